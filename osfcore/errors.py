@@ -1,0 +1,82 @@
+"""What can go wrong because of an input: one sentence with the value and what is allowed.
+
+Every error is an `OsfError`, so a caller at the edge (command line, REST) can show its text as it is. Constructors take
+the facts and write the sentence. Nothing here knows of exit codes or HTTP.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "none"
+
+
+class OsfError(ValueError):
+    """A mistake in an input, told in one sentence that a user can act on."""
+
+
+class InvalidInput(OsfError):
+    """A value outside what is allowed.
+
+    Args:
+        what: name of the value, with its unit if it has one.
+        value: what was given.
+        allowed: what is allowed, in words.
+    """
+
+    def __init__(self, what: str, value: object, allowed: str) -> None:
+        super().__init__(f"{what} is {value}, but it must be {allowed}.")
+        self.what = what
+
+
+class UnknownName(OsfError):
+    """A name that is not among the known ones.
+
+    Args:
+        kind: what the name names, such as "object" or "camera".
+        name: what was given.
+        known: the names that exist.
+    """
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        super().__init__(f"There is no {kind} named {name!r}; known: {_listed(known)}.")
+
+
+class MissingAssets(OsfError):
+    """Objects that the catalogue knows but whose meshes have not been fetched."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        super().__init__(
+            f"The meshes of these objects are not on this machine: {_listed(names)}; get them with 'osf assets fetch'."
+        )
+
+
+class OverlappingObjects(OsfError):
+    """Two bodies that penetrate each other."""
+
+    def __init__(self, first: str, second: str, depth_m: float) -> None:
+        super().__init__(f"{first} and {second} overlap by {1000 * depth_m:.0f} mm; move one of them away.")
+
+
+class NoRoom(OsfError):
+    """Objects that could not be placed side by side in the workspace."""
+
+    def __init__(self, names: Iterable[str], tries: int) -> None:
+        super().__init__(
+            f"No room was found in the workspace for {_listed(names)} after {tries} tries; take fewer or smaller objects."
+        )
+
+
+class CorruptFile(OsfError):
+    """A file or archive that cannot be read as what it should be."""
+
+    def __init__(self, path: Path | str, reason: str) -> None:
+        super().__init__(f"{path} cannot be used: {reason}.")
+
+
+class FetchFailed(OsfError):
+    """Something that could not be downloaded, verified or written; nothing was changed."""
+
+    def __init__(self, what: str, reason: str) -> None:
+        super().__init__(f"{what} could not be fetched: {reason}. Nothing was changed.")

@@ -1,0 +1,109 @@
+"""What is known of one object: catalogue facts, textured mesh, convex collision parts, resting orientations.
+
+Object frame: the frame of the source mesh moved to the centre of its bounding box, z up, [m].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+
+@dataclass(frozen=True, slots=True)
+class Symmetry:
+    """Which rotations an eye cannot tell apart, after BOP's YCB-V.
+
+    Attributes:
+        kind: "none", "discrete" or "continuous".
+        rotations: for "discrete", the unit quaternions (w, x, y, z) that map the object to itself, identity left out.
+        axis: for "continuous", the axis of revolution in the object frame.
+        reason: why, in a few words.
+    """
+
+    kind: Literal["none", "discrete", "continuous"]
+    rotations: tuple[tuple[float, float, float, float], ...] = ()
+    axis: tuple[float, float, float] | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectInfo:
+    """Catalogue facts.
+
+    Attributes:
+        name: identifier such as "006_mustard_bottle".
+        label: name for a person, such as "Mustard bottle".
+        mass_kg: mass [kg].
+        symmetry: of its appearance.
+        licence: of the mesh, in SPDX form where there is one.
+        attribution: whom to credit.
+    """
+
+    name: str
+    label: str
+    mass_kg: float
+    symmetry: Symmetry
+    licence: str
+    attribution: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TexturedMesh:
+    """Triangles with smooth normals and one texture; corners on a UV seam are separate vertices with equal normals.
+
+    Attributes:
+        vertices: in the object frame [m].
+        normals: unit, outward.
+        faces: vertex indices, counter-clockwise from outside.
+        uv: texture coordinates in [0, 1], v upwards as in OBJ.
+        texture: linear RGB, first row at v = 1; texels that no face covers continue their neighbours' colours.
+    """
+
+    vertices: Float[np.ndarray, "P 3"]
+    normals: Float[np.ndarray, "P 3"]
+    faces: Int[np.ndarray, "F 3"]
+    uv: Float[np.ndarray, "P 2"]
+    texture: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RestingPoses:
+    """Orientations in which the object rests on a plane.
+
+    Attributes:
+        quaternions: rotation from object frame to a z-up world, (w, x, y, z); any turn about z rests as well.
+        probabilities: of landing so when dropped at random; they sum to 1, largest first.
+    """
+
+    quaternions: Float[np.ndarray, "M 4"]
+    probabilities: Float[np.ndarray, "M"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectAsset:
+    """Everything the simulator needs of one object.
+
+    Attributes:
+        info: catalogue facts.
+        mesh: for pictures.
+        parts: vertices of each convex collision part, in the object frame [m].
+        resting: orientations for scenes.
+    """
+
+    info: ObjectInfo
+    mesh: TexturedMesh
+    parts: tuple[Float[np.ndarray, "M 3"], ...]
+    resting: RestingPoses
+
+    @property
+    def size_m(self) -> Float[np.ndarray, "3"]:
+        """Extents of the bounding box in the object frame [m]."""
+        return np.ptp(self.mesh.vertices, axis=0)
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the smallest sphere around the frame's origin that holds the object [m]."""
+        return float(np.linalg.norm(self.mesh.vertices, axis=1).max())
