@@ -12,8 +12,18 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names)) or "none"
 
 
+def _rebuilt(kind: type["OsfError"], sentence: str, facts: dict[str, object]) -> "OsfError":
+    error = kind.__new__(kind, sentence)
+    error.__dict__.update(facts)
+    return error
+
+
 class OsfError(ValueError):
     """A mistake in an input, told in one sentence that a user can act on."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Survive the way out of a worker process, although constructors take facts rather than the sentence."""
+        return _rebuilt, (type(self), str(self), self.__dict__)
 
 
 class InvalidInput(OsfError):

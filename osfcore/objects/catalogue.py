@@ -1,0 +1,57 @@
+"""The YCB objects that are known by name: label, mass, symmetry, licence. Meshes come from `sources`.
+
+Masses are those of the YCB data sheet. Symmetries follow BOP's YCB-V in the object frame (the google_16k axes, origin at
+the centre of the bounding box): an object is symmetric only where its label and colours are, too.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from osfcore.objects.asset import ObjectInfo, Symmetry
+
+LICENCE = "CC-BY-4.0"
+ATTRIBUTION = "YCB Object and Model Set, ycbbenchmarks.com (Calli et al. 2015)"
+
+_HALF_TURNS = ((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+_LABEL = "printed label breaks the symmetry"
+
+_ROWS = (
+    ("002_master_chef_can", "Master Chef can", 0.414, Symmetry("none", reason=_LABEL)),
+    ("003_cracker_box", "Cracker box", 0.411, Symmetry("none", reason=_LABEL)),
+    ("004_sugar_box", "Sugar box", 0.514, Symmetry("none", reason=_LABEL)),
+    ("005_tomato_soup_can", "Tomato soup can", 0.349, Symmetry("none", reason=_LABEL)),
+    ("006_mustard_bottle", "Mustard bottle", 0.603, Symmetry("none", reason=_LABEL)),
+    ("007_tuna_fish_can", "Tuna fish can", 0.171, Symmetry("none", reason=_LABEL)),
+    ("008_pudding_box", "Pudding box", 0.187, Symmetry("none", reason=_LABEL)),
+    ("009_gelatin_box", "Gelatin box", 0.097, Symmetry("none", reason=_LABEL)),
+    ("010_potted_meat_can", "Potted meat can", 0.370, Symmetry("none", reason=_LABEL)),
+    ("011_banana", "Banana", 0.066, Symmetry("none", reason="bent, with unlike ends")),
+    ("013_apple", "Apple", 0.068, Symmetry("none", reason="uneven shape and colour")),
+    ("016_pear", "Pear", 0.049, Symmetry("none", reason="uneven shape and colour")),
+    ("019_pitcher_base", "Pitcher base", 0.178, Symmetry("none", reason="handle and spout")),
+    ("021_bleach_cleanser", "Bleach cleanser", 1.131, Symmetry("none", reason=_LABEL)),
+    ("022_windex_bottle", "Windex bottle", 1.022, Symmetry("none", reason=_LABEL)),
+    ("024_bowl", "Bowl", 0.147, Symmetry("continuous", axis=(0.0, 0.0, 1.0), reason="plain body of revolution")),
+    ("025_mug", "Mug", 0.118, Symmetry("none", reason="handle")),
+    ("035_power_drill", "Power drill", 0.895, Symmetry("none", reason="no symmetric shape")),
+    ("036_wood_block", "Wood block", 0.729, Symmetry("discrete", _HALF_TURNS, reason="plain block")),
+    ("061_foam_brick", "Foam brick", 0.028, Symmetry("discrete", _HALF_TURNS, reason="plain brick")),
+)
+
+CATALOGUE: Mapping[str, ObjectInfo] = MappingProxyType(
+    {name: ObjectInfo(name, label, mass, symmetry, LICENCE, ATTRIBUTION) for name, label, mass, symmetry in _ROWS}
+)
+
+DEFAULT_NAMES: tuple[str, ...] = (
+    "002_master_chef_can",
+    "003_cracker_box",
+    "004_sugar_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "007_tuna_fish_can",
+    "008_pudding_box",
+    "009_gelatin_box",
+    "010_potted_meat_can",
+    "035_power_drill",
+)
+"""The objects that the package on PyPI holds."""

@@ -1,0 +1,279 @@
+"""Objects on disk: one folder each, written whole or not at all.
+
+A folder holds `object.json` (facts, format version, checksums), `arrays.npz` (mesh, collision parts, resting orientations),
+`texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. It is written under another name beside its place,
+synced, and renamed, so that a kill or a full disk leaves either the old object or none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import shutil
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, MissingAssets, UnknownName
+from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
+from osfcore.objects.catalogue import CATALOGUE
+
+FORMAT_VERSION = 1
+_FACTS, _ARRAYS, _TEXTURE, _VIEWER = "object.json", "arrays.npz", "texture.png", "viewer.glb"
+_TEMPORARY_PREFIX = ".writing-"
+_TEMPORARY_LIFE_S = 600  # far longer than one write takes; older ones were left by a killed process
+
+
+class AssetLibrary:
+    """The objects in one folder.
+
+    Several processes may read and write at once: readers see whole objects only.
+
+    Args:
+        root: the folder, usually DATA_DIR/objects; made at the first write.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+
+    def names(self) -> tuple[str, ...]:
+        """Names of all objects that can be loaded, sorted."""
+        if not self.root.is_dir():
+            return ()
+        return tuple(sorted(entry.name for entry in self.root.iterdir() if self.has(entry.name)))
+
+    def has(self, name: str) -> bool:
+        """Whether an object of this name has been written (by a version that this one can read)."""
+        if not name or name.startswith(".") or Path(name).name != name:
+            return False
+        try:
+            return self._facts(name)["format_version"] == FORMAT_VERSION
+        except (OSError, CorruptFile):
+            return False
+
+    def info(self, name: str) -> ObjectInfo:
+        """Facts of an object of the catalogue, fetched or not, or of one that a user added.
+
+        Raises:
+            UnknownName: if it is neither.
+            CorruptFile: if a user's object is damaged.
+        """
+        if name in CATALOGUE:
+            return CATALOGUE[name]
+        facts = self._known_facts(name)
+        with self._as_corrupt(name):
+            return _info_from_json(facts["info"])
+
+    def source(self, name: str) -> str:
+        """Where an object on this machine came from, as told to `write`."""
+        return str(self._known_facts(name).get("source", ""))
+
+    def size_m(self, name: str) -> Float[np.ndarray, "3"]:
+        """Extents of the bounding box in the object frame [m], without loading the mesh.
+
+        Raises:
+            MissingAssets: if the object is in the catalogue but not on this machine.
+            UnknownName: if there is no such object.
+            CorruptFile: if its files are damaged.
+        """
+        facts = self._known_facts(name)
+        with self._as_corrupt(name):
+            return np.array(facts["size_m"], float).reshape(3)
+
+    def load(self, name: str) -> ObjectAsset:
+        """An object with its mesh, texture, collision parts and resting orientations.
+
+        Raises:
+            MissingAssets: if the object is in the catalogue but not on this machine.
+            UnknownName: if there is no such object.
+            CorruptFile: if its files are damaged.
+        """
+        import cv2
+
+        facts = self._known_facts(name)
+        with self._as_corrupt(name):
+            with np.load(io.BytesIO(self._checked(name, _ARRAYS, facts)), allow_pickle=False) as stored:
+                arrays = {key: stored[key] for key in stored.files}
+            png = np.frombuffer(self._checked(name, _TEXTURE, facts), np.uint8)
+            texture = np.ascontiguousarray(cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1])
+            mesh = TexturedMesh(arrays["vertices"], arrays["normals"], arrays["faces"], arrays["uv"], texture)
+            parts = tuple(np.split(arrays["parts"], np.cumsum(arrays["part_sizes"])[:-1]))
+            resting = RestingPoses(arrays["resting_quaternions"], arrays["resting_probabilities"])
+            return ObjectAsset(self.info(name), mesh, parts, resting)
+
+    def viewer_glb(self, name: str) -> bytes:
+        """The object as binary glTF with a small JPEG texture, in the object frame (z up) [m].
+
+        Raises:
+            MissingAssets: if the object is in the catalogue but not on this machine.
+            UnknownName: if there is no such object.
+            CorruptFile: if its files are damaged.
+        """
+        facts = self._known_facts(name)
+        with self._as_corrupt(name):
+            return self._checked(name, _VIEWER, facts)
+
+    def write(self, asset: ObjectAsset, source: str) -> None:
+        """Put an object in place, in one piece, over an older one of the same name if there is one.
+
+        Args:
+            asset: what to write.
+            source: where it came from, for people.
+
+        Raises:
+            FetchFailed: if the disk is full or the folder cannot be written; nothing is changed.
+        """
+        from osfcore.objects.viewer_mesh import viewer_glb
+
+        glb = viewer_glb(asset.mesh)
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            self._remove_stale()
+            with self._temporary(asset.info.name) as folder:
+                _write_arrays(folder / _ARRAYS, asset)
+                _write_png(folder / _TEXTURE, asset.mesh.texture)
+                (folder / _VIEWER).write_bytes(glb)
+                checks = {f: zlib.crc32((folder / f).read_bytes()) for f in (_ARRAYS, _TEXTURE, _VIEWER)}
+                facts = {
+                    "format_version": FORMAT_VERSION,
+                    "info": asdict(asset.info),
+                    "size_m": [round(float(s), 6) for s in asset.size_m],
+                    "source": source,
+                    "crc32": checks,
+                }
+                (folder / _FACTS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+                for path in (*folder.iterdir(), folder):
+                    _sync(path)
+                self._put(folder, self.root / asset.info.name)
+        except OSError as error:
+            raise FetchFailed(asset.info.name, f"{self.root} cannot be written ({error.strerror})") from error
+
+    def _facts(self, name: str) -> dict[str, Any]:
+        path = self.root / name / _FACTS
+        try:
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            return {"format_version": 0, **facts}
+        except (ValueError, TypeError) as error:
+            raise CorruptFile(path, "it is not valid JSON") from error
+
+    def _known_facts(self, name: str) -> dict[str, Any]:
+        try:
+            if not name or name.startswith(".") or Path(name).name != name:
+                raise FileNotFoundError(name)
+            facts = self._facts(name)
+        except OSError:
+            if name in CATALOGUE:
+                raise MissingAssets([name]) from None
+            raise UnknownName("object", name, {*CATALOGUE, *self.names()}) from None
+        if facts["format_version"] != FORMAT_VERSION:
+            reason = "another version of this program wrote it; fetch or add the object again with --force"
+            raise CorruptFile(self.root / name, reason)
+        return facts
+
+    def _checked(self, name: str, file: str, facts: dict[str, Any]) -> bytes:
+        data = (self.root / name / file).read_bytes()
+        if zlib.crc32(data) != facts["crc32"][file]:
+            raise CorruptFile(self.root / name / file, "its checksum does not fit; fetch or add it again with --force")
+        return data
+
+    @contextlib.contextmanager
+    def _as_corrupt(self, name: str) -> Iterator[None]:
+        """Tell damaged contents as what they are."""
+        try:
+            yield
+        except CorruptFile:
+            raise
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            reason = "its files are damaged; fetch or add it again with --force"
+            raise CorruptFile(self.root / name, reason) from error
+
+    @contextlib.contextmanager
+    def _temporary(self, name: str) -> Iterator[Path]:
+        folder = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY_PREFIX}{name}-", dir=self.root))
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _put(self, folder: Path, place: Path) -> None:
+        folder.chmod(0o755)  # mkdtemp makes it private, but another user may serve what this one fetched
+        if place.exists():
+            with self._temporary(place.name) as trash:
+                os.rename(place, trash / "old")
+                os.rename(folder, place)
+        else:
+            os.rename(folder, place)
+        _sync(self.root)
+
+    def _remove_stale(self) -> None:
+        for path in self.root.glob(f"{_TEMPORARY_PREFIX}*"):
+            with contextlib.suppress(OSError):
+                if time.time() - path.stat().st_mtime > _TEMPORARY_LIFE_S:
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+def check_name(name: str) -> str:
+    """A name that a user's object may have.
+
+    Raises:
+        InvalidInput: if it is not 1 to 64 lower-case letters, digits, "_" and "-", the first a letter or digit.
+    """
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,63}", name):
+        allowed = "1 to 64 lower-case letters, digits, '_' or '-', starting with a letter or digit"
+        raise InvalidInput("object name", repr(name[:80]), allowed)
+    return name
+
+
+def _info_from_json(facts: dict[str, Any]) -> ObjectInfo:
+    symmetry = facts["symmetry"]
+    rotations = tuple((float(w), float(x), float(y), float(z)) for w, x, y, z in symmetry["rotations"])
+    axis = symmetry["axis"] and tuple(float(a) for a in symmetry["axis"])
+    return ObjectInfo(
+        name=str(facts["name"]),
+        label=str(facts["label"]),
+        mass_kg=float(facts["mass_kg"]),
+        symmetry=Symmetry(symmetry["kind"], rotations, axis, str(symmetry["reason"])),
+        licence=str(facts["licence"]),
+        attribution=str(facts["attribution"]),
+    )
+
+
+def _write_arrays(path: Path, asset: ObjectAsset) -> None:
+    mesh = asset.mesh
+    with path.open("wb") as file:
+        np.savez(
+            file,
+            vertices=mesh.vertices.astype(np.float32),
+            normals=mesh.normals.astype(np.float32),
+            faces=mesh.faces.astype(np.int32),
+            uv=mesh.uv.astype(np.float32),
+            parts=np.concatenate(asset.parts).astype(np.float32),
+            part_sizes=np.array([len(part) for part in asset.parts], np.int32),
+            resting_quaternions=asset.resting.quaternions.astype(float),
+            resting_probabilities=asset.resting.probabilities.astype(float),
+        )
+
+
+def _write_png(path: Path, texture: np.ndarray) -> None:
+    import cv2
+
+    _, data = cv2.imencode(".png", texture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    path.write_bytes(data.tobytes())
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,173 @@
+"""Textured meshes from files, brought into the object frame and checked.
+
+Whatever comes in (a scan, a modelled GLB with several materials, vertex colours only) leaves as one `TexturedMesh`:
+centred, wound outward, with smooth normals across texture seams and one clean texture.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
+from osfcore.objects.asset import TexturedMesh
+from osfcore.objects.surface import joined, piece_of
+from osfcore.objects.texture import clean_texture
+
+if TYPE_CHECKING:
+    pass
+
+MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0
+MAX_FACES = 200_000
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae")
+_Y_UP_SUFFIXES = (".glb", ".gltf")
+_MIN_THICKNESS = 1e-3  # of the longest side; thinner is a sheet, which no solver can rest on a table
+
+
+def read_mesh(path: Path, scale: float = 1.0) -> TexturedMesh:
+    """Read a mesh file with whatever texture or colours it has.
+
+    Args:
+        path: OBJ, GLB or another format that trimesh reads; its images lie beside it or inside.
+        scale: metres for one unit of the file. GLB is turned from y up to z up; other formats count as z up.
+
+    Raises:
+        InvalidInput: if there is no such file, its kind is unknown or its size is not that of a tabletop object.
+        CorruptFile: if it holds no usable triangles.
+    """
+    import trimesh
+
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InvalidInput("mesh file", path.name, f"one of {', '.join(MESH_SUFFIXES)}")
+    if not path.is_file():
+        raise InvalidInput("mesh file", path, "a file that exists")
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        pieces = [piece_of(g) for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+    except OsfError:
+        raise
+    except Exception as error:  # a reader of ten formats raises anything on damaged input
+        raise CorruptFile(path, f"it cannot be read as a mesh ({type(error).__name__})") from error
+    if not pieces:
+        raise CorruptFile(path, "it holds no triangles")
+    whole = joined(pieces)
+    vertices = np.asarray(whole.vertices, float) * scale
+    if path.suffix.lower() in _Y_UP_SUFFIXES:
+        vertices = vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return textured_mesh(vertices, whole.faces, whole.uv, whole.texture, path)
+
+
+def textured_mesh(
+    vertices: Float[np.ndarray, "P 3"],
+    faces: Int[np.ndarray, "F 3"],
+    uv: Float[np.ndarray, "P 2"],
+    texture: UInt8[np.ndarray, "h w 3"],
+    source: Path | str,
+) -> TexturedMesh:
+    """The mesh in the object frame: centred, wound outward, smooth normals, clean texture.
+
+    Args:
+        vertices: in any frame with z up [m].
+        faces: vertex indices.
+        uv: in [0, 1], v upwards.
+        texture: RGB.
+        source: what the message calls it when something is wrong.
+
+    Raises:
+        CorruptFile: if there are no triangles, numbers are not finite, indices point nowhere or it is flat.
+        InvalidInput: if it is under 5 mm or over 1 m long, or has too many triangles.
+    """
+    vertices, faces, uv = np.asarray(vertices, float), np.asarray(faces, np.int64), np.asarray(uv, float)
+    if len(faces) == 0 or len(vertices) == 0:
+        raise CorruptFile(source, "it holds no triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CorruptFile(source, "its faces name vertices that do not exist")
+    vertices, faces, uv = _referenced(vertices, faces, uv)
+    if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
+        raise CorruptFile(source, "it has coordinates that are not finite")
+    if len(faces) > MAX_FACES:
+        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    _check_size(high - low, source)
+    vertices = vertices - (low + high) / 2
+    welded, weld = _weld(vertices)
+    faces = faces[_has_area(welded, weld[faces])]
+    if len(faces) == 0:
+        raise CorruptFile(source, "all of its triangles are degenerate")
+    faces = _outward(welded, weld, faces)
+    return TexturedMesh(
+        vertices=vertices.astype(np.float32),
+        normals=_smooth_normals(welded, weld[faces])[weld].astype(np.float32),
+        faces=faces.astype(np.int32),
+        uv=np.clip(uv, 0, 1).astype(np.float32),
+        texture=clean_texture(np.ascontiguousarray(texture), uv, faces),
+    )
+
+
+def _check_size(extents: Float[np.ndarray, "3"], source: Path | str) -> None:
+    longest = float(extents.max())
+    if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
+        hint = "; is it in millimetres?" if longest > MAX_LENGTH_M else "; is it in another unit?"
+        size = " x ".join(f"{e:.4g}" for e in extents)
+        allowed = f"in metres with the longest side between {MIN_LENGTH_M} and {MAX_LENGTH_M:g}{hint}"
+        raise InvalidInput(f"size [m] of {source}", size, allowed)
+    if extents.min() < _MIN_THICKNESS * longest:
+        raise CorruptFile(source, "it is flat and encloses no volume")
+
+
+def _referenced(
+    vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], uv: Float[np.ndarray, "P 2"]
+) -> tuple[Float[np.ndarray, "Q 3"], Int[np.ndarray, "F 3"], Float[np.ndarray, "Q 2"]]:
+    """Without the vertices that no face names: they would move the bounding box."""
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], inverse.reshape(faces.shape), uv[used]
+
+
+def _weld(vertices: Float[np.ndarray, "P 3"]) -> tuple[Float[np.ndarray, "Q 3"], Int[np.ndarray, "P"]]:
+    """Distinct positions, and for each vertex the index of its position."""
+    grid = np.round(vertices / (1e-6 * np.ptp(vertices, axis=0).max())).astype(np.int64)
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    return vertices[first], inverse.reshape(-1)
+
+
+def _corners(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3"]:
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _has_area(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> np.ndarray:
+    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return distinct & (np.linalg.norm(_corners(points, faces), axis=1) > 0)
+
+
+def _outward(
+    points: Float[np.ndarray, "Q 3"], weld: Int[np.ndarray, "P"], faces: Int[np.ndarray, "F 3"]
+) -> Int[np.ndarray, "F 3"]:
+    """The same faces, each counter-clockwise seen from outside."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(points, weld[faces], process=False)
+    before = _corners(points, weld[faces])
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+    trimesh.repair.fix_inversion(mesh, multibody=mesh.is_watertight and mesh.body_count > 1)
+    flipped = np.einsum("ij,ij->i", before, _corners(points, np.asarray(mesh.faces))) < 0
+    return np.where(flipped[:, None], faces[:, ::-1], faces)
+
+
+def _smooth_normals(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "Q 3"]:
+    """Unit normals at positions: those of the faces around, weighted by their angle there."""
+    face_normals = _corners(points, faces)
+    face_normals /= np.linalg.norm(face_normals, axis=1, keepdims=True)
+    normals = np.zeros_like(points)
+    for corner in range(3):
+        here, after, before = (points[faces[:, (corner + k) % 3]] for k in range(3))
+        u, w = after - here, before - here
+        angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ij,ij->i", u, w))
+        np.add.at(normals, faces[:, corner], angle[:, None] * face_normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    # Opposite faces of a sheet cancel out, and unused positions have no faces: any unit vector is as good.
+    return np.where(length > 1e-9, normals / np.maximum(length, 1e-9), np.array([0.0, 0.0, 1.0]))

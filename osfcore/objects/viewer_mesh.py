@@ -1,0 +1,32 @@
+"""A light copy of a textured mesh for 3D views in browsers."""
+
+import io
+
+import cv2
+import numpy as np
+
+from osfcore.objects.asset import TexturedMesh
+
+MAX_TEXTURE_SIDE = 1024
+_JPEG_QUALITY = 85
+
+
+def viewer_glb(mesh: TexturedMesh) -> bytes:
+    """Binary glTF with a JPEG texture of at most 1024 texels a side, in the mesh's own frame [m]."""
+    import trimesh
+    from PIL import Image
+
+    texture = mesh.texture
+    scale = MAX_TEXTURE_SIDE / max(texture.shape[:2])
+    if scale < 1:
+        texture = cv2.resize(texture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    # trimesh embeds an image in the format that it was read in.
+    encoded = io.BytesIO()
+    Image.fromarray(texture).save(encoded, format="JPEG", quality=_JPEG_QUALITY)
+    image = Image.open(encoded)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    visual = trimesh.visual.TextureVisuals(uv=mesh.uv, material=material)
+    light = trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=np.asarray(mesh.normals), visual=visual, process=False
+    )
+    return bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(light), include_normals=True))
