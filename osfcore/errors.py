@@ -74,7 +74,8 @@ class NoRoom(OsfError):
 
     def __init__(self, names: Iterable[str], tries: int) -> None:
         super().__init__(
-            f"No room was found in the workspace for {_listed(names)} after {tries} tries; take fewer or smaller objects."
+            f"No room was found in the workspace for {_listed(names)} after {tries} tries; "
+            "take fewer or smaller objects."
         )
 
 

@@ -17,7 +17,9 @@ from osfcore.errors import InvalidInput
 QUATERNION_NORM_TOLERANCE = 1e-3
 
 
-def quaternion_multiply(a: Float[np.ndarray, "*batch 4"], b: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*out 4"]:
+def quaternion_multiply(
+    a: Float[np.ndarray, "*batch 4"], b: Float[np.ndarray, "*batch 4"]
+) -> Float[np.ndarray, "*out 4"]:
     """Hamilton product a b: the rotation b followed by the rotation a. Batches broadcast."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)

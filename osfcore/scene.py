@@ -1,7 +1,8 @@
 """The vocabulary: cameras, light, pusher, scene states and observations, with their conventions and limits.
 
 World frame: z up, table top at z = 0, its centre the origin; SI units. Everything here is a frozen dataclass of numpy
-arrays, checked when built, so what crosses a line between rooms is always sane. Letters: V views, N objects, h w pixels.
+arrays, checked when built, so what crosses a line between rooms is always sane. Letters: V views, N objects,
+h w pixels.
 """
 
 from __future__ import annotations

@@ -1,0 +1,60 @@
+"""The command line `osf`: one dataclass per command, each in `app/commands/`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from typing import Annotated, Any, Protocol
+
+import tyro
+
+from app.commands.assets import Assets
+from app.commands.check import Check
+from app.commands.collect import Collect
+from app.commands.serve import Serve
+from osfcore.errors import OsfError
+
+
+class Command(Protocol):
+    """What every command offers."""
+
+    json: bool
+
+    def run(self) -> dict[str, Any]:
+        """Do it; return what `--json` prints."""
+        ...
+
+
+Commands = Annotated[
+    Annotated[Serve, tyro.conf.subcommand("serve", description="Start the service and its page.")]
+    | Annotated[Assets, tyro.conf.subcommand("assets", description="List, fetch and add objects.")]
+    | Annotated[Collect, tyro.conf.subcommand("collect", description="Collect image sets and pushes.")]
+    | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],
+    tyro.conf.OmitSubcommandPrefixes,
+]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; 0 on success, 1 if it could not be done, 2 for a wrong call, 130 when interrupted."""
+    command: Command = tyro.cli(
+        Commands, prog="osf", args=arguments, description="Rearrange real objects from a photo."
+    )
+    try:
+        result = command.run()
+    except OsfError as error:
+        print(f"osf: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("osf: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # whoever read our output has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    if command.json:
+        print(json.dumps(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

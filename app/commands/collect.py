@@ -1,0 +1,139 @@
+"""`osf collect`: image sets and pushes from the simulator."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from app.commands.progress_bar import follow
+from app.paths import default_data_dir
+
+from osfcore.errors import InvalidInput
+
+
+@dataclass(frozen=True)
+class CollectObjectCommand:
+    """Images of one object from all sides under lights from all directions, in the OSF format."""
+
+    name: tyro.conf.Positional[str]
+    """Name of the object, such as 006_mustard_bottle."""
+    out: Path
+    """Folder to write; must be new or empty."""
+    images: int = 300
+    """Train and test images together; one in eight, at least 40, are for testing."""
+    size: int = 128
+    """Side of the square images [px]."""
+    seed: int = 0
+    """Of views and lights."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result names the folder and the counts."""
+        from osfcore.objects.library import AssetLibrary
+        from osfcore.world.collect_images import CollectObject, collect_object
+
+        config = CollectObject(self.name, self.out, self.images, self.size, self.seed)
+        last = follow(collect_object(config, AssetLibrary(self.data_dir / "objects")))
+        return {"out": str(self.out), "images": last.total if last else 0}
+
+
+@dataclass(frozen=True)
+class CollectTableCommand:
+    """Images of the bare table under many lights, in the OSF format."""
+
+    out: Path
+    """Folder to write; must be new or empty."""
+    images: int = 300
+    """Train and test images together; one in eight, at least 40, are for testing."""
+    size: int = 128
+    """Side of the square images [px]."""
+    seed: int = 0
+    """Of views and lights."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result names the folder and the counts."""
+        from osfcore.world.collect_images import CollectTable, collect_table
+
+        last = follow(collect_table(CollectTable(self.out, self.images, self.size, self.seed)))
+        return {"out": str(self.out), "images": last.total if last else 0}
+
+
+@dataclass(frozen=True)
+class CollectPushesCommand:
+    """Episodes of pushes for learning dynamics. A killed collection goes on where it was when started again."""
+
+    out: Path
+    """HDF5 file to write; must be new."""
+    episodes: int = 1000
+    """Number of episodes."""
+    steps: int = 50
+    """Actions of 0.2 s per episode."""
+    objects: int = 3
+    """Objects per scene, chosen at random among those fetched."""
+    policy: Literal["paper", "directed"] = "paper"
+    """Uniform random velocities, or a pusher that seeks sustained contact."""
+    workers: int = 2
+    """Processes that simulate side by side; the content does not depend on it."""
+    seed: int = 0
+    """Of everything."""
+    images: bool = False
+    """Keep frames of camera 0 as well."""
+    renderer: Literal["embree", "tiny"] = "embree"
+    """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result tells shares of steps with contact and motion, and the rate."""
+        from osfcore.objects.library import AssetLibrary
+        from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+
+        if not 1 <= self.workers <= 256:
+            raise InvalidInput("number of workers", self.workers, "between 1 and 256")
+        config = CollectPushes(
+            self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images, self.renderer
+        )
+        with _executor(self.workers) as executor:
+            last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor))
+        result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}
+        if last is not None:
+            result |= {
+                "contact_share": round(last.contact_share, 4),
+                "motion_share": round(last.motion_share, 4),
+                "episodes_per_s": round(last.episodes_per_s, 2),
+            }
+        return result
+
+
+@contextmanager
+def _executor(workers: int) -> Iterator[Executor | None]:
+    """Worker processes, or none for one worker."""
+    if workers == 1:
+        yield None
+        return
+    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+Collect = Annotated[
+    Annotated[CollectObjectCommand, tyro.conf.subcommand("object")]
+    | Annotated[CollectTableCommand, tyro.conf.subcommand("table")]
+    | Annotated[CollectPushesCommand, tyro.conf.subcommand("pushes")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

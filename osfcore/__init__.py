@@ -1,0 +1,1 @@
+"""Object-centric neural scattering functions for multi-object manipulation: the core, free of user interfaces."""

@@ -1,0 +1,141 @@
+"""scene.json: a scene with its cameras as a file, checked when read.
+
+    {"objects": [{"name", "position": [3], "quaternion": [w, x, y, z]}], "light": {"position": [3]},
+     "pusher": {"position": [3]}, "cameras": [{"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}]}
+
+`pusher` and `cameras` may be missing. Metres, z up, unit quaternions.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
+from osfcore.poses import Pose
+from osfcore.scene import Camera, Light, SceneState, finite_vector
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scene:
+    """A state and the cameras that look at it."""
+
+    state: SceneState
+    cameras: tuple[Camera, ...]
+
+
+def scene_to_json(scene: Scene) -> dict[str, Any]:
+    """The scene as plain lists and numbers."""
+    state = scene.state
+    result: dict[str, Any] = {
+        "objects": [
+            {"name": name, "position": p.tolist(), "quaternion": q.tolist()}
+            for name, p, q in zip(state.names, state.poses.position, state.poses.quaternion, strict=True)
+        ],
+        "light": {"position": state.light.position.tolist()},
+    }
+    if state.pusher is not None:
+        result["pusher"] = {"position": state.pusher.tolist()}
+    result["cameras"] = [camera_to_json(camera) for camera in scene.cameras]
+    return result
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """One camera as plain lists and numbers."""
+    return {
+        "name": camera.name,
+        "T_world_camera": camera.T_world_camera.matrix().tolist(),
+        "K": camera.intrinsics.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def scene_from_json(data: object) -> Scene:
+    """The scene of parsed JSON.
+
+    Raises:
+        InvalidInput: if something is missing or out of range; the message names it.
+    """
+    root = _mapping(data, "scene")
+    objects = [_mapping(entry, "entry of objects") for entry in _sequence(root, "objects")]
+    names = tuple(str(_entry(entry, "name", "object")) for entry in objects)
+    positions = [
+        finite_vector(_entry(o, "position", n), 3, f"position of {n} [m]") for n, o in zip(names, objects, strict=True)
+    ]
+    turns = [
+        finite_vector(_entry(o, "quaternion", n), 4, f"quaternion of {n}") for n, o in zip(names, objects, strict=True)
+    ]
+    poses = Pose(np.array(positions).reshape(-1, 3), np.array(turns).reshape(-1, 4))
+    light = Light(
+        finite_vector(_entry(_mapping(_entry(root, "light", "scene"), "light"), "position", "light"), 3, "light")
+    )
+    pusher = None
+    if root.get("pusher") is not None:
+        pusher = finite_vector(
+            _entry(_mapping(root["pusher"], "pusher"), "position", "pusher"), 3, "pusher position [m]"
+        )
+    cameras = tuple(camera_from_json(c) for c in _sequence(root, "cameras")) if "cameras" in root else ()
+    return Scene(SceneState(names, poses, light, pusher), cameras)
+
+
+def camera_from_json(data: object) -> Camera:
+    """One camera of parsed JSON.
+
+    Raises:
+        InvalidInput: if something is missing or out of range.
+    """
+    entry = _mapping(data, "camera")
+    name = str(_entry(entry, "name", "camera"))
+    pose = finite_vector(
+        np.ravel(_entry(entry, "T_world_camera", f"camera {name}")), 16, f"T_world_camera of camera {name}"
+    )
+    K = finite_vector(np.ravel(_entry(entry, "K", f"camera {name}")), 9, f"K of camera {name}")
+    rotation = pose.reshape(4, 4)[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        raise InvalidInput(f"T_world_camera of camera {name}", pose.tolist(), "a rotation and a translation, 4 x 4")
+    sizes = [_entry(entry, key, f"camera {name}") for key in ("width", "height")]
+    if not all(isinstance(size, int) for size in sizes):
+        raise InvalidInput(f"size of camera {name} [px]", sizes, "two whole numbers")
+    return Camera(name, Pose.from_matrix(pose.reshape(4, 4)), K.reshape(3, 3), *sizes)
+
+
+def read_scene(path: Path) -> Scene:
+    """The scene in a file.
+
+    Raises:
+        CorruptFile: if it cannot be read or is not a scene; the message says why.
+    """
+    try:
+        return scene_from_json(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise CorruptFile(path, error.strerror or str(error)) from error
+    except UnicodeDecodeError as error:
+        raise CorruptFile(path, "it is not a text file") from error
+    except json.JSONDecodeError as error:
+        raise CorruptFile(path, f"it is not valid JSON (line {error.lineno}: {error.msg})") from error
+    except OsfError as error:
+        raise CorruptFile(path, str(error).rstrip(".")) from error
+
+
+def _mapping(value: object, what: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InvalidInput(what, repr(value)[:60], "a JSON object")
+    return value
+
+
+def _entry(mapping: dict[str, Any], key: str, what: str) -> Any:  # noqa: ANN401
+    if key not in mapping:
+        raise InvalidInput(f"{key!r} of {what}", "missing", "given")
+    return mapping[key]
+
+
+def _sequence(mapping: dict[str, Any], key: str) -> list[Any]:
+    value = _entry(mapping, key, "scene")
+    if not isinstance(value, list):
+        raise InvalidInput(key, repr(value)[:60], "a list")
+    return value

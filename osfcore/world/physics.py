@@ -1,0 +1,244 @@
+"""Rigid bodies on a table in PyBullet: one client per simulation, poses in, contacts and poses out.
+
+Only this file and `tiny.py` import pybullet. PyBullet's quaternions are (x, y, z, w): they are converted here.
+
+Friction: 0.5 on objects and 1.0 on the table are Bullet's own values for a body and for its plane, in force where a
+setup names none, as the paper's does; Bullet multiplies them, so 0.5 acts between object and table and 0.25 between
+object and pusher. Rolling friction is a lever arm [m] chosen so that cans and fruit come to rest within a second.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pybullet
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from osfcore.objects.asset import ObjectAsset
+from osfcore.poses import Pose, quaternion_from_matrix, rotate
+from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
+
+TIME_STEP_S = 1 / 240
+SUBSTEPS = round(STEP_S / TIME_STEP_S)
+GRAVITY_M_S2 = 9.81
+TABLE_FRICTION = 1.0
+OBJECT_FRICTION = 0.5
+PUSHER_FRICTION = 0.5
+ROLLING_FRICTION_M = 0.003
+SPINNING_FRICTION_M = 0.003
+PUSHER_MASS_KG = 100.0  # so heavy that no object slows it; its pose is set exactly after each step anyway
+COLLISION_MARGIN_M = 0.0002  # Bullet inflates convex hulls by it; larger ones make objects hover
+_TABLE_THICKNESS_M = 0.1
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Body:
+    """A body in the simulation and where its centre of mass sits in the object frame."""
+
+    uid: int
+    T_object_inertial: Pose
+    T_inertial_object: Pose
+
+
+class Physics:
+    """A simulation of objects, pusher and table. Deterministic: the same calls give the same bits.
+
+    Args:
+        assets: the objects that take part, by name; their order is the order of contacts.
+    """
+
+    def __init__(self, assets: Mapping[str, ObjectAsset]) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        self._assets = dict(assets)
+        self._build()
+
+    def _build(self) -> None:
+        c = self._client
+        pybullet.resetSimulation(physicsClientId=c)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP_S,
+            numSolverIterations=50,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=0,
+            physicsClientId=c,
+        )
+        pybullet.setGravity(0, 0, -GRAVITY_M_S2, physicsClientId=c)
+        half = [TABLE_SIDE_M / 2, TABLE_SIDE_M / 2, _TABLE_THICKNESS_M / 2]
+        table_shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=c)
+        self._table = pybullet.createMultiBody(
+            0, table_shape, basePosition=[0, 0, -_TABLE_THICKNESS_M / 2], physicsClientId=c
+        )
+        self._dynamics(self._table, TABLE_FRICTION)
+        pusher_shape = pybullet.createCollisionShape(
+            pybullet.GEOM_CYLINDER, radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, physicsClientId=c
+        )
+        self._pusher = pybullet.createMultiBody(
+            PUSHER_MASS_KG, pusher_shape, basePosition=[0, 0, 2.0], physicsClientId=c
+        )
+        self._dynamics(self._pusher, PUSHER_FRICTION)
+        pybullet.setCollisionFilterPair(self._pusher, self._table, -1, -1, 0, physicsClientId=c)
+        self._pusher_position = np.array([0, 0, 2.0])
+        self._bodies: dict[str, _Body] = {}
+        for name, asset in self._assets.items():
+            self._bodies[name] = self._add(asset)
+
+    def _dynamics(self, uid: int, friction: float) -> None:
+        pybullet.changeDynamics(
+            uid,
+            -1,
+            lateralFriction=friction,
+            rollingFriction=ROLLING_FRICTION_M,
+            spinningFriction=SPINNING_FRICTION_M,
+            linearDamping=0,
+            angularDamping=0,
+            collisionMargin=COLLISION_MARGIN_M,
+            physicsClientId=self._client,
+        )
+
+    def _add(self, asset: ObjectAsset) -> _Body:
+        """One object far below the table, out of everything's way until it is placed."""
+        T_object_inertial, moments = mass_properties(asset.parts, asset.info.mass_kg)
+        T_inertial_object = T_object_inertial.inverse()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "parts.obj"  # Bullet makes a compound of hulls from the groups of an OBJ file
+            path.write_text(_hulls_as_obj([T_inertial_object.apply(part) for part in asset.parts]))
+            shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
+        # A visual shape of its own keeps Bullet from reading the file again for one.
+        visual = pybullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001, physicsClientId=self._client)
+        away = [10.0 * (1 + len(self._bodies)), 0.0, -50.0]
+        uid = pybullet.createMultiBody(asset.info.mass_kg, shape, visual, away, physicsClientId=self._client)
+        self._dynamics(uid, OBJECT_FRICTION)
+        pybullet.changeDynamics(uid, -1, localInertiaDiagonal=moments.tolist(), physicsClientId=self._client)
+        return _Body(uid, T_object_inertial, T_inertial_object)
+
+    def reset(self) -> None:
+        """Start over from the state right after construction, with nothing on the table."""
+        self._build()
+
+    def close(self) -> None:
+        """Free the simulation."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    @property
+    def pusher(self) -> Float[np.ndarray, "3"]:
+        """Centre of the pusher [m]."""
+        return self._pusher_position.copy()
+
+    def pose(self, name: str) -> Pose:
+        """`T_world_object`."""
+        body = self._bodies[name]
+        position, xyzw = pybullet.getBasePositionAndOrientation(body.uid, physicsClientId=self._client)
+        return Pose(np.array(position), np.array([xyzw[3], *xyzw[:3]])) @ body.T_inertial_object
+
+    def place(self, name: str, pose: Pose) -> None:
+        """Put an object at rest at `T_world_object`."""
+        body = self._bodies[name]
+        inertial = pose @ body.T_object_inertial
+        w, x, y, z = inertial.quaternion
+        pybullet.resetBasePositionAndOrientation(
+            body.uid, inertial.position.tolist(), [x, y, z, w], physicsClientId=self._client
+        )
+        pybullet.resetBaseVelocity(body.uid, [0, 0, 0], [0, 0, 0], physicsClientId=self._client)
+
+    def place_pusher(self, position: Float[np.ndarray, "3"]) -> None:
+        """Put the pusher upright at rest with its centre at `position` [m]."""
+        self._pusher_position = np.array(position, float)
+        self._hold_pusher(np.zeros(3))
+
+    def _hold_pusher(self, velocity: np.ndarray) -> None:
+        pybullet.resetBasePositionAndOrientation(
+            self._pusher, self._pusher_position.tolist(), [0, 0, 0, 1], physicsClientId=self._client
+        )
+        pybullet.resetBaseVelocity(self._pusher, velocity.tolist(), [0, 0, 0], physicsClientId=self._client)
+
+    def step(self, velocity: Float[np.ndarray, "3"]) -> frozenset[str]:
+        """Advance by `TIME_STEP_S` with the pusher at a velocity [m/s]; return the objects it touched.
+
+        The pusher stops at the border of its reach, |x| and |y| of `PUSHER_REACH_M`.
+        """
+        start = self._pusher_position
+        goal = start + velocity * TIME_STEP_S
+        reach = np.maximum(PUSHER_REACH_M, np.abs(start[:2]))
+        goal[:2] = np.clip(goal[:2], -reach, reach)
+        self._hold_pusher((goal - start) / TIME_STEP_S + [0, 0, GRAVITY_M_S2 * TIME_STEP_S])
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self._pusher_position = goal
+        self._hold_pusher(np.zeros(3))
+        return self._touched()
+
+    def _touched(self) -> frozenset[str]:
+        contacts = pybullet.getContactPoints(bodyA=self._pusher, physicsClientId=self._client)
+        touched = {contact[2] for contact in contacts}
+        return frozenset(name for name, body in self._bodies.items() if body.uid in touched)
+
+    def speed(self, name: str) -> tuple[float, float]:
+        """Linear [m/s] and angular [rad/s] speed of an object."""
+        linear, angular = pybullet.getBaseVelocity(self._bodies[name].uid, physicsClientId=self._client)
+        return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
+
+    def distance(self, first: str, second: str | None, reach_m: float = 0.05) -> float:
+        """Gap between two objects, or an object and the pusher (None) [m]; negative if they penetrate.
+
+        Gaps of more than `reach_m` come back as `reach_m`.
+        """
+        other = self._pusher if second is None else self._bodies[second].uid
+        return self._gap(self._bodies[first].uid, other, reach_m)
+
+    def table_distance(self, name: str) -> float:
+        """Gap between an object and the table [m]; negative if it sinks in; 0.05 if larger."""
+        return self._gap(self._bodies[name].uid, self._table, 0.05)
+
+    def _gap(self, first: int, second: int, reach_m: float) -> float:
+        points = pybullet.getClosestPoints(first, second, reach_m, physicsClientId=self._client)
+        return min((point[8] for point in points), default=reach_m)
+
+
+def mass_properties(parts: tuple[Float[np.ndarray, "M 3"], ...], mass_kg: float) -> tuple[Pose, Float[np.ndarray, "3"]]:
+    """Centre of mass with principal axes, and principal moments [kg m^2], of hulls of one uniform density.
+
+    Parts are summed as if they did not overlap.
+    """
+    volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+    canonical = (np.ones((3, 3)) + np.eye(3)) / 120  # second moments of the unit tetrahedron
+    for part in parts:
+        hull = ConvexHull(part)
+        inside = part[hull.vertices].mean(axis=0)
+        for simplex in hull.simplices:
+            edges = (part[simplex] - inside).T.astype(float)
+            determinant = abs(np.linalg.det(edges))
+            centre = inside + edges.sum(axis=1) / 4
+            volume += determinant / 6
+            first += determinant / 6 * centre
+            local = determinant * edges @ canonical @ edges.T  # about `inside`
+            shift = np.outer(inside, edges.sum(axis=1)) / 24 * determinant
+            second += local + shift + shift.T + determinant / 6 * np.outer(inside, inside)
+    centre = first / volume
+    covariance = second / volume - np.outer(centre, centre)
+    inertia = mass_kg * (np.trace(covariance) * np.eye(3) - covariance)
+    moments, axes = np.linalg.eigh(inertia)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    return Pose(centre, quaternion_from_matrix(axes)), moments
+
+
+def lowest_point(asset: ObjectAsset, quaternion: Float[np.ndarray, "4"]) -> float:
+    """Height of an object's lowest point relative to its frame's origin, when turned so [m]."""
+    return min(float(rotate(quaternion, part)[:, 2].min()) for part in asset.parts)
+
+
+def _hulls_as_obj(parts: list[np.ndarray]) -> str:
+    lines: list[str] = []
+    offset = 1
+    for number, part in enumerate(parts):
+        lines.append(f"o part{number}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part]
+        lines += [f"f {a + offset} {b + offset} {c + offset}" for a, b, c in ConvexHull(part).simplices]
+        offset += len(part)
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,93 @@
+"""Random scenes: objects at rest on the table, side by side inside the workspace, and a free pusher."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import NoRoom
+from osfcore.objects.asset import ObjectAsset
+from osfcore.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.scene import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, WORKSPACE_HALF_M
+from osfcore.world.physics import Physics, lowest_point
+
+GAP_M = 0.01  # between objects when placed
+PUSHER_GAP_M = 0.02
+DROP_M = 0.001  # objects start this far above the table
+_TRIES_PER_OBJECT = 60
+_LAYOUTS = 60
+_SETTLE_LIMIT_STEPS = 480
+_CALM_STEPS = 12
+CALM_SPEED_M_S = 2e-3
+CALM_TURN_RAD_S = 2e-2
+
+
+def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> None:
+    """Drop all objects in random stable poses without overlap, let them rest, put the pusher in a free place.
+
+    Raises:
+        NoRoom: if no layout was found.
+    """
+    for _ in range(_LAYOUTS):
+        physics.reset()
+        if not _lay_out(physics, assets, rng):
+            continue
+        settle(physics, tuple(assets))
+        inside = all(np.abs(physics.pose(name).position[:2]).max() <= WORKSPACE_HALF_M for name in assets)
+        if inside and is_calm(physics, tuple(assets)) and _place_pusher(physics, tuple(assets), rng):
+            return
+    raise NoRoom(assets, _LAYOUTS)
+
+
+def settle(physics: Physics, names: tuple[str, ...], limit_steps: int = _SETTLE_LIMIT_STEPS) -> int:
+    """Step without pushing until nothing has moved for a twentieth of a second; return the steps taken."""
+    calm = 0
+    for step in range(limit_steps):
+        if calm >= _CALM_STEPS:
+            return step
+        physics.step(np.zeros(3))
+        calm = calm + 1 if is_calm(physics, names) else 0
+    return limit_steps
+
+
+def is_calm(physics: Physics, names: tuple[str, ...]) -> bool:
+    """Whether every object is slower than 2 mm/s and 0.02 rad/s."""
+    speeds = [physics.speed(name) for name in names]
+    return all(linear < CALM_SPEED_M_S and angular < CALM_TURN_RAD_S for linear, angular in speeds)
+
+
+def random_rest(asset: ObjectAsset, rng: np.random.Generator) -> Float[np.ndarray, "4"]:
+    """A resting orientation by its probability, turned about the vertical at random."""
+    choice = rng.choice(len(asset.resting.quaternions), p=asset.resting.probabilities)
+    turn = quaternion_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
+    return quaternion_multiply(turn, asset.resting.quaternions[choice])
+
+
+def _lay_out(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> bool:
+    # Large objects first: they are the ones that find no place later.
+    order = sorted(assets, key=lambda name: -assets[name].radius_m)
+    placed: list[str] = []
+    for name in order:
+        quaternion = random_rest(assets[name], rng)
+        height = DROP_M - lowest_point(assets[name], quaternion)
+        for _ in range(_TRIES_PER_OBJECT):
+            x, y = rng.uniform(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, 2)
+            physics.place(name, Pose(np.array([x, y, height]), quaternion))
+            if all(physics.distance(name, other) >= GAP_M for other in placed):
+                placed.append(name)
+                break
+        else:
+            return False
+    return True
+
+
+def _place_pusher(physics: Physics, names: tuple[str, ...], rng: np.random.Generator) -> bool:
+    """Somewhere in or just around the workspace, clear of everything."""
+    half = WORKSPACE_HALF_M + 2 * PUSHER_RADIUS_M
+    for _ in range(_TRIES_PER_OBJECT):
+        physics.place_pusher(np.array([*rng.uniform(-half, half, 2), PUSHER_CENTRE_Z_M]))
+        if all(physics.distance(name, None) >= PUSHER_GAP_M for name in names):
+            return True
+    return False

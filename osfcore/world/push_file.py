@@ -1,0 +1,143 @@
+"""Episodes of pushes on disk: one file per finished episode while collecting, one HDF5 file in the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from osfcore.errors import CorruptFile, InvalidInput
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PushEpisode:
+    """One episode: T actions of 0.2 s, N objects.
+
+    Attributes:
+        names: the objects.
+        seed: that made the scene and the actions.
+        positions: of the objects, before the first and after each action [m].
+        quaternions: likewise, (w, x, y, z).
+        pusher: centre of the pusher, likewise [m].
+        actions: commanded velocities (vx, vy, 0) [m/s].
+        contact: whether the pusher touched the object during the action.
+        frames: images of one camera, likewise, or None.
+    """
+
+    names: tuple[str, ...]
+    seed: int
+    positions: Float[np.ndarray, "T1 N 3"]
+    quaternions: Float[np.ndarray, "T1 N 4"]
+    pusher: Float[np.ndarray, "T1 3"]
+    actions: Float[np.ndarray, "T 3"]
+    contact: Bool[np.ndarray, "T N"]
+    frames: UInt8[np.ndarray, "T1 h w 3"] | None = None
+
+
+_ARRAYS = ("positions", "quaternions", "pusher", "actions", "contact")
+
+
+class EpisodeFolder:
+    """Finished episodes beside the final file, so that a killed collection goes on where it was.
+
+    Args:
+        out: the final HDF5 file.
+        settings: what the episodes depend on; a folder begun with other settings is refused.
+
+    Raises:
+        InvalidInput: if the folder was begun with other settings.
+    """
+
+    def __init__(self, out: Path, settings: Mapping[str, object]) -> None:
+        self._out = out
+        self._folder = out.with_name(out.name + ".partial")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for leftover in self._folder.glob("*.tmp"):
+            leftover.unlink()
+        text = json.dumps(dict(settings), sort_keys=True)
+        path = self._folder / "settings.json"
+        if path.exists() and path.read_text() != text:
+            raise InvalidInput(
+                f"the collection begun in {self._folder}",
+                "made with other settings",
+                "continued with the same settings, or its folder removed",
+            )
+        if not path.exists():
+            temporary = path.with_suffix(".tmp")
+            temporary.write_text(text)
+            temporary.rename(path)
+        self._settings = text
+
+    def path(self, index: int) -> Path:
+        """Where the episode of this index belongs."""
+        return self._folder / f"{index:07d}.npz"
+
+    def finished(self) -> frozenset[int]:
+        """Indices of the episodes that are there."""
+        return frozenset(int(path.stem) for path in self._folder.glob("*.npz"))
+
+    def combine(self, count: int) -> None:
+        """Write episodes 0 to count - 1 into the HDF5 file, then remove the folder."""
+        temporary = self._out.with_name(self._out.name + ".tmp")
+        with h5py.File(temporary, "w") as file:
+            file.attrs["settings"] = self._settings
+            for index in range(count):
+                _to_group(file.create_group(f"{index:07d}"), load_episode(self.path(index)))
+            file.flush()
+        os.replace(temporary, self._out)
+        shutil.rmtree(self._folder)
+
+
+def save_episode(path: Path, episode: PushEpisode) -> None:
+    """Write one episode; the file appears complete or not at all."""
+    arrays = {name: getattr(episode, name) for name in _ARRAYS}
+    if episode.frames is not None:
+        arrays["frames"] = episode.frames
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        np.savez_compressed(file, names=np.array(episode.names), seed=episode.seed, **arrays)
+    os.replace(temporary, path)
+
+
+def load_episode(path: Path) -> PushEpisode:
+    """Read what `save_episode` wrote."""
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in _ARRAYS}
+        frames = data.get("frames")
+        return PushEpisode(tuple(data["names"].tolist()), int(data["seed"]), **arrays, frames=frames)
+
+
+def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
+    """All episodes of a push file, in order.
+
+    Raises:
+        CorruptFile: if it is not a push file.
+    """
+    try:
+        with h5py.File(path) as file:
+            return tuple(_from_group(group) for _, group in sorted(file.items()))
+    except (OSError, KeyError) as error:
+        raise CorruptFile(path, f"it is not a push file ({error})") from error
+
+
+def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
+    group.attrs["seed"] = episode.seed
+    group.create_dataset("names", data=list(episode.names), dtype=h5py.string_dtype())
+    for name in _ARRAYS:
+        group.create_dataset(name, data=getattr(episode, name), compression="gzip", shuffle=True)
+    if episode.frames is not None:
+        group.create_dataset("frames", data=episode.frames, compression="gzip", shuffle=True)
+
+
+def _from_group(group: h5py.Group) -> PushEpisode:
+    arrays = {name: np.asarray(group[name]) for name in _ARRAYS}
+    names = tuple(name.decode() for name in np.asarray(group["names"]).tolist())
+    frames = np.asarray(group["frames"]) if "frames" in group else None
+    return PushEpisode(names, int(np.asarray(group.attrs["seed"])), **arrays, frames=frames)

@@ -1,0 +1,358 @@
+"""The simulated tabletop: PyBullet moves the objects, ray tracing (or TinyRenderer) takes the pictures.
+
+One implementation of `osfcore.world.protocol.World`, with what only a simulator can do besides: tell the truth, take
+any view, move things by hand. Several may live in one process. Deterministic: the same seed gives the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import InvalidInput, MissingAssets, OsfError, OverlappingObjects, UnknownName
+from osfcore.objects.asset import ObjectAsset
+from osfcore.objects.library import AssetLibrary
+from osfcore.poses import Pose, unit_quaternion
+from osfcore.scene import (
+    MAX_OBJECTS,
+    PUSHER_CENTRE_Z_M,
+    PUSHER_REACH_M,
+    Camera,
+    Light,
+    Observation,
+    SceneState,
+    check_action,
+    default_cameras,
+    finite_vector,
+)
+from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, Physics
+from osfcore.world.placing import is_calm, place_randomly
+from osfcore.world.raytrace import Picture, RayTracer, masks_of
+from osfcore.world.tiny import TinyScene
+from osfcore.world.traced import TracedMesh
+
+Renderer = Literal["embree", "tiny"]
+OVERLAP_TOLERANCE_M = 0.002
+_SETTLE_LIMIT_S = 3.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneRequest:
+    """What a random scene shall contain.
+
+    Attributes:
+        names: the objects, or None for a random choice.
+        count: how many objects, where `names` is None.
+        light: the light, or None for a random one at least 10 deg above the table.
+    """
+
+    names: tuple[str, ...] | None = None
+    count: int = 3
+    light: Light | None = None
+
+
+class Tabletop:
+    """A table, objects, a pusher, cameras and a light, simulated.
+
+    Args:
+        library: where the objects' meshes are.
+        cameras: what `observe` looks through.
+        request: what `reset` puts on the table.
+        renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used).
+        executor: takes the views of an observation side by side, if given; threads serve.
+
+    Raises:
+        UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
+    """
+
+    def __init__(
+        self,
+        library: AssetLibrary,
+        *,
+        cameras: tuple[Camera, ...] | None = None,
+        request: SceneRequest | None = None,
+        renderer: Renderer = "embree",
+        executor: Executor | None = None,
+    ) -> None:
+        if renderer not in ("embree", "tiny"):
+            raise InvalidInput("renderer", repr(renderer), '"embree" or "tiny"')
+        self.cameras = default_cameras() if cameras is None else cameras
+        self._library = library
+        self._request = SceneRequest() if request is None else request
+        _check_request(library, self._request)
+        self._renderer: Renderer = renderer
+        self._executor = executor
+        self._assets: dict[str, ObjectAsset] = {}
+        self._meshes: dict[str, TracedMesh] = {}
+        self._physics: Physics | None = None
+        self._tiny: TinyScene | None = None
+        self._names: tuple[str, ...] = ()
+        self._light = Light(np.array([0.0, 0.0, 1.0]))
+        self._steps = 0
+
+    # The World protocol
+
+    def reset(self, seed: int) -> Observation:
+        """A new random scene at rest; the same for the same seed, request and objects.
+
+        Raises:
+            NoRoom: if the objects do not fit side by side.
+        """
+        self.arrange(seed)
+        return self.observe()
+
+    def observe(self, *, masks: bool = False) -> Observation:
+        """One image per camera."""
+        return self.render(self.cameras, masks=masks)
+
+    def act(self, action: Float[np.ndarray, "3"]) -> None:
+        """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s. The pusher stops at the border of its reach.
+
+        Raises:
+            InvalidInput: if the action is outside its limits; the world is unchanged.
+        """
+        self.act_contacts(action)
+
+    def close(self) -> None:
+        """Free the simulation."""
+        if self._physics is not None:
+            self._physics.close()
+            self._physics = None
+        if self._tiny is not None:
+            self._tiny.close()
+            self._tiny = None
+
+    # What only a simulator can do
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The objects on the table."""
+        return self._names
+
+    @property
+    def assets(self) -> Mapping[str, ObjectAsset]:
+        """The objects on the table with their shapes."""
+        return {name: self._asset(name) for name in self._names}
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the last reset or load [s]."""
+        return self._steps * TIME_STEP_S
+
+    @property
+    def _bodies(self) -> Physics:
+        if self._physics is None:
+            raise OsfError("The table is empty; reset or load a scene first.")
+        return self._physics
+
+    def truth(self) -> SceneState:
+        """The true state, for drawing and evaluation; estimators must not see it."""
+        bodies = self._bodies
+        poses = [bodies.pose(name) for name in self._names]
+        stacked = Pose(
+            np.array([p.position for p in poses]).reshape(-1, 3),
+            np.array([p.quaternion for p in poses]).reshape(-1, 4),
+        )
+        return SceneState(self._names, stacked, self._light, bodies.pusher)
+
+    def arrange(self, seed: int) -> None:
+        """Like `reset`, without taking images.
+
+        Raises:
+            NoRoom: if the objects do not fit side by side.
+        """
+        rng = np.random.default_rng(seed)
+        names = self._request.names
+        if names is None:
+            available = self._library.names()
+            names = tuple(available[i] for i in rng.choice(len(available), self._request.count, replace=False))
+        self._load_objects(names)
+        place_randomly(self._bodies, self.assets, rng)
+        drawn = Light.random(rng)  # drawn in any case, so that a given light leaves the rest of the scene alone
+        self._light = drawn if self._request.light is None else self._request.light
+        self._steps = 0
+
+    def load(self, state: SceneState) -> None:
+        """Put exactly this state on the table, at rest; a state without pusher parks it at the reach's corner.
+
+        Raises:
+            UnknownName, MissingAssets: if an object is not in the library.
+            OverlappingObjects: if bodies penetrate by more than 2 mm; then the table is as before.
+        """
+        for name in state.names:
+            _check_object(self._library, name)
+        before = (self._names, self.truth() if self._physics is not None else None)
+        self._place_all(state)
+        try:
+            self._refuse_overlaps()
+        except OverlappingObjects:
+            if before[1] is not None:
+                self._place_all(before[1])
+            else:
+                self.close()
+            raise
+        self._steps = 0
+
+    def act_steps(self, action: Float[np.ndarray, "3"], rate_hz: float = 60.0) -> Iterator[SceneState]:
+        """Like `act`, telling the state about `rate_hz` times a second of simulated time; the last one is the end.
+
+        Raises:
+            InvalidInput: if the action is outside its limits; the world is unchanged.
+        """
+        velocity = check_action(action)
+        stride = max(round(1 / (rate_hz * TIME_STEP_S)), 1)
+        for step in range(1, SUBSTEPS + 1):
+            self._advance(velocity)
+            if step % stride == 0 or step == SUBSTEPS:
+                yield self.truth()
+
+    def act_contacts(self, action: Float[np.ndarray, "3"]) -> frozenset[str]:
+        """Like `act`; returns the objects that the pusher touched meanwhile."""
+        velocity = check_action(action)
+        return frozenset().union(*(self._advance(velocity) for _ in range(SUBSTEPS)))
+
+    def settle(self, rate_hz: float = 60.0) -> Iterator[SceneState]:
+        """Let everything come to rest, at most 3 s, telling the state on the way."""
+        stride = max(round(1 / (rate_hz * TIME_STEP_S)), 1)
+        for step in range(1, round(_SETTLE_LIMIT_S / TIME_STEP_S) + 1):
+            self._advance(np.zeros(3))
+            if step % stride == 0:
+                yield self.truth()
+                if is_calm(self._bodies, self._names):
+                    return
+
+    def move_object(self, name: str, pose: Pose) -> None:
+        """Put one object at rest at `T_world_object`.
+
+        Raises:
+            UnknownName: if it is not on the table.
+            InvalidInput: if the pose is not finite, its quaternion not unit, or it is off the table.
+            OverlappingObjects: if it would penetrate something by more than 2 mm; then nothing moved.
+        """
+        if name not in self._names:
+            raise UnknownName("object on the table", name, self._names)
+        position = finite_vector(pose.position, 3, f"position of {name} [m]")
+        quaternion = unit_quaternion(pose.quaternion, f"quaternion of {name}")
+        bodies = self._bodies
+        before = bodies.pose(name)
+        bodies.place(name, Pose(position, quaternion))
+        try:
+            self._refuse_overlaps(name)
+        except OverlappingObjects:
+            bodies.place(name, before)
+            raise
+
+    def move_pusher(self, position: Float[np.ndarray, "3"]) -> None:
+        """Put the pusher somewhere within its reach [m]; its height stays.
+
+        Raises:
+            InvalidInput: if the position is out of reach or not finite.
+            OverlappingObjects: if it would penetrate an object; then it did not move.
+        """
+        x, y, _ = finite_vector(position, 3, "pusher position [m]")
+        if max(abs(x), abs(y)) > PUSHER_REACH_M:
+            raise InvalidInput("pusher position [m]", [x, y], f"within |x|, |y| <= {PUSHER_REACH_M}")
+        bodies = self._bodies
+        before = bodies.pusher
+        bodies.place_pusher(np.array([x, y, PUSHER_CENTRE_Z_M]))
+        try:
+            self._refuse_overlaps()
+        except OverlappingObjects:
+            bodies.place_pusher(before)
+            raise
+
+    def set_light(self, light: Light) -> None:
+        """Move the lamp."""
+        self._light = light
+
+    def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
+        """Images from any cameras of one image size, with masks on demand, with or without the pusher."""
+        if len({(c.width, c.height) for c in cameras}) != 1:
+            raise InvalidInput("image sizes", [(c.width, c.height) for c in cameras], "the same for all cameras")
+        pictures = self.pictures(cameras, with_pusher=with_pusher)
+        count = len(self._names)
+        return Observation(
+            cameras=cameras,
+            images=np.stack([picture.rgb for picture in pictures]),
+            names=self._names,
+            masks=np.stack([masks_of(picture, count) for picture in pictures]) if masks else None,
+            pusher=self._bodies.pusher if with_pusher else None,
+            time_s=self.time_s,
+        )
+
+    def pictures(self, cameras: tuple[Camera, ...], *, with_pusher: bool = True) -> tuple[Picture, ...]:
+        """Images with coverage and depth, for tests and evaluation."""
+        state = self.truth()
+        if not with_pusher:
+            state = SceneState(state.names, state.poses, state.light, None)
+        if self._renderer == "tiny":
+            if self._tiny is None:
+                self._tiny = TinyScene(self.assets)
+            return self._tiny.render(state, cameras)
+        for name in self._names:
+            if name not in self._meshes:
+                self._meshes[name] = TracedMesh(self._asset(name).mesh)
+        return RayTracer(self._meshes, executor=self._executor).render(state, cameras)
+
+    def _asset(self, name: str) -> ObjectAsset:
+        if name not in self._assets:
+            self._assets[name] = self._library.load(name)
+        return self._assets[name]
+
+    def _advance(self, velocity: Float[np.ndarray, "3"]) -> frozenset[str]:
+        self._steps += 1
+        return self._bodies.step(velocity)
+
+    def _load_objects(self, names: tuple[str, ...]) -> None:
+        assets = {name: self._asset(name) for name in names}
+        self.close()
+        self._physics = Physics(assets)
+        self._names = names
+
+    def _place_all(self, state: SceneState) -> None:
+        self._load_objects(state.names)
+        for i, name in enumerate(state.names):
+            self._bodies.place(name, state.poses[i])
+        parked = np.array([PUSHER_REACH_M, PUSHER_REACH_M, PUSHER_CENTRE_Z_M])
+        self._bodies.place_pusher(parked if state.pusher is None else state.pusher)
+        self._light = state.light
+
+    def _refuse_overlaps(self, moved: str | None = None) -> None:
+        """Raise OverlappingObjects if bodies penetrate; with `moved`, only pairs of which it is one are looked at."""
+        bodies = self._bodies
+        for i, first in enumerate(self._names):
+            gaps = {second: bodies.distance(first, second) for second in self._names[i + 1 :]}
+            gaps["the pusher"] = bodies.distance(first, None)
+            gaps["the table"] = bodies.table_distance(first)
+            for second, gap in gaps.items():
+                if gap < -OVERLAP_TOLERANCE_M and moved in (None, first, second):
+                    raise OverlappingObjects(first, second, -gap)
+
+
+def _check_object(library: AssetLibrary, name: str) -> None:
+    if not library.has(name):
+        library.info(name)  # raises UnknownName for what no catalogue knows
+        raise MissingAssets([name])
+
+
+def _check_request(library: AssetLibrary, request: SceneRequest) -> None:
+    if request.names is not None:
+        if not 1 <= len(request.names) <= MAX_OBJECTS:
+            raise InvalidInput("number of objects", len(request.names), f"between 1 and {MAX_OBJECTS}")
+        if len(set(request.names)) != len(request.names):
+            raise InvalidInput("list of objects", ", ".join(request.names), "without repetition")
+        for name in request.names:
+            _check_object(library, name)
+        return
+    if not 1 <= request.count <= MAX_OBJECTS:
+        raise InvalidInput("number of objects", request.count, f"between 1 and {MAX_OBJECTS}")
+    available = len(library.names())
+    if available == 0:
+        raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
+    if request.count > available:
+        raise InvalidInput("number of objects", request.count, f"at most {available}, as many as were fetched")
