@@ -1,0 +1,1 @@
+"""Which objects exist: catalogue, mesh sources, conversion, the library on disk."""

@@ -1,7 +1,8 @@
 """The YCB objects that are known by name: label, mass, symmetry, licence. Meshes come from `sources`.
 
-Masses are those of the YCB data sheet. Symmetries follow BOP's YCB-V in the object frame (the google_16k axes, origin at
-the centre of the bounding box): an object is symmetric only where its label and colours are, too.
+Masses are those of the YCB data sheet. Symmetries follow BOP's YCB-V in the object frame (the google_16k axes, origin
+at the bounding box's centre): an object is symmetric only where its label and colours are, too. The axes of the
+symmetric objects were measured on the meshes: they lie within a degree of the frame's.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,17 @@ from osfcore.objects.asset import ObjectInfo, Symmetry
 LICENCE = "CC-BY-4.0"
 ATTRIBUTION = "YCB Object and Model Set, ycbbenchmarks.com (Calli et al. 2015)"
 
-_HALF_TURNS = ((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+_S = 0.5**0.5
+_SQUARE_PRISM = (
+    (_S, 0.0, 0.0, _S),  # turns about z
+    (0.0, 0.0, 0.0, 1.0),
+    (_S, 0.0, 0.0, -_S),
+    (0.0, 1.0, 0.0, 0.0),  # half turns about horizontal axes
+    (0.0, 0.0, 1.0, 0.0),
+    (0.0, _S, _S, 0.0),
+    (0.0, _S, -_S, 0.0),
+)
+_HALF_TURN_Z = ((0.0, 0.0, 0.0, 1.0),)
 _LABEL = "printed label breaks the symmetry"
 
 _ROWS = (
@@ -34,8 +45,13 @@ _ROWS = (
     ("024_bowl", "Bowl", 0.147, Symmetry("continuous", axis=(0.0, 0.0, 1.0), reason="plain body of revolution")),
     ("025_mug", "Mug", 0.118, Symmetry("none", reason="handle")),
     ("035_power_drill", "Power drill", 0.895, Symmetry("none", reason="no symmetric shape")),
-    ("036_wood_block", "Wood block", 0.729, Symmetry("discrete", _HALF_TURNS, reason="plain block")),
-    ("061_foam_brick", "Foam brick", 0.028, Symmetry("discrete", _HALF_TURNS, reason="plain brick")),
+    ("036_wood_block", "Wood block", 0.729, Symmetry("discrete", _SQUARE_PRISM, reason="plain square block")),
+    (
+        "061_foam_brick",
+        "Foam brick",
+        0.028,
+        Symmetry("discrete", _HALF_TURN_Z, reason="plain brick, holes in its top only"),
+    ),
 )
 
 CATALOGUE: Mapping[str, ObjectInfo] = MappingProxyType(

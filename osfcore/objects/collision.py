@@ -29,10 +29,8 @@ def convex_parts(mesh: TexturedMesh, concavity: float = CONCAVITY) -> tuple[Floa
     """
     vertices, faces = np.asarray(mesh.vertices, float), mesh.faces
     longest = float(np.ptp(vertices, axis=0).max())
-    if dent_depth_m(mesh) <= _SHALLOW * longest:
-        clouds = [vertices]
-    else:
-        clouds = _decomposed(vertices, faces, concavity)
+    is_shallow = dent_depth_m(mesh) <= _SHALLOW * longest
+    clouds = [vertices] if is_shallow else _decomposed(vertices, faces, concavity)
     hulls = [reduced_hull(cloud) for cloud in clouds]
     solid = tuple(hull.astype(np.float32) for hull in hulls if hull is not None)
     if not solid:
@@ -50,8 +48,8 @@ def dent_depth_m(mesh: TexturedMesh) -> float:
         hull = body.convex_hull
     except QhullError as error:
         raise InvalidInput("mesh", "without volume", "a solid body") from error
-    surface, _ = trimesh.sample.sample_surface(body, _SAMPLES, seed=0)
-    around, _ = trimesh.sample.sample_surface(hull, _SAMPLES // 4, seed=0)
+    surface = trimesh.sample.sample_surface(body, _SAMPLES, seed=0)[0]
+    around = trimesh.sample.sample_surface(hull, _SAMPLES // 4, seed=0)[0]
     return float(np.percentile(KDTree(np.concatenate([surface, mesh.vertices])).query(around)[0], 99))
 
 
@@ -78,8 +76,8 @@ def reduced_hull(
 ) -> Float[np.ndarray, "M 3"] | None:
     """Few of the points whose hull leaves out no other by more than `tolerance_m`, or None if they span no volume.
 
-    Starts from the extremes along 13 axes and adds the point that sticks out most, again and again. Where `max_vertices`
-    do not suffice, the hull is swollen by half of what still sticks out.
+    Starts from the extremes along 13 axes and adds the point that sticks out most, again and again. Where
+    `max_vertices` do not suffice, the hull is swollen by half of what still sticks out.
     """
     try:
         points = points[ConvexHull(points).vertices]

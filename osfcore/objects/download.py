@@ -13,6 +13,7 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,32 +29,49 @@ _TEMPORARY_LIFE_S = 3600  # older folders were left by a killed process
 
 
 @contextlib.contextmanager
+def told_as_fetch_failed(what: str, place: Path) -> Iterator[None]:
+    """Tell a full disk, or a place that cannot be written, in one sentence.
+
+    Raises:
+        FetchFailed: instead of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise FetchFailed(what, f"{place} cannot be written ({error.strerror or error})") from error
+
+
+@contextlib.contextmanager
 def temporary_folder(parent: Path, what: str) -> Iterator[Path]:
     """A folder inside `parent` that is gone afterwards; folders that a killed process left long ago go with it.
 
     Raises:
         FetchFailed: if it cannot be made.
     """
-    try:
+    with told_as_fetch_failed(what, parent):
         parent.mkdir(parents=True, exist_ok=True)
-        for old in parent.glob(f"{_TEMPORARY_PREFIX}*"):
-            if time.time() - old.stat().st_mtime > _TEMPORARY_LIFE_S:
-                shutil.rmtree(old, ignore_errors=True)
+        remove_old(parent, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
         folder = Path(tempfile.mkdtemp(prefix=_TEMPORARY_PREFIX, dir=parent))
-    except OSError as error:
-        raise FetchFailed(what, f"{parent} cannot be written ({error.strerror})") from error
     try:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def remove_old(parent: Path, prefix: str, age_s: float) -> None:
+    """Remove folders of that prefix which are older than `age_s` [s]."""
+    for path in parent.glob(f"{prefix}*"):
+        with contextlib.suppress(OSError):  # another process may be removing it, too
+            if time.time() - path.stat().st_mtime > age_s:
+                shutil.rmtree(path, ignore_errors=True)
+
+
 def download(address: str, path: Path, max_bytes: int = MAX_BYTES) -> bool:
     """Load a file from an http(s) address, with a few tries; False if the server does not have it.
 
     Raises:
-        FetchFailed: if the server cannot be reached, answers with an error, sends too much or breaks off, or the disk is
-            full; `path` is then not there.
+        FetchFailed: if the server cannot be reached, answers with an error, sends too much or breaks off, or the disk
+            is full; `path` is then not there.
     """
     reason = ""
     for attempt in range(TRIES):
@@ -81,15 +99,15 @@ def _save(answer: http.client.HTTPResponse, path: Path, max_bytes: int, address:
     size = 0
     part = path.with_name(path.name + ".part")
     try:
-        with part.open("wb") as file:
+        with told_as_fetch_failed(address, path.parent):
+            file = part.open("wb")
+        with file:
             while chunk := answer.read(_CHUNK_BYTES):
                 size += len(chunk)
                 if size > max_bytes:
                     raise FetchFailed(address, f"it is larger than {max_bytes / 1e6:.0f} MB")
-                try:
+                with told_as_fetch_failed(address, path.parent):
                     file.write(chunk)
-                except OSError as error:
-                    raise FetchFailed(address, f"{path.parent} cannot be written ({error.strerror})") from error
         if expected is not None and size != int(expected):
             raise ConnectionError(f"{size} of {expected} bytes arrived")
         part.replace(path)
@@ -120,6 +138,8 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
         if error.errno is None or "gzip" in str(error).lower():
             raise CorruptFile(archive, "it is a damaged archive") from error
         raise FetchFailed(archive.name, f"{folder} cannot be written ({error.strerror})") from error
+    except (ValueError, zlib.error) as error:
+        raise CorruptFile(archive, "it is a damaged archive") from error
 
 
 def pip_download(requirement: str, folder: Path) -> Iterator[int]:

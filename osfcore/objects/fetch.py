@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, Symmetry, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.objects.download import temporary_folder
+from osfcore.objects.download import temporary_folder, told_as_fetch_failed
 from osfcore.objects.library import AssetLibrary, check_name
 from osfcore.progress import Progress
 
@@ -83,7 +83,8 @@ def _converted(
             note = f"{{}} {label} ({done + len(running)} of {objects})"
             yield Progress(done, total, note.format("Getting"))
             place = folder / name
-            place.mkdir()
+            with told_as_fetch_failed(name, folder):
+                place.mkdir()
             files = source.files(name, place)
             yield Progress(done, total, note.format("Converting"))
             if executor is None:
@@ -99,10 +100,9 @@ def _converted(
                 done += 1
                 yield Progress(done, total, f"Converted {label} ({done - 1} of {objects})")
     finally:
-        # Conversions that run already write into the library, not into the folder; they only must not lose their input.
         for future in running:
             future.cancel()
-        wait(running)
+        wait(running)  # those that run already would lose their input with the folder
 
 
 def convert(files: MeshFiles, info: ObjectInfo, library: AssetLibrary, source: str) -> None:
@@ -181,9 +181,13 @@ def add_object(
 def _read(files: MeshFiles) -> TexturedMesh:
     from osfcore.objects.mesh import read_mesh, textured_mesh
     from osfcore.objects.msh import read_msh
+    from osfcore.objects.surface import PLAIN_SIDE
 
     if files.mesh.suffix != ".msh":
-        return read_mesh(files.mesh)
+        mesh = read_mesh(files.mesh)
+        if max(mesh.texture.shape) <= PLAIN_SIDE:
+            raise CorruptFile(files.mesh, "the image of its texture is missing")
+        return mesh
     import cv2
 
     raw = read_msh(files.mesh)

@@ -1,8 +1,8 @@
 """Objects on disk: one folder each, written whole or not at all.
 
-A folder holds `object.json` (facts, format version, checksums), `arrays.npz` (mesh, collision parts, resting orientations),
-`texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. It is written under another name beside its place,
-synced, and renamed, so that a kill or a full disk leaves either the old object or none.
+A folder holds `object.json` (facts, format version, checksums), `arrays.npz` (mesh, collision parts, resting
+orientations), `texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. It is written under another name
+beside its place, synced, and renamed, so that a kill or a full disk leaves either the old object or none.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import os
 import re
 import shutil
 import tempfile
-import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -24,9 +23,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, MissingAssets, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
+from osfcore.objects.download import remove_old, told_as_fetch_failed
 
 FORMAT_VERSION = 1
 _FACTS, _ARRAYS, _TEXTURE, _VIEWER = "object.json", "arrays.npz", "texture.png", "viewer.glb"
@@ -105,7 +105,9 @@ class AssetLibrary:
             with np.load(io.BytesIO(self._checked(name, _ARRAYS, facts)), allow_pickle=False) as stored:
                 arrays = {key: stored[key] for key in stored.files}
             png = np.frombuffer(self._checked(name, _TEXTURE, facts), np.uint8)
-            texture = np.ascontiguousarray(cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1])
+            texture = cv2.imdecode(png, cv2.IMREAD_COLOR_RGB)
+            if texture is None:
+                raise CorruptFile(self.root / name / _TEXTURE, "it is not an image")
             mesh = TexturedMesh(arrays["vertices"], arrays["normals"], arrays["faces"], arrays["uv"], texture)
             parts = tuple(np.split(arrays["parts"], np.cumsum(arrays["part_sizes"])[:-1]))
             resting = RestingPoses(arrays["resting_quaternions"], arrays["resting_probabilities"])
@@ -136,9 +138,9 @@ class AssetLibrary:
         from osfcore.objects.viewer_mesh import viewer_glb
 
         glb = viewer_glb(asset.mesh)
-        try:
+        with told_as_fetch_failed(asset.info.name, self.root):
             self.root.mkdir(parents=True, exist_ok=True)
-            self._remove_stale()
+            remove_old(self.root, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
             with self._temporary(asset.info.name) as folder:
                 _write_arrays(folder / _ARRAYS, asset)
                 _write_png(folder / _TEXTURE, asset.mesh.texture)
@@ -155,8 +157,6 @@ class AssetLibrary:
                 for path in (*folder.iterdir(), folder):
                     _sync(path)
                 self._put(folder, self.root / asset.info.name)
-        except OSError as error:
-            raise FetchFailed(asset.info.name, f"{self.root} cannot be written ({error.strerror})") from error
 
     def _facts(self, name: str) -> dict[str, Any]:
         path = self.root / name / _FACTS
@@ -215,12 +215,6 @@ class AssetLibrary:
             os.rename(folder, place)
         _sync(self.root)
 
-    def _remove_stale(self) -> None:
-        for path in self.root.glob(f"{_TEMPORARY_PREFIX}*"):
-            with contextlib.suppress(OSError):
-                if time.time() - path.stat().st_mtime > _TEMPORARY_LIFE_S:
-                    shutil.rmtree(path, ignore_errors=True)
-
 
 def check_name(name: str) -> str:
     """A name that a user's object may have.
@@ -237,7 +231,10 @@ def check_name(name: str) -> str:
 def _info_from_json(facts: dict[str, Any]) -> ObjectInfo:
     symmetry = facts["symmetry"]
     rotations = tuple((float(w), float(x), float(y), float(z)) for w, x, y, z in symmetry["rotations"])
-    axis = symmetry["axis"] and tuple(float(a) for a in symmetry["axis"])
+    axis = None
+    if symmetry["axis"] is not None:
+        x, y, z = symmetry["axis"]
+        axis = (float(x), float(y), float(z))
     return ObjectInfo(
         name=str(facts["name"]),
         label=str(facts["label"]),

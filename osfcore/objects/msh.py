@@ -1,7 +1,7 @@
 """Reader of MuJoCo's binary mesh format.
 
-Four int32 counts (vertices, normals, texture coordinates, faces), then float32 vertices, normals and texture coordinates,
-then int32 faces. Here v runs downwards; it is turned to run upwards as in OBJ.
+Four int32 counts (vertices, normals, texture coordinates, faces), then float32 vertices, normals and texture
+coordinates, then int32 faces. Here v runs downwards; it is turned to run upwards as in OBJ.
 """
 
 from dataclasses import dataclass

@@ -15,8 +15,8 @@ _SAME_DOWN_RAD = 0.35  # the facets of a rolling can lie closer together than th
 def resting_poses(parts: tuple[Float[np.ndarray, "M 3"], ...]) -> RestingPoses:
     """Orientations at rest on a plane, for a body of uniform density made of convex parts.
 
-    Poses that differ by a turn about the vertical, or by less than 20 degrees in what points down, count as one; those that a
-    random drop hardly ever ends in are left out.
+    Poses that differ by a turn about the vertical, or by less than 20 degrees in what points down, count as one; those
+    that a random drop hardly ever ends in are left out.
 
     Raises:
         InvalidInput: if the parts span no volume.
@@ -37,7 +37,7 @@ def resting_poses(parts: tuple[Float[np.ndarray, "M 3"], ...]) -> RestingPoses:
     for i in order:
         near = [k for k, j in enumerate(kept) if downs[i] @ downs[j] > np.cos(_SAME_DOWN_RAD)]
         if near:
-            sums[near[0]] += probabilities[i]
+            sums[near[0]] += float(probabilities[i])
         else:
             kept.append(int(i))
             sums.append(float(probabilities[i]))

@@ -1,13 +1,14 @@
 """Where meshes come from: the package on PyPI, a folder in google_16k layout, a web server with either layout.
 
-A source brings files onto this machine; `fetch` turns them into objects. Everything downloaded lands under a temporary name
-in the cache folder and is renamed once it is complete and verified.
+A source brings files onto this machine; `fetch` turns them into objects. Everything downloaded lands under a temporary
+name in the cache folder and is renamed once it is complete and verified.
 """
 
 from __future__ import annotations
 
 import hashlib
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Protocol
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName
 from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
-from osfcore.objects.download import download, pip_download, temporary_folder, unpack
+from osfcore.objects.download import download, pip_download, temporary_folder, told_as_fetch_failed, unpack
 from osfcore.progress import Progress
 
 _LAYOUTS = ("{name}/google_16k/textured.obj", "{name}/textured.obj")
@@ -122,23 +123,22 @@ class WheelSource:
         digest = _sha256(path)
         if digest != self.SHA256:
             raise FetchFailed(self.label, f"its SHA-256 is {digest} instead of {self.SHA256}")
-        self._cache.mkdir(parents=True, exist_ok=True)
-        path.replace(self.wheel)
+        with told_as_fetch_failed(self.label, self._cache):
+            self._cache.mkdir(parents=True, exist_ok=True)
+            path.replace(self.wheel)
 
     def files(self, name: str, folder: Path) -> MeshFiles:
         """Mesh and texture of one object, taken out of the wheel."""
         if name not in DEFAULT_NAMES:
             raise UnknownName(f"object in {self.label}", name, DEFAULT_NAMES)
-        files = MeshFiles(folder / f"{name}.msh", folder / f"{name}.png")
+        mesh, texture = folder / f"{name}.msh", folder / f"{name}.png"
         try:
-            with zipfile.ZipFile(self.wheel) as wheel:
-                files.mesh.write_bytes(wheel.read(f"{self.FOLDER}/meshes/{name}.msh"))
-                folder.joinpath(f"{name}.png").write_bytes(wheel.read(f"{self.FOLDER}/textures/{name}.png"))
-        except (zipfile.BadZipFile, KeyError) as error:
+            with told_as_fetch_failed(name, folder), zipfile.ZipFile(self.wheel) as wheel:
+                mesh.write_bytes(wheel.read(f"{self.FOLDER}/meshes/{name}.msh"))
+                texture.write_bytes(wheel.read(f"{self.FOLDER}/textures/{name}.png"))
+        except (zipfile.BadZipFile, zlib.error, KeyError) as error:
             raise CorruptFile(self.wheel, f"it does not hold {name}") from error
-        except OSError as error:
-            raise FetchFailed(name, f"{folder} cannot be written ({error.strerror})") from error
-        return files
+        return MeshFiles(mesh, texture)
 
 
 class FolderSource:

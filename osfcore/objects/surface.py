@@ -1,10 +1,11 @@
-"""Colours of loaded meshes as one texture: images, colour factors, vertex or face colours, several materials at once."""
+"""Colours of loaded meshes as one texture: images, colour factors, vertex or face colours, several materials."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 MAX_IMAGE_PIXELS = 8192 * 8192
 _MAX_TILES = 4  # how often a texture may repeat along one side
+PLAIN_SIDE = 4  # texels a side of the texture of a body of one colour
 _CELL = 4  # texels a side of the cell that one face's vertex colours get
 _GREY = (178, 178, 178)
 
@@ -43,7 +45,7 @@ def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
     Raises:
         InvalidInput: if the image has over 67 million pixels or repeats too often.
     """
-    visual = mesh.visual
+    visual: Any = mesh.visual  # trimesh's kinds of visuals share no base that tells their attributes
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     uv = getattr(visual, "uv", None)
     if visual.kind == "texture":
@@ -65,7 +67,7 @@ def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
         return _baked(vertices, faces, corner_colours[..., :3].astype(float))
     else:
         colour = np.array(_GREY)
-    texture = np.broadcast_to(np.round(colour).astype(np.uint8), (_CELL, _CELL, 3)).copy()
+    texture = np.broadcast_to(np.round(colour).astype(np.uint8), (PLAIN_SIDE, PLAIN_SIDE, 3)).copy()
     return TexturedPiece(vertices, faces, np.full((len(vertices), 2), 0.5), texture)
 
 
@@ -122,8 +124,6 @@ def joined(pieces: list[TexturedPiece]) -> TexturedPiece:
     """All pieces as one, their textures (equal ones once) stacked into one image."""
     if len(pieces) == 1:
         return pieces[0]
-    import cv2
-
     images = {_key(p.texture): p.texture for p in pieces}
     width = max(image.shape[1] for image in images.values())
     tops, rows, top = {}, [], 0

@@ -1,7 +1,7 @@
 """Textures without traces of their background: reduced by a coverage-weighted filter, filled around the charts.
 
-Scanned textures show their charts on black. A plain filter or mip map would pull that black into the charts' rims; here only
-texels that a face covers count, and all others continue the colours of their neighbours.
+Scanned textures show their charts on black. A plain filter or mip map would pull that black into the charts' rims; here
+only texels that a face covers count, and all others continue the colours of their neighbours.
 """
 
 import cv2

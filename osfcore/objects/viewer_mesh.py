@@ -15,6 +15,9 @@ def viewer_glb(mesh: TexturedMesh) -> bytes:
     """Binary glTF with a JPEG texture of at most 1024 texels a side, in the mesh's own frame [m]."""
     import trimesh
     from PIL import Image
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual.material import PBRMaterial
+    from trimesh.visual.texture import TextureVisuals
 
     texture = mesh.texture
     scale = MAX_TEXTURE_SIDE / max(texture.shape[:2])
@@ -24,9 +27,9 @@ def viewer_glb(mesh: TexturedMesh) -> bytes:
     encoded = io.BytesIO()
     Image.fromarray(texture).save(encoded, format="JPEG", quality=_JPEG_QUALITY)
     image = Image.open(encoded)
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
-    visual = trimesh.visual.TextureVisuals(uv=mesh.uv, material=material)
+    material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    visual = TextureVisuals(uv=mesh.uv, material=material)
     light = trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=np.asarray(mesh.normals), visual=visual, process=False
     )
-    return bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(light), include_normals=True))
+    return bytes(export_glb(trimesh.Scene(light), include_normals=True))

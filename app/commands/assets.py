@@ -1,0 +1,194 @@
+"""`osf assets`: list, fetch and add objects."""
+
+from __future__ import annotations
+
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from app.commands.progress_bar import follow
+from app.paths import default_data_dir
+from osfcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from osfcore.objects.library import AssetLibrary
+
+MAX_WORKERS = 16
+
+
+@dataclass(frozen=True)
+class AssetsList:
+    """List the objects that are known, and which of them are on this machine."""
+
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps (also: OSF_DATA_DIR)."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> dict[str, Any]:
+        """Show the table; return its rows."""
+        from osfcore.objects.catalogue import CATALOGUE
+
+        library = _library(self.data_dir)
+        names = sorted({*CATALOGUE, *library.names()})
+        rows = [_row(library, name) for name in names]
+        if not self.json:
+            _show(rows)
+        return {"objects": rows, "data_dir": str(self.data_dir)}
+
+
+@dataclass(frozen=True)
+class AssetsFetch:
+    """Fetch objects of the catalogue and make them ready: texture, collision parts, resting orientations."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Objects such as 006_mustard_bottle; none: all that the source offers."""
+    source: str = "pypi"
+    """"pypi" (ten objects), a folder with NAME/google_16k/textured.obj, or the http(s) address of such a folder or of
+    the archives NAME_google_16k.tgz."""
+    workers: int = 2
+    """Processes that convert meshes; 1 converts in this one."""
+    force: bool = False
+    """Fetch also what is here already."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps (also: OSF_DATA_DIR)."""
+    json: bool = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> dict[str, Any]:
+        """Fetch with a progress bar; return what is there now."""
+        from osfcore.objects.fetch import fetch
+        from osfcore.objects.sources import source_from
+
+        if not 1 <= self.workers <= MAX_WORKERS:
+            raise InvalidInput("workers", self.workers, f"between 1 and {MAX_WORKERS}")
+        library = _library(self.data_dir)
+        source = source_from(self.source, self.data_dir / "cache")
+        wanted = self.names or source.names()
+        with _executor(self.workers) if self.workers > 1 and self._work(library, wanted) else nullcontext() as executor:
+            follow(fetch(wanted, source, library, executor, force=self.force))
+        return {"objects": list(wanted), "available": list(library.names()), "data_dir": str(self.data_dir)}
+
+    def _work(self, library: AssetLibrary, wanted: tuple[str, ...]) -> int:
+        return sum(self.force or not library.has(name) for name in wanted)
+
+
+@dataclass(frozen=True)
+class AssetsAdd:
+    """Add an object of your own from a textured mesh."""
+
+    mesh: Annotated[Path, tyro.conf.Positional]
+    """OBJ, GLB or PLY file, in metres."""
+    name: str
+    """What scenes call it: lower-case letters, digits, '_' and '-'."""
+    mass: float
+    """Mass [kg]."""
+    label: str = ""
+    """Name for a person; made from the name if not given."""
+    scale: float = 1.0
+    """Metres for one unit of the file, such as 0.001 for millimetres."""
+    licence: str = "unknown"
+    """Licence of the mesh."""
+    force: bool = False
+    """Replace an object of that name."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps (also: OSF_DATA_DIR)."""
+    json: bool = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> dict[str, Any]:
+        """Convert and store the mesh; return its facts."""
+        from osfcore.objects.fetch import add_object
+
+        library = _library(self.data_dir)
+        asset = add_object(
+            self.mesh,
+            self.name,
+            self.mass,
+            library,
+            label=self.label,
+            scale=self.scale,
+            licence=self.licence,
+            force=self.force,
+        )
+        row = {**_row(library, self.name), "collision_parts": len(asset.parts)}
+        if not self.json:
+            size = _size_text(row["size_m"])
+            print(f"Added {self.name}: {size} cm, {self.mass:g} kg, {len(asset.parts)} collision parts.")
+        return row
+
+
+@dataclass(frozen=True)
+class Assets:
+    """List, fetch and add objects."""
+
+    action: (
+        Annotated[AssetsList, tyro.conf.subcommand("list")]
+        | Annotated[AssetsFetch, tyro.conf.subcommand("fetch")]
+        | Annotated[AssetsAdd, tyro.conf.subcommand("add")]
+    )
+
+    @property
+    def json(self) -> bool:
+        """Whether to print JSON."""
+        return self.action.json
+
+    def run(self) -> dict[str, Any]:
+        """Do what was chosen."""
+        return self.action.run()
+
+
+def _library(data_dir: Path) -> AssetLibrary:
+    from osfcore.objects.library import AssetLibrary
+
+    return AssetLibrary(data_dir / "objects")
+
+
+def _executor(workers: int) -> ProcessPoolExecutor:
+    from multiprocessing import get_context
+
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_die_on_interrupt)
+
+
+def _die_on_interrupt() -> None:
+    """Let Ctrl-C end a worker at once and silently; objects are written whole or not at all."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _row(library: AssetLibrary, name: str) -> dict[str, Any]:
+    info, available = library.info(name), library.has(name)
+    return {
+        "name": name,
+        "label": info.label,
+        "size_m": [float(side) for side in library.size_m(name)] if available else None,
+        "mass_kg": info.mass_kg,
+        "symmetry": info.symmetry.kind,
+        "symmetry_reason": info.symmetry.reason,
+        "available": available,
+        "licence": info.licence,
+        "attribution": info.attribution,
+    }
+
+
+def _size_text(size_m: list[float] | None) -> str:
+    return " x ".join(f"{100 * side:.0f}" for side in size_m) if size_m else ""
+
+
+def _show(rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for title in ("name", "label", "cm", "kg", "symmetry", "here", "licence"):
+        table.add_column(title, justify="right" if title in ("cm", "kg") else "left", no_wrap=True)
+    for row in rows:
+        here = "yes" if row["available"] else "no"
+        cells = (row["name"], row["label"], _size_text(row["size_m"]), f"{row['mass_kg']:.3f}")
+        table.add_row(*(escape(cell) for cell in (*cells, row["symmetry"], here, row["licence"])))
+    Console().print(table)
