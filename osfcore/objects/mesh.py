@@ -57,7 +57,7 @@ def read_mesh(path: Path, scale: float = 1.0) -> TexturedMesh:
     vertices = np.asarray(whole.vertices, float) * scale
     if path.suffix.lower() in _Y_UP_SUFFIXES:
         vertices = vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    return textured_mesh(vertices, whole.faces, whole.uv, whole.texture, path)
+    return textured_mesh(vertices, whole.faces, whole.uv, whole.texture, path, is_clean=whole.is_padded)
 
 
 def textured_mesh(
@@ -66,6 +66,8 @@ def textured_mesh(
     uv: Float[np.ndarray, "P 2"],
     texture: UInt8[np.ndarray, "h w 3"],
     source: Path | str,
+    *,
+    is_clean: bool = False,
 ) -> TexturedMesh:
     """The mesh in the object frame: centred, wound outward, smooth normals, clean texture.
 
@@ -75,6 +77,7 @@ def textured_mesh(
         uv: in [0, 1], v upwards.
         texture: RGB.
         source: what the message calls it when something is wrong.
+        is_clean: whether the texture can stay as it is.
 
     Raises:
         CorruptFile: if there are no triangles, numbers are not finite, indices point nowhere or it is flat.
@@ -98,21 +101,22 @@ def textured_mesh(
     if len(faces) == 0:
         raise CorruptFile(source, "all of its triangles are degenerate")
     faces = _outward(welded, weld, faces)
+    texture = np.ascontiguousarray(texture)
     return TexturedMesh(
         vertices=vertices.astype(np.float32),
         normals=_smooth_normals(welded, weld[faces])[weld].astype(np.float32),
         faces=faces.astype(np.int32),
         uv=np.clip(uv, 0, 1).astype(np.float32),
-        texture=clean_texture(np.ascontiguousarray(texture), uv, faces),
+        texture=texture if is_clean else clean_texture(texture, uv, faces),
     )
 
 
 def _check_size(extents: Float[np.ndarray, "3"], source: Path | str) -> None:
     longest = float(extents.max())
     if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
-        hint = "; is it in millimetres?" if longest > MAX_LENGTH_M else "; is it in another unit?"
+        hint = "is it in millimetres" if longest > MAX_LENGTH_M else "is it in another unit"
         size = " x ".join(f"{e:.4g}" for e in extents)
-        allowed = f"in metres with the longest side between {MIN_LENGTH_M} and {MAX_LENGTH_M:g}{hint}"
+        allowed = f"in metres ({hint}?), with the longest side between {MIN_LENGTH_M} and {MAX_LENGTH_M:g}"
         raise InvalidInput(f"size [m] of {source}", size, allowed)
     if extents.min() < _MIN_THICKNESS * longest:
         raise CorruptFile(source, "it is flat and encloses no volume")

@@ -31,12 +31,14 @@ class TexturedPiece:
         faces: vertex indices.
         uv: in [0, 1], v upwards.
         texture: RGB, first row at v = 1.
+        is_padded: whether texels around the faces' own continue their colours already.
     """
 
     vertices: Float[np.ndarray, "P 3"]
     faces: Int[np.ndarray, "F 3"]
     uv: Float[np.ndarray, "P 2"]
     texture: UInt8[np.ndarray, "h w 3"]
+    is_padded: bool = False
 
 
 def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
@@ -117,7 +119,7 @@ def _baked(
     uv = pixel / (np.array([across, down]) * _CELL)
     uv[..., 1] = 1 - uv[..., 1]
     flat = np.arange(3 * len(faces)).reshape(-1, 3)
-    return TexturedPiece(vertices[faces].reshape(-1, 3), flat, uv.reshape(-1, 2), texture)
+    return TexturedPiece(vertices[faces].reshape(-1, 3), flat, uv.reshape(-1, 2), texture, is_padded=True)
 
 
 def joined(pieces: list[TexturedPiece]) -> TexturedPiece:

