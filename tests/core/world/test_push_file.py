@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.world.push_file import EpisodeFolder, PushEpisode, load_episode, read_pushes, save_episode
+
+
+def episode(seed: int, *, frames: bool = False) -> PushEpisode:
+    rng = np.random.default_rng(seed)
+    return PushEpisode(
+        ("a", "b"),
+        seed,
+        rng.normal(size=(4, 2, 3)),
+        rng.normal(size=(4, 2, 4)),
+        rng.normal(size=(4, 3)),
+        rng.normal(size=(3, 3)),
+        rng.random((3, 2)) < 0.5,
+        rng.integers(0, 255, (4, 8, 8, 3), np.uint8) if frames else None,
+    )
+
+
+def assert_same(a: PushEpisode, b: PushEpisode) -> None:
+    assert (a.names, a.seed) == (b.names, b.seed)
+    for name in ("positions", "quaternions", "pusher", "actions", "contact", "frames"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_episode_survives_its_file(tmp_path, frames):
+    path = tmp_path / "0000000.npz"
+    save_episode(path, episode(1, frames=frames))
+    assert_same(load_episode(path), episode(1, frames=frames))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_combined_file_holds_all_episodes_in_order_and_the_folder_goes(tmp_path):
+    out = tmp_path / "pushes.h5"
+    folder = EpisodeFolder(out, {"seed": 0})
+    for index in (2, 0, 1):
+        save_episode(folder.path(index), episode(index))
+    assert folder.finished() == {0, 1, 2}
+    folder.combine(3)
+    for index, stored in enumerate(read_pushes(out)):
+        assert_same(stored, episode(index))
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_half_written_episodes_do_not_count(tmp_path):
+    folder = EpisodeFolder(tmp_path / "pushes.h5", {})
+    folder.path(0).with_suffix(".123.tmp").write_bytes(b"half")
+    assert EpisodeFolder(tmp_path / "pushes.h5", {}).finished() == frozenset()
+    assert not list((tmp_path / "pushes.h5.partial").glob("*.tmp"))
+
+
+def test_folder_of_other_settings_is_refused(tmp_path):
+    EpisodeFolder(tmp_path / "pushes.h5", {"seed": 0})
+    with pytest.raises(InvalidInput, match="other settings"):
+        EpisodeFolder(tmp_path / "pushes.h5", {"seed": 1})
+
+
+def test_what_is_no_push_file_is_told(tmp_path):
+    path = tmp_path / "pushes.h5"
+    path.write_bytes(b"not HDF5")
+    with pytest.raises(CorruptFile, match="not a push file"):
+        read_pushes(path)
