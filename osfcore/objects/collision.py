@@ -45,7 +45,7 @@ def dent_depth_m(mesh: TexturedMesh) -> float:
 
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     try:
-        hull = body.convex_hull
+        hull = trimesh.Trimesh(mesh.vertices, ConvexHull(mesh.vertices).simplices, process=False)
     except QhullError as error:
         raise InvalidInput("mesh", "without volume", "a solid body") from error
     surface = trimesh.sample.sample_surface(body, _SAMPLES, seed=0)[0]
@@ -77,7 +77,8 @@ def reduced_hull(
     """Few of the points whose hull leaves out no other by more than `tolerance_m`, or None if they span no volume.
 
     Starts from the extremes along 13 axes and adds the point that sticks out most, again and again. Where
-    `max_vertices` do not suffice, the hull is swollen by half of what still sticks out.
+    `max_vertices` do not suffice, the hull is swollen by half of what still sticks out, or until only about twice the
+    tolerance does.
     """
     try:
         points = points[ConvexHull(points).vertices]
@@ -99,5 +100,6 @@ def reduced_hull(
     if outside[worst] > tolerance_m:
         centre = kept.mean(axis=0)
         radius = np.linalg.norm(kept - centre, axis=1, keepdims=True)
-        kept = centre + (kept - centre) * (1 + outside[worst] / 2 / radius)
+        swelling = max(outside[worst] / 2, outside[worst] - 2 * tolerance_m)
+        kept = centre + (kept - centre) * (1 + swelling / radius)
     return kept

@@ -132,6 +132,9 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
                 if not (member.isfile() or member.isdir()):
                     raise CorruptFile(archive, f"it holds {member.name!r}, which is neither a file nor a folder")
                 tar.extract(member, folder, filter="data")
+            _read_on(tar)
+    except CorruptFile:
+        raise
     except (tarfile.TarError, EOFError) as error:
         raise CorruptFile(archive, "it is a damaged or unsafe archive") from error
     except OSError as error:
@@ -140,6 +143,13 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
         raise FetchFailed(archive.name, f"{folder} cannot be written ({error.strerror})") from error
     except (ValueError, zlib.error) as error:
         raise CorruptFile(archive, "it is a damaged archive") from error
+
+
+def _read_on(tar: tarfile.TarFile) -> None:
+    """Read what follows the last member: only at its end does gzip compare checksums."""
+    for _ in range(MAX_BYTES // _CHUNK_BYTES):
+        if tar.fileobj is None or not tar.fileobj.read(_CHUNK_BYTES):
+            return
 
 
 def pip_download(requirement: str, folder: Path) -> Iterator[int]:

@@ -54,10 +54,8 @@ class AssetLibrary:
 
     def has(self, name: str) -> bool:
         """Whether an object of this name has been written (by a version that this one can read)."""
-        if not name or name.startswith(".") or Path(name).name != name:
-            return False
         try:
-            return self._facts(name)["format_version"] == FORMAT_VERSION
+            return _is_plain(name) and self._facts(name)["format_version"] == FORMAT_VERSION
         except (OSError, CorruptFile):
             return False
 
@@ -168,7 +166,7 @@ class AssetLibrary:
 
     def _known_facts(self, name: str) -> dict[str, Any]:
         try:
-            if not name or name.startswith(".") or Path(name).name != name:
+            if not _is_plain(name):
                 raise FileNotFoundError(name)
             facts = self._facts(name)
         except OSError:
@@ -214,6 +212,11 @@ class AssetLibrary:
         else:
             os.rename(folder, place)
         _sync(self.root)
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a name can be that of a folder in the library, and of nothing elsewhere."""
+    return re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", name) is not None
 
 
 def check_name(name: str) -> str:

@@ -44,7 +44,7 @@ def test_a_can_stands_and_lies_in_a_handful_of_ways():
 
 def test_mass_counts_where_the_parts_are():
     heavy = np.array(trimesh.creation.box((0.1, 0.1, 0.1)).vertices)
-    thin = np.array(trimesh.creation.box((0.01, 0.01, 0.2)).vertices) + [0, 0, 0.15]
+    thin = [*np.array(trimesh.creation.box((0.01, 0.01, 0.2)).vertices), 0, 0, 0.15]
     resting = resting_poses((heavy, thin))
     up = rotate(resting.quaternions[0], np.array([0, 0, 1.0]))
     lowest = rotate(resting.quaternions[0], np.concatenate([heavy, thin]))[:, 2].min()

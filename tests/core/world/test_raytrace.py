@@ -1,6 +1,7 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
-from concurrent.futures import ThreadPoolExecutor
 
 from osfcore.poses import Pose, quaternion_exp
 from osfcore.scene import PUSHER_CENTRE_Z_M, Camera, Light, SceneState, default_cameras, goal_camera

@@ -1,0 +1,55 @@
+# make demo   build everything and open the page      make test   the test suite
+# Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   DATA_DIR=<where objects and runs live>
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
+TORCH_INDEX ?=
+PORT ?= 8000
+DATA_DIR ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+DATA := $(if $(DATA_DIR),--data-dir $(DATA_DIR),)
+OFFLINE := echo "make: the packages could not be installed; see the lines above (is there a network connection?)" >&2
+
+.PHONY: demo install dev test lint soak bench clean
+
+demo: install
+	@$(BIN)/osf assets fetch $(DATA)
+	@$(BIN)/osf serve --port $(PORT) $(DATA)
+
+install: $(VENV)/.installed
+dev: $(VENV)/.dev-installed
+
+$(BIN)/python:
+	@$(PYTHON) .ci/check_python.py
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+	  echo "make: the virtual environment could not be made; on Debian and Ubuntu 'apt install python3-venv' brings what is missing" >&2; exit 1; }
+
+$(VENV)/.installed: $(BIN)/python pyproject.toml requirements.lock
+	@echo "Installing packages into $(VENV) (a few minutes the first time)"
+	@$(if $(TORCH_INDEX),$(PIP) install -q -c requirements.lock --index-url $(TORCH_INDEX) torch || { $(OFFLINE); exit 1; },:)
+	@$(PIP) install -q -c requirements.lock -e . || { $(OFFLINE); exit 1; }
+	@touch $@
+
+$(VENV)/.dev-installed: $(VENV)/.installed
+	@$(PIP) install -q -c requirements.lock -e '.[dev]' || { $(OFFLINE); exit 1; }
+	@touch $@
+
+test: dev
+	$(BIN)/pytest
+
+lint: dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+
+soak: dev
+	$(BIN)/pytest -m soak
+
+bench: dev
+	$(BIN)/python -m tests.bench.bench_world
+	$(BIN)/python -m tests.bench.bench_service
+
+clean:
+	rm -rf $(VENV) .cache .pytest_cache .ruff_cache .hypothesis test-artifacts

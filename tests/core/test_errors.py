@@ -1,0 +1,28 @@
+import pytest
+
+from osfcore import errors
+
+SENTENCES = [
+    errors.InvalidInput("light elevation [deg]", 3, "at least 5"),
+    errors.UnknownName("object", "teapot", ["b", "a"]),
+    errors.MissingAssets(["bowl"]),
+    errors.OverlappingObjects("mug", "bowl", 0.0123),
+    errors.NoRoom(["a", "b"], 60),
+    errors.CorruptFile("file.obj", "it has no faces"),
+    errors.FetchFailed("The wheel", "there is no network"),
+]
+
+
+@pytest.mark.parametrize("error", SENTENCES, ids=lambda e: type(e).__name__)
+def test_every_error_is_a_sentence_on_one_line(error):
+    assert isinstance(error, errors.OsfError)
+    text = str(error)
+    assert text[0].isupper() or text.split(maxsplit=1)[0] in {"light", "mug", "file.obj"}
+    assert text.endswith(".")
+    assert "\n" not in text
+
+
+def test_sentences_carry_the_facts():
+    assert "a, b" in str(SENTENCES[1])
+    assert "12 mm" in str(SENTENCES[3])
+    assert "at least 5" in str(SENTENCES[0])
