@@ -48,7 +48,7 @@ def test_mass_counts_where_the_parts_are():
     rod.apply_translation((0, 0, 0.15))
     resting = resting_poses((block, np.array(rod.vertices)))
     ups = np.array([rotate(q, np.array([0, 0, 1.0])) for q in resting.quaternions])
-    assert ups[0, 2] == pytest.approx(1)  # on the block's free face
+    assert ups[:, 2].max() == pytest.approx(1)  # standing on the block
     assert (ups[:, 2] > -0.7).all()  # never balanced on the rod
 
 
