@@ -1,0 +1,162 @@
+"""A job process: runs the generator of one job, step by step, and listens for pause, resume and cancel."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import os
+import signal
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
+from app.processes import own_group, silence_stdout
+from osfcore.errors import OsfError
+from osfcore.objects.library import AssetLibrary
+
+STEP_INTERVAL_S = 0.1  # steps that come faster are not told one by one
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Place:
+    """Where a job reads and writes.
+
+    Attributes:
+        data_dir: of the service.
+        folder: the job's own, for what it makes; exists.
+    """
+
+    data_dir: Path
+    folder: Path
+
+    @property
+    def library(self) -> AssetLibrary:
+        """The objects on this machine."""
+        return AssetLibrary(self.data_dir / "objects")
+
+
+def _collect_pushes(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+
+    yield from collect_pushes(CollectPushes(out=place.folder / "pushes.h5", **params), place.library)
+
+
+def _collect_object(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from osfcore.world.collect_images import CollectObject, collect_object
+
+    out = place.folder / params["name"]
+    yield from collect_object(CollectObject(out=out, **params), place.library)
+    _pack(out)
+
+
+def _collect_table(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from osfcore.world.collect_images import CollectTable, collect_table
+
+    out = place.folder / "table"
+    yield from collect_table(CollectTable(out=out, **params))
+    _pack(out)
+
+
+def _fetch_assets(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from osfcore.objects.fetch import fetch
+    from osfcore.objects.sources import source_from
+
+    source = source_from("pypi", place.data_dir / "downloads")
+    yield from fetch(tuple(params["names"]), source, place.library)
+
+
+KINDS: dict[str, Callable[[dict[str, Any], Place], Iterator[Any]]] = {
+    "collect_pushes": _collect_pushes,
+    "collect_object": _collect_object,
+    "collect_table": _collect_table,
+    "fetch_assets": _fetch_assets,
+}
+
+
+def job_main(connection: Connection, kind: str, params: dict[str, Any], place: Place) -> None:
+    """Run a job to its end and tell how it went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
+    own_group()
+    silence_stdout()
+    orders = Orders(connection)
+    with contextlib.suppress(OSError):  # the web process has gone
+        connection.send(_run(connection, orders, kind, params, place))
+
+
+def _run(connection: Connection, orders: Orders, kind: str, params: dict[str, Any], place: Place) -> object:
+    result: dict[str, Any] = {}
+    last = 0.0
+    try:
+        with contextlib.closing(KINDS[kind](params, place)) as steps:  # pyright: ignore[reportArgumentType]
+            for step in steps:
+                result = _extras(step)
+                now = time.monotonic()
+                if now - last >= STEP_INTERVAL_S or step.done == step.total:
+                    connection.send(JobStep(step.done, step.total, step.note, result))
+                    last = now
+                if orders.must_stop():
+                    return JobCancelled()
+    except OsfError as error:
+        return Failure.of(error)
+    except MemoryError:
+        return Failure(0, "OutOfMemory", "The job ran out of memory; take fewer or smaller images.")
+    except Exception as error:
+        _log.exception("a %s job failed", kind)
+        return Failure(0, "Internal", f"The job failed ({type(error).__name__}); the service's log tells more.")
+    return JobDone(result)
+
+
+class Orders:
+    """Listens on the pipe in a thread of its own, so that an order counts even during a long step."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._may_run = threading.Event()
+        self._may_run.set()
+        self._is_cancelled = threading.Event()
+        threading.Thread(target=self._listen, name="orders", daemon=True).start()
+
+    def must_stop(self) -> bool:
+        """Whether the job was cancelled; waits here while it is paused."""
+        self._may_run.wait()
+        return self._is_cancelled.is_set()
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                order = self._connection.recv()
+            except (EOFError, OSError):
+                # The service died: nobody wants the result, and what is half-written counts as never begun.
+                os.killpg(0, signal.SIGKILL)
+                return
+            match order:
+                case PauseJob():
+                    self._may_run.clear()
+                case ResumeJob():
+                    self._may_run.set()
+                case CancelJob():
+                    self._is_cancelled.set()
+                    self._may_run.set()
+
+
+def _extras(step: object) -> dict[str, Any]:
+    """What a step tells besides done, total and note."""
+    if not dataclasses.is_dataclass(step) or isinstance(step, type):
+        return {}
+    return {key: value for key, value in dataclasses.asdict(step).items() if key not in ("done", "total", "note")}
+
+
+def _pack(folder: Path) -> None:
+    """Put a folder into one ZIP beside it, for downloading; PNGs do not shrink, so they are only stored."""
+    partial = folder.with_name(f".{folder.name}.zip")
+    with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder.parent))
+    partial.replace(folder.with_name(f"{folder.name}.zip"))

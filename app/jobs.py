@@ -1,0 +1,449 @@
+"""The job registry: one job runs at a time in a process of its own, the others wait their turn.
+
+Everything is written through to the store. A service that stops fails the job it was running; waiting ones go on after
+the next start.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any, Literal
+
+from app.job_process import Place, job_main
+from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
+from app.processes import end, launch
+from app.store import Store, now_utc
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+
+State = Literal["queued", "running", "paused", "done", "failed", "cancelled"]
+FINISHED: tuple[State, ...] = ("done", "failed", "cancelled")
+STOPPED_NOTE = "The service stopped while this job was running; start it again."
+_LOOK_INTERVAL_S = 0.2
+_EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
+_log = logging.getLogger(__name__)
+
+
+class WrongJobState(OsfError):
+    """An order that does not fit the state that a job is in."""
+
+    def __init__(self, job: Job, wanted: str) -> None:
+        super().__init__(f"Job {job.id} is {job.state}, so it cannot be {wanted}.")
+
+
+class QueueFull(OsfError):
+    """Too many jobs wait already."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"{limit} jobs are waiting already, which is the most; wait for one or cancel one.")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A job as it is now.
+
+    Attributes:
+        id: identifier.
+        kind: what is done.
+        params: with what.
+        state: where it is in its life.
+        done: units finished.
+        total: units in all; 0 before it is known.
+        note: what is being done, for a person.
+        created_at: UTC, ISO 8601.
+        started_at: when it left the queue.
+        finished_at: when it ended, in whatever way.
+        eta_s: time left, estimated [s].
+        error: why it failed, one sentence.
+        result: what its kind tells at the end.
+        files: names that can be downloaded.
+        position: in the queue, the next one has 1.
+    """
+
+    id: str
+    kind: str
+    params: dict[str, Any]
+    state: State = "queued"
+    done: int = 0
+    total: int = 0
+    note: str = "Waiting"
+    created_at: str = field(default_factory=now_utc)
+    started_at: str | None = None
+    finished_at: str | None = None
+    eta_s: float | None = None
+    error: str | None = None
+    result: dict[str, Any] | None = None
+    files: tuple[str, ...] = ()
+    position: int | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether nothing will change any more."""
+        return self.state in FINISHED
+
+
+@dataclass(frozen=True, slots=True)
+class JobChanged:
+    """A job is now like this; `event` is the number under which a page can ask for what came later."""
+
+    event: int
+    job: Job
+
+
+@dataclass
+class _Run:
+    """The one job that has a process."""
+
+    id: str
+    process: SpawnProcess
+    connection: Connection
+    clock: _Clock
+    cancel_at: float | None = None  # when patience with a cancelled job ends
+
+
+class Jobs:
+    """All jobs of one data directory.
+
+    Args:
+        store: where they are kept.
+        data_dir: objects are read from it, outputs go to `collections/JOB` in it.
+        publish: told of every change.
+        max_queued: how many may wait.
+        cancel_grace_s: how long a cancelled job may take to stop by itself.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        data_dir: Path,
+        publish: Callable[[JobChanged], None],
+        max_queued: int = 20,
+        cancel_grace_s: float = 0.7,
+    ) -> None:
+        self._store = store
+        self._data_dir = data_dir
+        self._publish = publish
+        self._max_queued = max_queued
+        self._cancel_grace_s = cancel_grace_s
+        self._changed = threading.Condition(threading.RLock())
+        self._jobs: dict[str, Job] = {}
+        self._numbers: dict[str, int] = {}
+        self._run: _Run | None = None
+        self._is_stopping = False
+        self._last_event = 0.0
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Take over what the store holds and begin to work."""
+        for number, fields in self._store.jobs():
+            job = Job(**{**fields, "files": tuple(fields["files"])})
+            self._jobs[job.id], self._numbers[job.id] = job, number
+        for job in list(self._jobs.values()):
+            if job.state in ("running", "paused"):
+                self._fail_stopped(job)
+        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the running job, which counts as failed. Calling it again does nothing."""
+        with self._changed:
+            self._is_stopping = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    # What pages and programs ask for
+
+    def all(self) -> tuple[Job, ...]:
+        """All jobs, newest first."""
+        with self._changed:
+            return tuple(self._with_position(job) for job in reversed(self._jobs.values()))
+
+    def get(self, job: str) -> Job:
+        """One job.
+
+        Raises:
+            UnknownName: if there is none of this name.
+        """
+        with self._changed:
+            if job not in self._jobs:
+                raise UnknownName("job", job, list(self._jobs)[-5:])
+            return self._with_position(self._jobs[job])
+
+    def folder(self, job: str) -> Path:
+        """Where a job's outputs are."""
+        return self._data_dir / "collections" / job
+
+    def holder(self, scene: str) -> str | None:
+        """The job that drives a scene now, if one does: its parameters name it as "scene"."""
+        with self._changed:
+            job = self._jobs[self._run.id] if self._run else None
+            return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
+
+    def submit(self, kind: str, params: dict[str, Any]) -> Job:
+        """Put a job into the queue.
+
+        Raises:
+            QueueFull: if too many wait already.
+        """
+        with self._changed:
+            if len(self._queue()) >= self._max_queued:
+                raise QueueFull(self._max_queued)
+            job = Job(uuid.uuid4().hex[:12], kind, params)
+            self._numbers[job.id] = 1 + max(self._numbers.values(), default=0)
+            self._set(job)
+            self._changed.notify_all()
+            return self.get(job.id)
+
+    def cancel(self, job: str, wait_s: float = 3.0) -> Job:
+        """Take a job out of the queue or end it; waits until it has ended.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it has finished.
+        """
+        with self._changed:
+            found = self.get(job)
+            if found.is_finished:
+                raise WrongJobState(found, "cancelled")
+            if found.state == "queued":
+                self._set(_ended(self._jobs[job], "cancelled", note="Cancelled"))
+                self._tell_queue()
+                return self.get(job)
+            if self._run is not None and self._run.cancel_at is None:
+                self._run.cancel_at = time.monotonic() + self._cancel_grace_s
+                self._order(CancelJob())
+            self._changed.wait_for(lambda: self._jobs[job].is_finished, wait_s)
+            return self.get(job)
+
+    def pause(self, job: str) -> Job:
+        """Let a running job rest after its current step.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it is not running.
+        """
+        return self._switch(job, "running", "paused", PauseJob())
+
+    def resume(self, job: str) -> Job:
+        """Let a paused job go on.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it is not paused.
+        """
+        return self._switch(job, "paused", "running", ResumeJob())
+
+    def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob) -> Job:
+        with self._changed:
+            found = self.get(job)
+            if found.state != before or self._run is None or self._run.cancel_at is not None:
+                raise WrongJobState(found, "paused" if after == "paused" else "resumed")
+            self._order(order)
+            self._run.clock.switch(is_running=after == "running")
+            self._set(replace(self._jobs[job], state=after, eta_s=None))
+            return self.get(job)
+
+    # The working thread
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_stopping or bool(self._queue()))
+                if self._is_stopping:
+                    return
+                job = self._queue()[0]
+                try:
+                    self._begin(job)
+                except OSError as error:
+                    self._set(_ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
+                    continue
+            self._attend()
+
+    def _begin(self, job: Job) -> None:
+        folder = self.folder(job.id)
+        if job.kind != "fetch_assets":
+            folder.mkdir(parents=True, exist_ok=True)
+        process, connection = launch(job_main, f"osf-job-{job.id}", job.kind, job.params, Place(self._data_dir, folder))
+        self._run = _Run(job.id, process, connection, _Clock())
+        self._set(replace(job, state="running", started_at=now_utc(), note="Starting"))
+        self._tell_queue()
+
+    def _attend(self) -> None:
+        """Follow the running job until its process has ended."""
+        run = self._run
+        assert run is not None
+        outcome: object = None
+        while outcome is None:
+            if wait([run.connection], _LOOK_INTERVAL_S if run.cancel_at is None else 0.05):
+                try:
+                    message = run.connection.recv()
+                except (EOFError, OSError):
+                    outcome = Failure(0, "Died", "The job's process ended unexpectedly; it may have run out of memory.")
+                    break
+                if isinstance(message, JobStep):
+                    self._progress(message)
+                else:
+                    outcome = message
+            with self._changed:
+                if self._is_stopping:
+                    outcome = Failure(0, "Stopped", STOPPED_NOTE)
+                elif run.cancel_at is not None and time.monotonic() > run.cancel_at:
+                    outcome = JobCancelled()
+        end(run.process, 0.0 if isinstance(outcome, Failure | JobCancelled) else 1.0)
+        run.connection.close()
+        self._finish(run, outcome)
+
+    def _finish(self, run: _Run, outcome: object) -> None:
+        job = self._jobs[run.id]
+        folder = self.folder(job.id)
+        if run.cancel_at is not None and not isinstance(outcome, JobDone):
+            outcome = JobCancelled()  # whatever ended it first, it was asked to
+        match outcome:
+            case JobDone(result):
+                files = tuple(sorted(p.name for p in folder.glob("[!.]*") if p.is_file()))
+                ended = _ended(job, "done", note="Done", result=result, files=files)
+            case JobCancelled():
+                ended = _ended(job, "cancelled", note="Cancelled")
+            case Failure(_, _, text):
+                ended = _ended(job, "failed", note="Failed", error=text)
+            case _:
+                ended = _ended(job, "failed", note="Failed", error="The job's process told nonsense.")
+        if ended.state != "done":
+            shutil.rmtree(folder, ignore_errors=True)
+        with self._changed:
+            self._run = None
+            self._set(ended)
+            self._changed.notify_all()
+
+    def _progress(self, step: JobStep) -> None:
+        with self._changed:
+            run = self._run
+            assert run is not None
+            eta_s = run.clock.left_s(step.done, step.total)
+            job = self._jobs[run.id]
+            result = step.result or None
+            job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
+            self._set(job, is_progress=True)
+
+    def _order(self, order: PauseJob | ResumeJob | CancelJob) -> None:
+        assert self._run is not None
+        try:
+            self._run.connection.send(order)
+        except OSError:  # it has just ended; the working thread will see that
+            _log.info("job %s ended before it could be told %s", self._run.id, type(order).__name__)
+
+    # State
+
+    def _queue(self) -> list[Job]:
+        return [job for job in self._jobs.values() if job.state == "queued"]
+
+    def _with_position(self, job: Job) -> Job:
+        if job.state != "queued":
+            return job
+        return replace(job, position=1 + [other.id for other in self._queue()].index(job.id))
+
+    def _set(self, job: Job, *, is_progress: bool = False) -> None:
+        """Keep and tell a job's new state; progress is thinned out."""
+        with self._changed:
+            self._jobs[job.id] = job
+            now = time.monotonic()
+            if is_progress and now - self._last_event < _EVENT_INTERVAL_S:
+                return
+            self._last_event = now if is_progress else self._last_event
+            self._keep_and_tell(job)
+
+    def _keep_and_tell(self, job: Job) -> None:
+        told = self._with_position(job)
+        number = 0
+        try:
+            self._store.save_job(job.id, self._numbers[job.id], job_fields(job))
+            number = self._store.add_event(job_fields(told))
+        except OsfError as error:  # a full disk must not stop the jobs
+            _log.error("job %s: %s", job.id, error)
+        self._publish(JobChanged(number, told))
+
+    def _tell_queue(self) -> None:
+        """Positions have moved up."""
+        for job in self._queue():
+            self._keep_and_tell(job)
+
+    def _fail_stopped(self, job: Job) -> None:
+        shutil.rmtree(self.folder(job.id), ignore_errors=True)
+        self._set(_ended(job, "failed", note="Failed", error=STOPPED_NOTE))
+
+
+class _Clock:
+    """How fast a job goes, pauses left out."""
+
+    def __init__(self) -> None:
+        self._first: tuple[int, float] | None = None
+        self._paused_at: float | None = None
+        self._paused_s = 0.0
+
+    def switch(self, *, is_running: bool) -> None:
+        now = time.monotonic()
+        if not is_running:
+            self._paused_at = now
+        elif self._paused_at is not None:
+            self._paused_s += now - self._paused_at
+            self._paused_at = None
+
+    def left_s(self, done: int, total: int) -> float | None:
+        """Time left [s], once there is something to go by."""
+        now = time.monotonic() - self._paused_s
+        if self._first is None:
+            self._first = (done, now)
+        first_done, start = self._first
+        if done <= first_done:
+            return None
+        return round((now - start) / (done - first_done) * (total - done), 1)
+
+
+def job_fields(job: Job) -> dict[str, Any]:
+    """A job as JSON."""
+    return {**asdict(job), "files": list(job.files)}
+
+
+def job_from_fields(fields: dict[str, Any]) -> Job:
+    """The inverse of `job_fields`."""
+    return Job(**{**fields, "files": tuple(fields["files"])})
+
+
+def _ended(job: Job, state: State, **changes: Any) -> Job:  # noqa: ANN401  any field of Job
+    return replace(job, state=state, finished_at=now_utc(), eta_s=None, position=None, **changes)
+
+
+def check_file_name(job: Job, name: str) -> str:
+    """The name of one of a job's files.
+
+    Raises:
+        UnknownName: if it has none of this name.
+    """
+    if name not in job.files:
+        raise UnknownName(f"file of job {job.id}", name, job.files)
+    return name
+
+
+def check_params(kind: str, params: dict[str, Any], known: Callable[[str], object], available: int) -> None:
+    """Refuse at once what the job would refuse later.
+
+    Raises:
+        OsfError: if an object is unknown or there are too few.
+    """
+    if kind == "collect_object":
+        known(params["name"])
+    for name in params.get("names", ()):
+        known(name)
+    if kind == "collect_pushes" and params["objects"] > available:
+        allowed = f"at most {available}, as many as were fetched" if available else "0 until some have been fetched"
+        raise InvalidInput("number of objects", params["objects"], allowed)

@@ -1,0 +1,124 @@
+"""The app factory: REST under /api, events, the viewer's relay at /viewer, documentation, and the page at /."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import HTMLResponse
+from fastapi.routing import APIRoute
+from fastapi.staticfiles import StaticFiles
+from starlette.concurrency import run_in_threadpool
+
+from app import problems, relay
+from app.routes import events, health, jobs, objects, scenes
+from app.runner import Runner
+from app.schemas import FrameEvent, NoticeEvent, Problem
+from app.security import SecurityMiddleware
+from app.services import Services, Shelf
+from app.settings import Settings
+from app.store import Store
+from app.viewer import Viewer
+from osfcore.objects.library import AssetLibrary
+
+_DESCRIPTION = (
+    "Scenes of real objects on a lit table, a pusher to move them, cameras to look at them, and jobs for long work. "
+    "Metres, seconds, quaternions (w, x, y, z); world z up, table top at z = 0. "
+    "Errors are application/problem+json with one sentence in `detail`."
+)
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The service as an ASGI app; everything starts and stops with its lifespan."""
+    settings = settings or Settings()
+    app = FastAPI(
+        title="OSF manipulation",
+        version=health.VERSION,
+        description=_DESCRIPTION,
+        openapi_url="/api/openapi.json",
+        docs_url=None,  # the default pages load scripts from elsewhere
+        redoc_url=None,
+        lifespan=_lifespan,
+        generate_unique_id_function=_operation_id,
+        max_body_size=settings.max_body_bytes,
+    )
+    app.state.settings = settings
+    app.add_middleware(
+        SecurityMiddleware, allowed_hosts=settings.allowed_hosts, allowed_origins=settings.allowed_origins
+    )
+    problems.install(app)
+    for module in (health, objects, scenes, jobs, events):
+        app.include_router(module.router)
+    app.include_router(relay.router)
+    _add_docs(app)
+    app.openapi = lambda: _openapi(app)  # pyright: ignore[reportAttributeAccessIssue]
+    app.mount("/", StaticFiles(directory=static_folder(), html=True), name="static")
+    return app
+
+
+def static_folder() -> Path:
+    """The page's files: inside the installed package, or at the top of a checkout."""
+    here = Path(__file__).parent
+    packaged = here / "static"
+    return packaged if packaged.is_dir() else here.parent / "static"
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    settings: Settings = app.state.settings
+    async with AsyncExitStack() as stack:
+        store = await run_in_threadpool(Store, settings.data_dir, settings.max_stored_events)
+        stack.push_async_callback(run_in_threadpool, store.close)
+        runner = Runner(settings, store, AssetLibrary(settings.data_dir / "objects"))
+        stack.push_async_callback(run_in_threadpool, runner.stop)
+        await run_in_threadpool(runner.start)
+        viewer = Viewer(runner)
+        stack.push_async_callback(run_in_threadpool, viewer.stop)
+        await run_in_threadpool(viewer.start)
+        services = Services(settings, store, runner, viewer, Shelf(runner.library))
+        app.state.services = services
+        stack.callback(services.closing.set)
+        yield
+
+
+def _operation_id(route: APIRoute) -> str:
+    return f"{route.tags[0]}-{route.name}" if route.tags else route.name
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The schema with those models that no route returns as such: problems and the events' data."""
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schemas = schema.setdefault("components", {}).setdefault("schemas", {})
+        for model in (Problem, FrameEvent, NoticeEvent):
+            own = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= own.pop("$defs", {})
+            schemas[model.__name__] = own
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _add_docs(app: FastAPI) -> None:
+    """Swagger UI with scripts from a package on this machine."""
+    package = importlib.util.find_spec("fastapi_offline")
+    assert package is not None
+    assert package.origin is not None
+    app.mount("/docs-assets", StaticFiles(directory=Path(package.origin).parent / "static"), name="docs-assets")
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs(request: Request) -> HTMLResponse:
+        """The interactive documentation."""
+        base = request.scope.get("root_path", "")
+        return get_swagger_ui_html(
+            openapi_url=f"{base}/api/openapi.json",
+            title="OSF manipulation: REST interface",
+            swagger_js_url=f"{base}/docs-assets/swagger-ui-bundle.js",
+            swagger_css_url=f"{base}/docs-assets/swagger-ui.css",
+            swagger_favicon_url=f"{base}/docs-assets/favicon.png",
+        )

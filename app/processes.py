@@ -1,0 +1,54 @@
+"""Starting and ending child processes so that none outlives the service, and Ctrl-C reaches only the service."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+def launch(target: Callable[..., None], name: str, *arguments: object) -> tuple[SpawnProcess, Connection]:
+    """Start `target(connection, *arguments)` in a new process; returns it and the other end of its pipe."""
+    ours, theirs = _SPAWN.Pipe(duplex=True)
+    process = _SPAWN.Process(target=target, name=name, args=(theirs, *arguments), daemon=True)
+    # A Ctrl-C goes to the whole terminal group; children inherit the mask and thus never see one.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    except BaseException:
+        ours.close()
+        raise
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()  # or its end would never be seen
+    return process, ours
+
+
+def silence_stdout() -> None:
+    """Send what libraries write to standard output nowhere: the service's own output is one line that people read."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+
+
+def own_group() -> None:
+    """Make this process the head of a group, so that its own children end with it (see `end`)."""
+    os.setpgid(0, 0)
+
+
+def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
+    """Wait `grace_s` for a process to leave by itself, then end it and its group. Calling it again does nothing."""
+    process.join(grace_s)
+    if process.is_alive() and process.pid is not None:
+        try:
+            if os.getpgid(process.pid) == process.pid:
+                os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:  # it has just left
+            pass
+        process.kill()
+    process.join()

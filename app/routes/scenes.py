@@ -1,0 +1,135 @@
+"""Scenes: make, look at, change."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Response, status
+
+from app.messages import SceneRecord, TakeImage, TakeMask
+from app.problems import NotFound
+from app.routes import problems
+from app.schemas import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
+from app.services import Services, ServicesDep
+from osfcore.errors import UnknownName
+from osfcore.scene import CAMERA_POSITIONS
+
+router = APIRouter(prefix="/api/scenes", tags=["scenes"], responses=problems(503, 507))
+_CAMERAS = (*(str(number) for number in range(len(CAMERA_POSITIONS))), "goal")
+SceneId = Annotated[str, Path(description="Identifier of a scene.")]
+CameraName = Annotated[str, Path(description='"0" to "3" or "goal".', examples=["0"])]
+SizeQuery = Annotated[ImageSize | None, Query(description="Side of the image [px]; the scene's own if left out.")]
+_PNG = {
+    200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}, "description": "The image."}
+}
+
+
+@router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409))
+def create(services: ServicesDep, body: SceneIn, response: Response) -> SceneOut:
+    """Make a scene and show it; it has come to rest."""
+    record = services.runner.create_scene(
+        names=None if body.objects is None else tuple(body.objects),
+        count=body.count,
+        seed=body.seed,
+        light=None if body.light is None else body.light.light(),
+        poses=None if body.poses is None else tuple(pose.named_pose() for pose in body.poses),
+        image_size=body.image_size,
+    )
+    response.headers["Location"] = f"/api/scenes/{record.id}"
+    return services.scene_out(record)
+
+
+@router.get("")
+async def list_all(services: ServicesDep) -> SceneList:
+    """List all scenes, oldest first."""
+    runner = services.runner
+    return SceneList(scenes=[services.scene_out(record) for record in runner.scenes()], current=runner.current)
+
+
+@router.get("/{scene}", responses=problems(404))
+async def get(services: ServicesDep, scene: SceneId) -> SceneOut:
+    """Tell how a scene is now."""
+    return services.scene_out(_found(services, scene))
+
+
+@router.delete("/{scene}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409))
+def delete(services: ServicesDep, scene: SceneId) -> None:
+    """Forget a scene."""
+    _found(services, scene)
+    services.runner.delete_scene(scene)
+
+
+@router.post("/{scene}/activate", responses=problems(404))
+def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
+    """Show a scene in viewer and page."""
+    _found(services, scene)
+    return services.scene_out(services.runner.activate(scene))
+
+
+@router.post("/{scene}/reset", responses=problems(404, 409))
+def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
+    """Put a scene back to how it was created."""
+    _found(services, scene)
+    return services.scene_out(services.runner.reset_scene(scene))
+
+
+@router.patch("/{scene}", responses=problems(404, 409))
+def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
+    """Move light and objects by hand, all or nothing."""
+    _found(services, scene)
+    record = services.runner.edit_scene(
+        scene,
+        light=None if body.light is None else body.light.light(),
+        poses=tuple(pose.named_pose() for pose in body.objects or ()),
+    )
+    return services.scene_out(record)
+
+
+@router.post("/{scene}/actions", responses=problems(404, 409))
+def act(services: ServicesDep, scene: SceneId, body: ActionsIn) -> SceneOut:
+    """Push: hold each velocity for 0.2 s of simulated time."""
+    _found(services, scene)
+    return services.scene_out(services.runner.act(scene, body.actions))
+
+
+@router.get("/{scene}/images/{camera}.png", response_class=Response, responses={**problems(404), **_PNG})
+async def image(
+    services: ServicesDep,
+    scene: SceneId,
+    camera: CameraName,
+    size: SizeQuery = None,
+    masks: Annotated[bool, Query(description="Draw each object's visible pixels over it, in colour.")] = False,
+    pusher: Annotated[bool, Query(description="Whether the pusher and its shadow are in the image.")] = True,
+) -> Response:
+    """Take an image with one camera."""
+    record = _view(services, scene, camera)
+    png = await services.runner.image(TakeImage(scene, camera, size or record.image_size, masks, pusher))
+    return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
+
+
+@router.get("/{scene}/masks/{camera}/{name}.png", response_class=Response, responses={**problems(404), **_PNG})
+async def mask(
+    services: ServicesDep,
+    scene: SceneId,
+    camera: CameraName,
+    name: Annotated[str, Path(description="Name of an object of the scene.")],
+    size: SizeQuery = None,
+) -> Response:
+    """Take the visible pixels of one object: 255 where it is seen, else 0."""
+    record = _view(services, scene, camera)
+    if name not in record.state.names:
+        raise NotFound(str(UnknownName("object on the table", name, record.state.names)))
+    png = await services.runner.image(TakeMask(scene, camera, name, size or record.image_size))
+    return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
+
+
+def _found(services: Services, scene: str) -> SceneRecord:
+    try:
+        return services.runner.scene(scene)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+
+
+def _view(services: Services, scene: str, camera: str) -> SceneRecord:
+    record = _found(services, scene)
+    if camera not in _CAMERAS:
+        raise NotFound(str(UnknownName("camera", camera, _CAMERAS)))
+    return record

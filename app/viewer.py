@@ -1,0 +1,397 @@
+"""The live 3D view: draws the current scene with viser and turns what people do there into runner commands.
+
+The only importer of viser. viser's loop never waits: drawing happens in the playback's thread, commands in another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from app.jobs import JobChanged
+from app.messages import CurrentScene, SceneRecord
+from app.playback import Playback
+from app.runner import Runner
+from osfcore.errors import OsfError
+from osfcore.objects.library import AssetLibrary
+from osfcore.poses import Pose
+from osfcore.scene import (
+    AMBIENT,
+    DIFFUSE,
+    MIN_LIGHT_ELEVATION_DEG,
+    PUSHER_HEIGHT_M,
+    PUSHER_RADIUS_M,
+    SCENE_CENTRE,
+    TABLE_SIDE_M,
+    Camera,
+    Light,
+    SceneState,
+    default_cameras,
+)
+from osfcore.world.optics import PUSHER_ALBEDO, TABLE_ALBEDO
+
+PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
+PUSH_STEPS = 2
+VIEW_FROM = (0.75, -0.75, 0.65)
+TABLE_THICKNESS_M = 0.04
+LIGHT_CUBE_M = 0.06
+_STILL = 1e-6  # poses that differ by less are not sent again
+_log = logging.getLogger(__name__)
+Client = viser.ClientHandle | None
+
+
+class LoopbackViser(viser.ViserServer):
+    """viser bound to loopback, unable to open a public tunnel."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse: any client could ask for this."""
+        del verbose
+        return None
+
+
+class Viewer:
+    """The view of the runner's current scene, the same for any number of browsers."""
+
+    def __init__(self, runner: Runner) -> None:
+        self._runner = runner
+        self._commands = ThreadPoolExecutor(1, thread_name_prefix="viewer-commands")
+        self._server: LoopbackViser | None = None
+        self._undo: list[Callable[[], None]] = []
+
+    @property
+    def client_page(self) -> Path:
+        """The client's one file."""
+        return Path(viser.__file__).parent / "client" / "build" / "index.html"
+
+    @property
+    def server(self) -> LoopbackViser:
+        """The loopback server; only while it runs."""
+        assert self._server is not None
+        return self._server
+
+    @property
+    def port(self) -> int:
+        """Of the loopback server."""
+        return self.server.get_port()
+
+    def start(self) -> None:
+        """Open the loopback server and draw what there is."""
+        with contextlib.redirect_stdout(io.StringIO()):  # the banner would tell the inner port
+            self._server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
+        self._drawing = SceneDrawing(self._server, self._runner.library, self._move_object, self._move_light)
+        self._playback = Playback(self._drawing)
+        self._add_panel(self._server)
+        self._server.on_client_connect(lambda _: self._runner.watch_frames(1))
+        self._server.on_client_disconnect(lambda _: self._runner.watch_frames(-1))
+        self._playback.start()
+        self._undo = [
+            self._runner.hub.subscribe(self._playback.note),
+            self._runner.hub.subscribe(self._on_job),
+        ]
+        self._show_current()
+
+    def stop(self) -> None:
+        """Close the server and end the threads. Calling it again does nothing."""
+        if self._server is None:
+            return
+        for undo in self._undo:
+            undo()
+        self._playback.stop()
+        self._commands.shutdown(wait=False, cancel_futures=True)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+        self._server = None
+
+    def _show_current(self) -> None:
+        current = self._runner.current
+        self._playback.note(CurrentScene(None if current is None else self._runner.scene(current)))
+
+    def _add_panel(self, server: LoopbackViser) -> None:
+        gui = server.gui
+        gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
+        gui.set_panel_label("Scene")
+        push = gui.add_button_group("Push", tuple(PUSHES), hint="Move the pusher along an axis of the table.")
+        reset = gui.add_button("Reset", hint="Back to how the scene was created.")
+        new = gui.add_button("New scene", hint="Other objects, other light.")
+        self._wants_gizmos = gui.add_checkbox("Move objects", False, hint="Show handles to drag and turn the objects.")
+        cameras = gui.add_checkbox("Cameras", True)
+        names = gui.add_checkbox("Names", True)
+        gui.main_panel.minimize()
+
+        push.on_click(lambda event: self._push(event.target.value, event.client))
+        reset.on_click(lambda event: self._on_current(self._runner.reset_scene, event.client))
+        new.on_click(lambda event: self._obey(self._runner.create_scene, event.client))
+        self._wants_gizmos.on_update(lambda _: self._update_gizmos())
+        cameras.on_update(lambda event: self._drawing.show_cameras(event.target.value))
+        names.on_update(lambda event: self._drawing.show_names(event.target.value))
+
+    def _push(self, direction: str, client: Client) -> None:
+        if direction in PUSHES:  # clients may send anything
+            self._on_current(lambda scene: self._runner.act(scene, [PUSHES[direction]] * PUSH_STEPS), client)
+
+    def _move_object(self, name: str, pose: Pose, client: Client) -> None:
+        """An object was let go; where it must not be, it goes back. Called on viser's loop."""
+
+        def move(scene: str) -> None:
+            try:
+                self._runner.edit_scene(scene, poses=((name, pose),), settle=True)
+            except OsfError:
+                self._show_current()
+                raise
+
+        self._commands.submit(self._on_current, move, client)
+
+    def _move_light(self, light: Light, client: Client) -> None:
+        """The light was let go. Called on viser's loop."""
+        self._commands.submit(self._on_current, lambda scene: self._runner.edit_scene(scene, light=light), client)
+
+    def _on_current(self, command: Callable[[str], object], client: Client) -> None:
+        scene = self._runner.current
+        if scene is not None:
+            self._obey(lambda: command(scene), client)
+
+    def _obey(self, command: Callable[[], object], client: Client) -> None:
+        """Carry out a command; tell the one who gave it if it is refused."""
+        try:
+            command()
+        except OsfError as error:
+            if client is not None:
+                client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+        except Exception:
+            _log.exception("a command from the viewer failed")
+
+    def _on_job(self, event: object) -> None:
+        if isinstance(event, JobChanged):
+            self._update_gizmos()
+
+    def _update_gizmos(self) -> None:
+        """Hands may move objects only while no job does."""
+        current = self._runner.current
+        is_free = current is not None and self._runner.jobs.holder(current) is None
+        self._drawing.show_gizmos(self._wants_gizmos.value and is_free)
+
+
+class SceneDrawing:
+    """The nodes of one viser scene. Nodes are made once; afterwards only what changes is assigned."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        on_move: Callable[[str, Pose, Client], None],
+        on_light: Callable[[Light, Client], None],
+    ) -> None:
+        self._server = server
+        self._scene = server.scene
+        self._library = library
+        self._on_move = on_move
+        self._on_light = on_light
+        self._lock = threading.RLock()
+        self._bodies: dict[str, viser.SceneNodeHandle] = {}
+        self._labels: dict[str, viser.SceneNodeHandle] = {}
+        self._gizmos: dict[str, viser.SceneNodeHandle] = {}
+        self._heights: dict[str, float] = {}
+        self._held: set[str] = set()  # what someone is dragging follows the hand, not the scene
+        self._has_names = True
+        self._has_gizmos = False
+        self._add_room()
+        self._add_light()
+        self._frustums = {camera.name: self._frustum(camera) for camera in default_cameras()}
+
+    def show(self, record: SceneRecord | None) -> None:
+        """Begin with a scene, or clear the table."""
+        names = () if record is None else record.state.names
+        with self._lock:
+            for name in set(self._bodies) - set(names):
+                for nodes in (self._bodies, self._labels, self._gizmos):
+                    nodes.pop(name).remove()
+            for name in names:
+                if name not in self._bodies:
+                    self._add_object(name)
+            self._held.clear()
+            self._pusher.visible = record is not None
+            for frustum in self._frustums.values():
+                frustum.image = None
+            if record is not None:
+                self.place(record.state)
+
+    def place(self, state: SceneState) -> None:
+        """Move everything to where it is in a state."""
+        with self._lock, self._changes():
+            for name in state.names:
+                if name in self._bodies and name not in self._held:
+                    self._place_object(name, state.pose(name))
+            if state.pusher is not None:
+                _put(self._pusher, state.pusher)
+            if "light" not in self._held:
+                self._place_light(state.light.position)
+                _put(self._light_gizmo, state.light.position)
+
+    def show_frames(self, names: tuple[str, ...], images: np.ndarray) -> None:
+        """Put live images into the cameras' frustums."""
+        with self._lock:
+            for name, image in zip(names, images, strict=True):
+                if name in self._frustums:
+                    self._frustums[name].image = image
+
+    def show_cameras(self, is_on: bool) -> None:
+        """Show or hide the cameras."""
+        for frustum in self._frustums.values():
+            frustum.visible = is_on
+
+    def show_names(self, is_on: bool) -> None:
+        """Show or hide the objects' names."""
+        with self._lock:
+            self._has_names = is_on
+            for label in self._labels.values():
+                label.visible = is_on
+
+    def show_gizmos(self, is_on: bool) -> None:
+        """Show or hide the handles for moving objects."""
+        with self._lock:
+            if is_on != self._has_gizmos:
+                self._has_gizmos = is_on
+                for gizmo in self._gizmos.values():
+                    gizmo.visible = is_on
+
+    @contextlib.contextmanager
+    def _changes(self) -> Iterator[None]:
+        """All at once in the browser."""
+        with self._server.atomic():
+            yield
+        self._server.flush()
+
+    def _add_room(self) -> None:
+        scene = self._scene
+        scene.set_up_direction("+z")
+        scene.configure_default_lights(False)
+        scene.configure_environment_map(None)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.up = VIEW_FROM, SCENE_CENTRE, (0.0, 0.0, 1.0)
+        camera.near, camera.far = 0.01, 20.0
+        scene.add_box(
+            "/table",
+            color=_colour(TABLE_ALBEDO),
+            dimensions=(TABLE_SIDE_M, TABLE_SIDE_M, TABLE_THICKNESS_M),
+            position=(0.0, 0.0, -TABLE_THICKNESS_M / 2),
+            cast_shadow=False,
+        )
+        self._pusher = scene.add_cylinder(
+            "/pusher", radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, color=_colour(PUSHER_ALBEDO), visible=False
+        )
+
+    def _add_light(self) -> None:
+        scene = self._scene
+        start = (0.0, 0.0, 1.0)
+        # three.js divides by pi what Lambert's law does not
+        scene.add_light_ambient("/ambient", intensity=float(np.pi * AMBIENT))
+        self._lamp = scene.add_light_directional(
+            "/lamp", intensity=float(np.pi * DIFFUSE), cast_shadow=True, position=start
+        )
+        cube = (LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M)
+        self._cube = scene.add_box(
+            "/light", color=(40, 200, 60), dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
+        )
+        self._light_gizmo = scene.add_transform_controls(
+            "/light_handle", scale=0.18, disable_rotations=True, position=start, depth_test=False
+        )
+
+        async def drag(event: viser.TransformControlsEvent) -> None:
+            light = light_toward(np.asarray(event.target.position))
+            if event.phase != "end":
+                self._held.add("light")
+                if light is not None:
+                    self._place_light(light.position)
+                return
+            self._held.discard("light")
+            if light is not None:
+                self._place_light(light.position)
+                event.target.position = tuple(light.position)
+                self._on_light(light, event.client)
+
+        self._light_gizmo.on_update(drag)
+
+    def _frustum(self, camera: Camera) -> viser.CameraFrustumHandle:
+        pose = camera.T_world_camera
+        return self._scene.add_camera_frustum(
+            f"/cameras/{camera.name}",
+            fov=camera.fov_y_rad,
+            aspect=camera.width / camera.height,
+            scale=0.12,
+            thickness=0.004,
+            color=(90, 100, 115),
+            wxyz=pose.quaternion,
+            position=pose.position,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _add_object(self, name: str) -> None:
+        try:
+            body = self._scene.add_glb(f"/objects/{name}", self._library.viewer_glb(name))
+            self._heights[name] = float(np.linalg.norm(self._library.size_m(name)) / 2)
+            label = self._library.info(name).label
+        except OsfError as error:  # removed or damaged since the scene was made: its name still shows where it is
+            _log.warning("%s is not drawn: %s", name, error)
+            body, label = self._scene.add_frame(f"/objects/{name}", axes_length=0.05, axes_radius=0.002), name
+        self._bodies[name] = body
+        self._labels[name] = self._scene.add_label(
+            f"/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
+        )
+        gizmo = self._scene.add_transform_controls(f"/handles/{name}", scale=0.12, visible=self._has_gizmos)
+        self._gizmos[name] = gizmo
+
+        async def drag(event: viser.TransformControlsEvent) -> None:
+            pose = Pose(np.array(event.target.position, float), np.array(event.target.wxyz, float))
+            if event.phase != "end":
+                self._held.add(name)
+                self._follow(name, pose)
+                return
+            self._held.discard(name)
+            self._follow(name, pose)
+            self._on_move(name, pose, event.client)
+
+        gizmo.on_update(drag)
+
+    def _follow(self, name: str, pose: Pose) -> None:
+        body, label = self._bodies.get(name), self._labels.get(name)
+        if body is not None and label is not None:
+            _put(body, pose.position, pose.quaternion)
+            _put(label, pose.position + np.array([0.0, 0.0, self._heights.get(name, 0.05)]))
+
+    def _place_object(self, name: str, pose: Pose) -> None:
+        self._follow(name, pose)
+        _put(self._gizmos[name], pose.position, pose.quaternion)
+
+    def _place_light(self, position: np.ndarray) -> None:
+        _put(self._cube, position)
+        _put(self._lamp, position)
+
+
+def light_toward(position: np.ndarray) -> Light | None:
+    """The light in the direction of a point [m], kept above the lowest elevation; None for the table's centre."""
+    if not np.all(np.isfinite(position)) or not np.linalg.norm(position) > 1e-6:
+        return None
+    x, y, z = position / np.linalg.norm(position)
+    lowest_rad = float(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))
+    return Light.from_angles(float(np.arctan2(y, x)), max(float(np.arcsin(np.clip(z, -1, 1))), lowest_rad))
+
+
+def _put(node: viser.SceneNodeHandle, position: np.ndarray, quaternion: np.ndarray | None = None) -> None:
+    if np.abs(np.asarray(node.position) - position).max() > _STILL:
+        node.position = np.asarray(position, float)
+    if quaternion is not None and np.abs(np.asarray(node.wxyz) - quaternion).max() > _STILL:
+        node.wxyz = np.asarray(quaternion, float)
+
+
+def _colour(albedo: tuple[float, float, float]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * channel) for channel in albedo)
+    return red, green, blue
