@@ -38,6 +38,31 @@ _TABLE_THICKNESS_M = 0.1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class BodyModel:
+    """What physics needs of an object, made once: `body_model`.
+
+    Attributes:
+        mass_kg: mass [kg].
+        T_object_inertial: centre of mass and principal axes in the object frame.
+        moments: principal moments [kg m^2].
+        hulls: convex parts as a Wavefront OBJ, one group each, around the centre of mass.
+    """
+
+    mass_kg: float
+    T_object_inertial: Pose
+    moments: Float[np.ndarray, "3"]
+    hulls: str
+
+
+def body_model(asset: ObjectAsset) -> BodyModel:
+    """Mass properties and collision shape of an object."""
+    T_object_inertial, moments = mass_properties(asset.parts, asset.info.mass_kg)
+    T_inertial_object = T_object_inertial.inverse()
+    hulls = _hulls_as_obj([T_inertial_object.apply(part) for part in asset.parts])
+    return BodyModel(asset.info.mass_kg, T_object_inertial, moments, hulls)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class _Body:
     """A body in the simulation and where its centre of mass sits in the object frame."""
 
@@ -50,12 +75,12 @@ class Physics:
     """A simulation of objects, pusher and table. Deterministic: the same calls give the same bits.
 
     Args:
-        assets: the objects that take part, by name; their order is the order of contacts.
+        models: the objects that take part, by name.
     """
 
-    def __init__(self, assets: Mapping[str, ObjectAsset]) -> None:
+    def __init__(self, models: Mapping[str, BodyModel]) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
-        self._assets = dict(assets)
+        self._models = dict(models)
         self._build()
 
     def _build(self) -> None:
@@ -88,8 +113,8 @@ class Physics:
         pybullet.setCollisionFilterPair(self._pusher, self._table, -1, -1, 0, physicsClientId=c)
         self._pusher_position = np.array([0, 0, 2.0])
         self._bodies: dict[str, _Body] = {}
-        for name, asset in self._assets.items():
-            self._bodies[name] = self._add(asset)
+        for name, model in self._models.items():
+            self._bodies[name] = self._add(model)
 
     def _dynamics(self, uid: int, friction: float) -> None:
         pybullet.changeDynamics(
@@ -104,21 +129,19 @@ class Physics:
             physicsClientId=self._client,
         )
 
-    def _add(self, asset: ObjectAsset) -> _Body:
+    def _add(self, model: BodyModel) -> _Body:
         """One object, out of everything's way until it is placed."""
-        T_object_inertial, moments = mass_properties(asset.parts, asset.info.mass_kg)
-        T_inertial_object = T_object_inertial.inverse()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "parts.obj"  # Bullet makes a compound of hulls from the groups of an OBJ file
-            path.write_text(_hulls_as_obj([T_inertial_object.apply(part) for part in asset.parts]))
+            path.write_text(model.hulls)
             shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
         # A visual shape of its own keeps Bullet from reading the file again for one.
         visual = pybullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001, physicsClientId=self._client)
-        away = [10.0 * (1 + len(self._bodies)), 0.0, 50.0]  # far off until it is placed
-        uid = pybullet.createMultiBody(asset.info.mass_kg, shape, visual, away, physicsClientId=self._client)
+        away = [10.0 * (1 + len(self._bodies)), 0.0, 50.0]
+        uid = pybullet.createMultiBody(model.mass_kg, shape, visual, away, physicsClientId=self._client)
         self._dynamics(uid, OBJECT_FRICTION)
-        pybullet.changeDynamics(uid, -1, localInertiaDiagonal=moments.tolist(), physicsClientId=self._client)
-        return _Body(uid, T_object_inertial, T_inertial_object)
+        pybullet.changeDynamics(uid, -1, localInertiaDiagonal=model.moments.tolist(), physicsClientId=self._client)
+        return _Body(uid, model.T_object_inertial, model.T_object_inertial.inverse())
 
     def reset(self) -> None:
         """Start over from the state right after construction, with nothing on the table."""
@@ -213,24 +236,21 @@ def mass_properties(parts: tuple[Float[np.ndarray, "M 3"], ...], mass_kg: float)
 
     Parts are summed as if they did not overlap.
     """
-    volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
-    canonical = (np.ones((3, 3)) + np.eye(3)) / 120  # second moments of the unit tetrahedron
+    # Each part is cut into tetrahedra from an inner point to the triangles of its hull, corners p0 (inner) to p3.
+    tetrahedra = []
     for part in parts:
         hull = ConvexHull(part)
-        inside = part[hull.vertices].mean(axis=0)
-        for simplex in hull.simplices:
-            edges = (part[simplex] - inside).T.astype(float)
-            determinant = abs(np.linalg.det(edges))
-            centre = inside + edges.sum(axis=1) / 4
-            volume += determinant / 6
-            first += determinant / 6 * centre
-            local = determinant * edges @ canonical @ edges.T  # about `inside`
-            shift = np.outer(inside, edges.sum(axis=1)) / 24 * determinant
-            second += local + shift + shift.T + determinant / 6 * np.outer(inside, inside)
-    centre = first / volume
-    covariance = second / volume - np.outer(centre, centre)
-    inertia = mass_kg * (np.trace(covariance) * np.eye(3) - covariance)
-    moments, axes = np.linalg.eigh(inertia)
+        corners = part[hull.simplices].astype(float)
+        inner = np.broadcast_to(part[hull.vertices].mean(axis=0, dtype=float), (len(corners), 1, 3))
+        tetrahedra.append(np.concatenate([inner, corners], axis=1))
+    points = np.concatenate(tetrahedra)  # (S, 4, 3)
+    volumes = np.abs(np.linalg.det(points[:, 1:] - points[:, :1])) / 6
+    sums = points.sum(axis=1)
+    centre = volumes @ sums / 4 / volumes.sum()
+    # Second moments of a tetrahedron: V / 20 (s s^T + sum_i p_i p_i^T), with s the sum of its corners.
+    second = np.einsum("s,si,sj->ij", volumes, sums, sums) + np.einsum("s,ski,skj->ij", volumes, points, points)
+    covariance = second / 20 / volumes.sum() - np.outer(centre, centre)
+    moments, axes = np.linalg.eigh(mass_kg * (np.trace(covariance) * np.eye(3) - covariance))
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
     return Pose(centre, quaternion_from_matrix(axes)), moments

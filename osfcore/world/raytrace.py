@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -138,14 +139,7 @@ def masks_of(picture: Picture, count: int) -> Bool[np.ndarray, "N h w"]:
 def _trace(shot: _Shot) -> Picture:
     """One view: closed-form table first, then grids of samples where something happens."""
     height, width = shot.camera.height, shot.camera.width
-    near_body = np.zeros((height, width), bool)
-    for body in shot.bodies:
-        box = _screen_box(body, shot.camera)
-        if box is not None:
-            left, top, right, bottom = box
-            near_body[top:bottom, left:right] = True
-    if shot.sharp:
-        near_body[:] = True
+    near_body = np.ones((height, width), bool) if shot.sharp else _near_bodies(shot)
     rgb = np.zeros((height, width, 3), np.float32)
     depth = np.full((height, width), np.inf, np.float32)
     coverage = np.zeros((len(shot.bodies), height, width), np.float32)
@@ -154,6 +148,23 @@ def _trace(shot: _Shot) -> Picture:
         _sampled(shot, busy & ~near_body, (), rgb, depth, coverage)
     _sampled(shot, near_body, tuple(range(len(shot.bodies))), rgb, depth, coverage)
     return Picture(rgb, coverage, depth)
+
+
+def _near_bodies(shot: _Shot) -> Bool[np.ndarray, "h w"]:
+    """Pixels that a body may cover: those with a corner on one, and their neighbours."""
+    height, width = shot.camera.height, shot.camera.width
+    on_body = np.zeros((height + 1, width + 1), bool)
+    for body in shot.bodies:
+        box = _screen_box(body, shot.camera)
+        if box is not None:
+            left, top, right, bottom = box
+            y, x = np.mgrid[top : bottom + 1, left : right + 1]
+            directions = _directions(shot, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32))
+            origins = np.broadcast_to(shot.origin, directions.shape)
+            hit = body.mesh.occludes(*into_frame(body.pose, origins, directions))
+            on_body[top : bottom + 1, left : right + 1] |= hit.reshape(x.shape)
+    pixels = on_body[:-1, :-1] | on_body[:-1, 1:] | on_body[1:, :-1] | on_body[1:, 1:]
+    return cv2.dilate(pixels.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
 def _screen_box(body: _Body, camera: Camera) -> tuple[int, int, int, int] | None:

@@ -30,7 +30,7 @@ from osfcore.scene import (
     default_cameras,
     finite_vector,
 )
-from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, Physics
+from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, body_model
 from osfcore.world.placing import is_calm, place_randomly
 from osfcore.world.raytrace import Picture, RayTracer, masks_of
 from osfcore.world.tiny import TinyScene
@@ -88,6 +88,7 @@ class Tabletop:
         self._renderer: Renderer = renderer
         self._executor = executor
         self._assets: dict[str, ObjectAsset] = {}
+        self._models: dict[str, BodyModel] = {}
         self._meshes: dict[str, TracedMesh] = {}
         self._physics: Physics | None = None
         self._tiny: TinyScene | None = None
@@ -309,9 +310,11 @@ class Tabletop:
         return self._bodies.step(velocity)
 
     def _load_objects(self, names: tuple[str, ...]) -> None:
-        assets = {name: self._asset(name) for name in names}
+        for name in names:
+            if name not in self._models:
+                self._models[name] = body_model(self._asset(name))
         self.close()
-        self._physics = Physics(assets)
+        self._physics = Physics({name: self._models[name] for name in names})
         self._names = names
 
     def _place_all(self, state: SceneState) -> None:

@@ -3,7 +3,7 @@ import pytest
 
 from osfcore.poses import Pose, quaternion_exp
 from osfcore.scene import MAX_SPEED_M_S, PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, PUSHER_REACH_M
-from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, Physics, lowest_point, mass_properties
+from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, Physics, body_model, lowest_point, mass_properties
 from osfcore.world.placing import settle
 from tests.core.world.boxes import box_asset
 
@@ -13,7 +13,7 @@ LEVEL = np.array([1.0, 0, 0, 0])
 
 @pytest.fixture
 def physics():
-    simulation = Physics({"box": BOX})
+    simulation = Physics({"box": body_model(BOX)})
     yield simulation
     simulation.close()
 
@@ -51,7 +51,7 @@ def test_box_rests_on_the_table_without_sinking_or_jitter(physics):
 def test_pose_is_of_the_object_frame_not_of_the_centre_of_mass():
     lopsided = box_asset("box", (0.08, 0.06, 0.04))
     shifted = type(lopsided)(lopsided.info, lopsided.mesh, (lopsided.parts[0] + [0.01, 0.005, 0],), lopsided.resting)
-    simulation = Physics({"box": shifted})
+    simulation = Physics({"box": body_model(shifted)})
     pose = Pose(np.array([0.1, 0.05, 0.2]), quaternion_exp(np.array([0.1, 0.2, 0.3])))
     simulation.place("box", pose)
     np.testing.assert_allclose(simulation.pose("box").matrix(), pose.matrix(), atol=1e-6)
@@ -91,7 +91,7 @@ def test_pusher_stops_at_its_reach(physics):
 
 
 def test_gap_between_boxes_is_the_true_one():
-    simulation = Physics({"a": BOX, "b": BOX})
+    simulation = Physics({"a": body_model(BOX), "b": body_model(BOX)})
     simulation.place("a", Pose(np.array([0.0, 0, 0.02]), LEVEL))
     simulation.place("b", Pose(np.array([0.09, 0, 0.02]), LEVEL))
     assert simulation.distance("a", "b") == pytest.approx(0.01, abs=5e-4)

@@ -4,14 +4,14 @@ import pytest
 from osfcore.errors import NoRoom
 from osfcore.poses import Pose, quaternion_to_matrix, rotate
 from osfcore.scene import WORKSPACE_HALF_M
-from osfcore.world.physics import Physics
+from osfcore.world.physics import Physics, body_model
 from osfcore.world.placing import is_calm, place_randomly, random_rest, settle
 from tests.core.world.boxes import box_asset
 
 
 def test_scenes_of_real_objects_lie_apart_inside_the_workspace_at_rest(library):
     assets = {name: library.load(name) for name in library.names()}
-    physics = Physics(assets)
+    physics = Physics({name: body_model(asset) for name, asset in assets.items()})
     for seed in range(5):
         place_randomly(physics, assets, np.random.default_rng(seed))
         assert is_calm(physics, tuple(assets))
@@ -25,7 +25,7 @@ def test_scenes_of_real_objects_lie_apart_inside_the_workspace_at_rest(library):
 
 def test_what_cannot_fit_is_told():
     assets = {f"box{i}": box_asset(f"box{i}", (0.5, 0.5, 0.02)) for i in range(3)}
-    physics = Physics(assets)
+    physics = Physics({name: body_model(asset) for name, asset in assets.items()})
     with pytest.raises(NoRoom, match="box0, box1, box2"):
         place_randomly(physics, assets, np.random.default_rng(0))
     physics.close()
@@ -43,7 +43,7 @@ def test_everything_that_moves_at_pushing_speed_stops_within_a_second(library):
     """In every resting pose, pushed at 0.3 m/s and let go; rolling friction stops cans and bottles too."""
     for name in library.names():
         asset = library.load(name)
-        physics = Physics({name: asset})
+        physics = Physics({name: body_model(asset)})
         for quaternion in asset.resting.quaternions:
             bottom = quaternion_to_matrix(quaternion)[2] @ np.concatenate(asset.parts).T
             physics.place(name, Pose(np.array([0, 0, -bottom.min()]), quaternion))
