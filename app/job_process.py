@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
-from app.processes import own_group, silence_stdout
+from app.processes import import_quietly, own_group, silence_stdout
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
 
@@ -86,6 +86,8 @@ def job_main(connection: Connection, kind: str, params: dict[str, Any], place: P
     own_group()
     silence_stdout()
     orders = Orders(connection)
+    if kind != "fetch_assets":
+        import_quietly("osfcore.world.tabletop")
     with contextlib.suppress(OSError):  # the web process has gone
         connection.send(_run(connection, orders, kind, params, place))
 

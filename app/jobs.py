@@ -12,31 +12,23 @@ import threading
 import time
 import uuid
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from app.job import Job, JobChanged, State, WrongJobState, ended, job_fields, job_from_fields
 from app.job_process import Place, job_main
 from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
 from app.processes import end, launch
 from app.store import Store, now_utc
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import OsfError, UnknownName
 
-State = Literal["queued", "running", "paused", "done", "failed", "cancelled"]
-FINISHED: tuple[State, ...] = ("done", "failed", "cancelled")
 STOPPED_NOTE = "The service stopped while this job was running; start it again."
 _LOOK_INTERVAL_S = 0.2
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
 _log = logging.getLogger(__name__)
-
-
-class WrongJobState(OsfError):
-    """An order that does not fit the state that a job is in."""
-
-    def __init__(self, job: Job, wanted: str) -> None:
-        super().__init__(f"Job {job.id} is {job.state}, so it cannot be {wanted}.")
 
 
 class QueueFull(OsfError):
@@ -44,58 +36,6 @@ class QueueFull(OsfError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"{limit} jobs are waiting already, which is the most; wait for one or cancel one.")
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """A job as it is now.
-
-    Attributes:
-        id: identifier.
-        kind: what is done.
-        params: with what.
-        state: where it is in its life.
-        done: units finished.
-        total: units in all; 0 before it is known.
-        note: what is being done, for a person.
-        created_at: UTC, ISO 8601.
-        started_at: when it left the queue.
-        finished_at: when it ended, in whatever way.
-        eta_s: time left, estimated [s].
-        error: why it failed, one sentence.
-        result: what its kind tells at the end.
-        files: names that can be downloaded.
-        position: in the queue, the next one has 1.
-    """
-
-    id: str
-    kind: str
-    params: dict[str, Any]
-    state: State = "queued"
-    done: int = 0
-    total: int = 0
-    note: str = "Waiting"
-    created_at: str = field(default_factory=now_utc)
-    started_at: str | None = None
-    finished_at: str | None = None
-    eta_s: float | None = None
-    error: str | None = None
-    result: dict[str, Any] | None = None
-    files: tuple[str, ...] = ()
-    position: int | None = None
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether nothing will change any more."""
-        return self.state in FINISHED
-
-
-@dataclass(frozen=True, slots=True)
-class JobChanged:
-    """A job is now like this; `event` is the number under which a page can ask for what came later."""
-
-    event: int
-    job: Job
 
 
 @dataclass
@@ -144,7 +84,7 @@ class Jobs:
     def start(self) -> None:
         """Take over what the store holds and begin to work."""
         for number, fields in self._store.jobs():
-            job = Job(**{**fields, "files": tuple(fields["files"])})
+            job = job_from_fields(fields)
             self._jobs[job.id], self._numbers[job.id] = job, number
         for job in list(self._jobs.values()):
             if job.state in ("running", "paused"):
@@ -216,7 +156,7 @@ class Jobs:
             if found.is_finished:
                 raise WrongJobState(found, "cancelled")
             if found.state == "queued":
-                self._set(_ended(self._jobs[job], "cancelled", note="Cancelled"))
+                self._set(ended(self._jobs[job], "cancelled", note="Cancelled"))
                 self._tell_queue()
                 return self.get(job)
             if self._run is not None and self._run.cancel_at is None:
@@ -265,7 +205,7 @@ class Jobs:
                 try:
                     self._begin(job)
                 except OSError as error:
-                    self._set(_ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
+                    self._set(ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
                     continue
             self._attend()
 
@@ -295,6 +235,8 @@ class Jobs:
                 else:
                     outcome = message
             with self._changed:
+                if outcome is not None:
+                    break
                 if self._is_stopping:
                     outcome = Failure(0, "Stopped", STOPPED_NOTE)
                 elif run.cancel_at is not None and time.monotonic() > run.cancel_at:
@@ -311,18 +253,18 @@ class Jobs:
         match outcome:
             case JobDone(result):
                 files = tuple(sorted(p.name for p in folder.glob("[!.]*") if p.is_file()))
-                ended = _ended(job, "done", note="Done", result=result, files=files)
+                after = ended(job, "done", note="Done", result=result, files=files)
             case JobCancelled():
-                ended = _ended(job, "cancelled", note="Cancelled")
+                after = ended(job, "cancelled", note="Cancelled")
             case Failure(_, _, text):
-                ended = _ended(job, "failed", note="Failed", error=text)
+                after = ended(job, "failed", note="Failed", error=text)
             case _:
-                ended = _ended(job, "failed", note="Failed", error="The job's process told nonsense.")
-        if ended.state != "done":
+                after = ended(job, "failed", note="Failed", error="The job's process told nonsense.")
+        if after.state != "done":
             shutil.rmtree(folder, ignore_errors=True)
         with self._changed:
             self._run = None
-            self._set(ended)
+            self._set(after)
             self._changed.notify_all()
 
     def _progress(self, step: JobStep) -> None:
@@ -379,7 +321,7 @@ class Jobs:
 
     def _fail_stopped(self, job: Job) -> None:
         shutil.rmtree(self.folder(job.id), ignore_errors=True)
-        self._set(_ended(job, "failed", note="Failed", error=STOPPED_NOTE))
+        self._set(ended(job, "failed", note="Failed", error=STOPPED_NOTE))
 
 
 class _Clock:
@@ -407,43 +349,3 @@ class _Clock:
         if done <= first_done:
             return None
         return round((now - start) / (done - first_done) * (total - done), 1)
-
-
-def job_fields(job: Job) -> dict[str, Any]:
-    """A job as JSON."""
-    return {**asdict(job), "files": list(job.files)}
-
-
-def job_from_fields(fields: dict[str, Any]) -> Job:
-    """The inverse of `job_fields`."""
-    return Job(**{**fields, "files": tuple(fields["files"])})
-
-
-def _ended(job: Job, state: State, **changes: Any) -> Job:  # noqa: ANN401  any field of Job
-    return replace(job, state=state, finished_at=now_utc(), eta_s=None, position=None, **changes)
-
-
-def check_file_name(job: Job, name: str) -> str:
-    """The name of one of a job's files.
-
-    Raises:
-        UnknownName: if it has none of this name.
-    """
-    if name not in job.files:
-        raise UnknownName(f"file of job {job.id}", name, job.files)
-    return name
-
-
-def check_params(kind: str, params: dict[str, Any], known: Callable[[str], object], available: int) -> None:
-    """Refuse at once what the job would refuse later.
-
-    Raises:
-        OsfError: if an object is unknown or there are too few.
-    """
-    if kind == "collect_object":
-        known(params["name"])
-    for name in params.get("names", ()):
-        known(name)
-    if kind == "collect_pushes" and params["objects"] > available:
-        allowed = f"at most {available}, as many as were fetched" if available else "0 until some have been fetched"
-        raise InvalidInput("number of objects", params["objects"], allowed)

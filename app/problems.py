@@ -21,6 +21,7 @@ STATUS_OF_KIND = {
     "TooManyScenes": 409,
     "QueueFull": 429,
     "StageUnavailable": 503,
+    "StageBusy": 503,
     "CannotStore": 507,
     "CorruptFile": 409,
     "Internal": 500,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
@@ -16,6 +18,7 @@ def launch(target: Callable[..., None], name: str, *arguments: object) -> tuple[
     """Start `target(connection, *arguments)` in a new process; returns it and the other end of its pipe."""
     ours, theirs = _SPAWN.Pipe(duplex=True)
     process = _SPAWN.Process(target=target, name=name, args=(theirs, *arguments), daemon=True)
+    resource_tracker.ensure_running()  # its own start would unblock the signal again
     # A Ctrl-C goes to the whole terminal group; children inherit the mask and thus never see one.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -34,6 +37,18 @@ def silence_stdout() -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)
+
+
+def import_quietly(module: str) -> None:
+    """Import a module whose libraries greet on standard error; real errors still raise."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        importlib.import_module(module)
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def own_group() -> None:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from app.hub import Hub
-from app.jobs import Job, JobChanged, Jobs, check_params
+from app.job import Job, JobChanged, check_params
+from app.jobs import Jobs
 from app.messages import (
     Act,
     AdoptScene,
@@ -262,7 +263,7 @@ class Runner:
         key = (self.scene(command.id).revision, command)
         found = self._images.get(key)
         if found is None:
-            answer = asyncio.wrap_future(self._stage.submit(command))
+            answer = asyncio.wrap_future(await asyncio.to_thread(self._stage.submit, command))
             try:
                 found = await asyncio.wait_for(answer, self._settings.stage_timeout_s)
             except TimeoutError:

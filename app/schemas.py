@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.jobs import Job, State
+from app.job import Job, State
 from app.messages import SceneRecord
 from app.runner import MAX_SEED
 from osfcore.objects.asset import ObjectInfo

@@ -67,7 +67,10 @@ def is_same_origin(connection: HTTPConnection, allowed: Iterable[str] = ()) -> b
 class SecurityMiddleware:
     """Refuses unknown hosts and foreign origins, and adds headers to every response."""
 
-    def __init__(self, app: ASGIApp, *, allowed_hosts: Iterable[str], allowed_origins: Iterable[str]) -> None:
+    def __init__(
+        self, app: ASGIApp, *, allowed_hosts: Iterable[str], allowed_origins: Iterable[str], max_body_bytes: int
+    ) -> None:
+        self._max_body_bytes = max_body_bytes
         self._app = app
         self._allowed_hosts = frozenset(allowed_hosts)
         self._allowed_origins = frozenset(allowed_origins)
@@ -85,11 +88,24 @@ class SecurityMiddleware:
                 await send({"type": "websocket.close", "code": 1008})
             return
         path = scope["path"]
+        is_too_large = False
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _add_headers(MutableHeaders(scope=message), path)
             await send(message)
+
+        async def send_problems(message: Message) -> None:
+            # The body limit answers in plain text, before any handler of the app is asked.
+            nonlocal is_too_large
+            if is_too_large:
+                return
+            if message["type"] == "http.response.start" and message["status"] == 413:
+                is_too_large = True
+                detail = f"The request is larger than {self._max_body_bytes} bytes."
+                await problem(413, detail)(scope, receive, send_with_headers)
+                return
+            await send_with_headers(message)
 
         if not is_known:
             detail = "The service is not known under this host name; set OSF_ALLOWED_HOSTS to allow it."
@@ -98,7 +114,7 @@ class SecurityMiddleware:
             detail = "Requests from other sites are refused; set OSF_ALLOWED_ORIGINS to allow one."
             await problem(403, detail)(scope, receive, send_with_headers)
         else:
-            await self._app(scope, receive, send_with_headers)
+            await self._app(scope, receive, send_problems)
 
 
 def _add_headers(headers: MutableHeaders, path: str) -> None:

@@ -40,7 +40,7 @@ from app.messages import (
     TakeMask,
     WatchFrames,
 )
-from app.processes import silence_stdout
+from app.processes import import_quietly, silence_stdout
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose
@@ -60,7 +60,7 @@ def stage_main(connection: Connection, objects_root: Path, max_live_worlds: int)
     """Serve commands until told to leave or the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
     silence_stdout()
-    import osfcore.world.tabletop  # noqa: F401  the slow imports, before the stage calls itself ready
+    import_quietly("osfcore.world.tabletop")  # slow, so before the stage calls itself ready
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
         stage = Stage(connection, AssetLibrary(objects_root), executor, max_live_worlds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import threading
@@ -29,6 +30,7 @@ from app.stage import stage_main
 from osfcore.errors import OsfError
 
 Status = Literal["starting", "ready", "restarting"]
+MAX_PENDING = 64
 _LEAVE_GRACE_S = 1.0
 _RESTART_PAUSES_S = (0.0, 1.0, 5.0, 30.0)  # longer and longer while it keeps dying without answering anything
 _log = logging.getLogger(__name__)
@@ -52,6 +54,13 @@ class StageUnavailable(OsfError):
 
     def __init__(self, what: str) -> None:
         super().__init__(f"The simulation {what} and is being restarted; try again in a moment.")
+
+
+class StageBusy(OsfError):
+    """More commands wait than make sense."""
+
+    def __init__(self) -> None:
+        super().__init__("The simulation has too much to do at once; try again in a moment.")
 
 
 class StageLink:
@@ -80,7 +89,8 @@ class StageLink:
         self._greeting = greeting
         self._on_event = on_event
         self._on_lost = on_lost
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # never held while sending: the listener needs it to take answers
+        self._send_lock = threading.Lock()
         self._numbers = itertools.count(1)
         self._pending: dict[int, Future[Any]] = {}
         self._process: SpawnProcess | None = None
@@ -106,8 +116,8 @@ class StageLink:
         self._stopping.set()
         with self._lock:
             connection, process = self._connection, self._process
-            if connection is not None:
-                self._send(connection, Request(0, Leave()))
+        if connection is not None:
+            self._send(connection, Request(0, Leave()))
         if process is not None:
             end(process, _LEAVE_GRACE_S)
         if self._thread is not None:
@@ -119,14 +129,17 @@ class StageLink:
         """Send a command; the future raises StageError or StageUnavailable where it could not be done."""
         future: Future[Any] = Future()
         with self._lock:
-            if self._connection is None or self._stopping.is_set():
+            connection = self._connection
+            if connection is None or self._stopping.is_set():
                 future.set_exception(StageUnavailable("is not running"))
+                return future
+            if len(self._pending) >= MAX_PENDING:
+                future.set_exception(StageBusy())
                 return future
             number = next(self._numbers)
             self._pending[number] = future
-            if not self._send(self._connection, Request(number, command)):
-                del self._pending[number]
-                future.set_exception(StageUnavailable("has stopped"))
+        if not self._send(connection, Request(number, command)):
+            self._settle(number, lambda lost: lost.set_exception(StageUnavailable("has stopped")))
         return future
 
     def call(self, command: Command) -> Any:  # noqa: ANN401  each command says what answers it
@@ -149,17 +162,18 @@ class StageLink:
 
     def _launch(self) -> None:
         process, connection = launch(stage_main, "osf-stage", *self._arguments)
-        with self._lock:
-            self._process, self._connection = process, connection
-            for command in self._greeting():
-                number = next(self._numbers)
-                self._pending[number] = Future()
-                self._send(connection, Request(number, command))
+        greeting = [Request(0, command) for command in self._greeting()]
+        with self._send_lock:  # whatever is sent from now on comes after the greeting
+            with self._lock:
+                self._process, self._connection = process, connection
+            with contextlib.suppress(OSError):  # the listening thread will see that it died
+                for request in greeting:
+                    connection.send(request)
 
-    @staticmethod
-    def _send(connection: Connection, request: Request) -> bool:
+    def _send(self, connection: Connection, request: Request) -> bool:
         try:
-            connection.send(request)
+            with self._send_lock:
+                connection.send(request)
         except OSError:  # the listening thread sees the end as well and restarts
             return False
         return True

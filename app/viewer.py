@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from app.jobs import JobChanged
+from app.job import JobChanged
 from app.messages import CurrentScene, SceneRecord
 from app.playback import Playback
 from app.runner import Runner
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
-from osfcore.poses import Pose
+from osfcore.poses import Pose, quaternion_to_matrix
 from osfcore.scene import (
     AMBIENT,
     DIFFUSE,
@@ -40,9 +40,10 @@ from osfcore.world.optics import PUSHER_ALBEDO, TABLE_ALBEDO
 
 PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
 PUSH_STEPS = 2
-VIEW_FROM = (0.75, -0.75, 0.65)
+VIEW_FROM, VIEW_FOV_RAD = (1.0, -1.0, 0.95), 0.75
 TABLE_THICKNESS_M = 0.04
 LIGHT_CUBE_M = 0.06
+LABEL_GAP_M = 0.01
 _STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
@@ -198,7 +199,7 @@ class SceneDrawing:
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._labels: dict[str, viser.SceneNodeHandle] = {}
         self._gizmos: dict[str, viser.SceneNodeHandle] = {}
-        self._heights: dict[str, float] = {}
+        self._sizes_m: dict[str, np.ndarray] = {}
         self._held: set[str] = set()  # what someone is dragging follows the hand, not the scene
         self._has_names = True
         self._has_gizmos = False
@@ -276,6 +277,7 @@ class SceneDrawing:
         scene.configure_environment_map(None)
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.up = VIEW_FROM, SCENE_CENTRE, (0.0, 0.0, 1.0)
+        camera.fov = VIEW_FOV_RAD
         camera.near, camera.far = 0.01, 20.0
         scene.add_box(
             "/table",
@@ -301,7 +303,7 @@ class SceneDrawing:
             "/light", color=(40, 200, 60), dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
         )
         self._light_gizmo = scene.add_transform_controls(
-            "/light_handle", scale=0.18, disable_rotations=True, position=start, depth_test=False
+            "/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
         )
 
         async def drag(event: viser.TransformControlsEvent) -> None:
@@ -325,8 +327,8 @@ class SceneDrawing:
             f"/cameras/{camera.name}",
             fov=camera.fov_y_rad,
             aspect=camera.width / camera.height,
-            scale=0.12,
-            thickness=0.004,
+            scale=0.09,
+            thickness=0.003,
             color=(90, 100, 115),
             wxyz=pose.quaternion,
             position=pose.position,
@@ -337,7 +339,7 @@ class SceneDrawing:
     def _add_object(self, name: str) -> None:
         try:
             body = self._scene.add_glb(f"/objects/{name}", self._library.viewer_glb(name))
-            self._heights[name] = float(np.linalg.norm(self._library.size_m(name)) / 2)
+            self._sizes_m[name] = self._library.size_m(name)
             label = self._library.info(name).label
         except OsfError as error:  # removed or damaged since the scene was made: its name still shows where it is
             _log.warning("%s is not drawn: %s", name, error)
@@ -365,7 +367,9 @@ class SceneDrawing:
         body, label = self._bodies.get(name), self._labels.get(name)
         if body is not None and label is not None:
             _put(body, pose.position, pose.quaternion)
-            _put(label, pose.position + np.array([0.0, 0.0, self._heights.get(name, 0.05)]))
+            size_m = self._sizes_m.get(name, np.zeros(3))
+            top_m = float(np.abs(quaternion_to_matrix(pose.quaternion)[2]) @ size_m / 2)
+            _put(label, pose.position + np.array([0.0, 0.0, top_m + LABEL_GAP_M]))
 
     def _place_object(self, name: str, pose: Pose) -> None:
         self._follow(name, pose)

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Header, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
-from app.jobs import Job, JobChanged, job_from_fields
+from app.job import Job, JobChanged, job_from_fields
 from app.messages import CurrentScene, FramesTaken, Notice, SceneChanged
 from app.routes import problems
 from app.schemas import FrameEvent, JobOut, NoticeEvent

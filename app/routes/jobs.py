@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path, Response, status
 from fastapi.responses import FileResponse
 
-from app.jobs import Job, check_file_name
+from app.job import Job, check_file_name
 from app.problems import NotFound
 from app.routes import problems
 from app.schemas import JobIn, JobList, JobOut

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from app.job import Job
+from app.schemas import CameraOut, JobIn, JobOut, LightIn, SceneIn, SceneOut
+from osfcore.errors import InvalidInput
+from osfcore.scene import goal_camera
+from tests.app.test_store import record
+
+
+def test_a_scene_says_what_the_record_says():
+    kept = record()
+    out = SceneOut.of(kept, {"x": "Box"}, is_current=True)
+    assert [o.label for o in out.objects] == ["Box", "y"]
+    assert out.objects[1].position == [0.3, 0.0, 0.1]
+    assert [c.name for c in out.cameras] == ["0", "1", "2", "3", "goal"]
+    assert {(c.width, c.height) for c in out.cameras} == {(128, 128)}
+    assert out.pusher is not None
+    assert SceneOut.of(record(pusher=None), {}, is_current=False).pusher is None
+
+
+def test_cameras_project_as_the_core_does():
+    camera = goal_camera(64)
+    out = CameraOut.of(camera)
+    point = np.array([0.1, -0.05, 0.02, 1.0])
+    pixel = np.array(out.K) @ (np.linalg.inv(np.array(out.T_world_camera)) @ point)[:3]
+    assert np.allclose(pixel[:2] / pixel[2], camera.project(point[:3]))
+
+
+def test_unknown_fields_are_mistakes():
+    with pytest.raises(ValidationError):
+        SceneIn.model_validate({"objekts": []})
+
+
+def test_a_light_below_the_table_is_refused():
+    with pytest.raises(InvalidInput, match="elevation"):
+        LightIn(position=[1, 0, -0.1]).light()
+
+
+def test_jobs_are_told_apart_by_kind():
+    adapter = TypeAdapter(JobIn)
+    job = adapter.validate_python({"kind": "collect_pushes", "params": {"episodes": 2}})
+    assert job.params.model_dump()["steps"] == 50
+    with pytest.raises(ValidationError):
+        adapter.validate_python({"kind": "collect_object"})
+    with pytest.raises(ValidationError):
+        adapter.validate_python({"kind": "collect_pushes", "params": {"out": "/etc/passwd"}})
+
+
+def test_a_job_says_what_the_registry_says():
+    out = JobOut.of(Job("a", "collect_table", {"images": 60}, files=("table.zip",), position=2))
+    assert (out.files, out.position, out.state) == (["table.zip"], 2, "queued")
