@@ -7,7 +7,6 @@ centred, wound outward, with smooth normals across texture seams and one clean t
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -17,13 +16,11 @@ from osfcore.objects.asset import TexturedMesh
 from osfcore.objects.surface import joined, piece_of
 from osfcore.objects.texture import clean_texture
 
-if TYPE_CHECKING:
-    pass
-
 MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0
 MAX_FACES = 200_000
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae")
 _Y_UP_SUFFIXES = (".glb", ".gltf")
+_CREASE_RAD = np.deg2rad(50.0)  # edges sharper than this stay sharp: a box must not shade like a pillow
 _MIN_THICKNESS = 1e-3  # of the longest side; thinner is a sheet, which no solver can rest on a table
 
 
@@ -102,9 +99,11 @@ def textured_mesh(
         raise CorruptFile(source, "all of its triangles are degenerate")
     faces = _outward(welded, weld, faces)
     texture = np.ascontiguousarray(texture)
+    origin, group, faces = _split_at_creases(welded, weld, faces)
+    vertices, uv = vertices[origin], uv[origin]
     return TexturedMesh(
         vertices=vertices.astype(np.float32),
-        normals=_smooth_normals(welded, weld[faces])[weld].astype(np.float32),
+        normals=_smooth_normals(vertices, group, faces).astype(np.float32),
         faces=faces.astype(np.int32),
         uv=np.clip(uv, 0, 1).astype(np.float32),
         texture=texture if is_clean else clean_texture(texture, uv, faces),
@@ -162,16 +161,39 @@ def _outward(
     return np.where(flipped[:, None], faces[:, ::-1], faces)
 
 
-def _smooth_normals(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "Q 3"]:
-    """Unit normals at positions: those of the faces around, weighted by their angle there."""
-    face_normals = _corners(points, faces)
+def _split_at_creases(
+    points: Float[np.ndarray, "Q 3"], weld: Int[np.ndarray, "P"], faces: Int[np.ndarray, "F 3"]
+) -> tuple[Int[np.ndarray, "R"], Int[np.ndarray, "R"], Int[np.ndarray, "F 3"]]:
+    """One vertex per smooth patch that meets there.
+
+    Returns:
+        For each new vertex the old one it copies and the group that shares its normal (one position, one patch), and
+        the faces in new vertices.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(points, weld[faces], process=False)
+    smooth = mesh.face_adjacency[mesh.face_adjacency_angles < _CREASE_RAD]
+    patches = trimesh.graph.connected_component_labels(smooth, node_count=len(faces))
+    corners = np.stack([faces.reshape(-1), np.repeat(patches, 3)], axis=1)
+    split, inverse = np.unique(corners, axis=0, return_inverse=True)
+    shared = np.stack([weld[split[:, 0]], split[:, 1]], axis=1)
+    _, group = np.unique(shared, axis=0, return_inverse=True)
+    return split[:, 0], group.reshape(-1), inverse.reshape(-1, 3)
+
+
+def _smooth_normals(
+    vertices: Float[np.ndarray, "R 3"], group: Int[np.ndarray, "R"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "R 3"]:
+    """Unit normals: those of the faces around each group of vertices, weighted by their angle there."""
+    face_normals = _corners(vertices, faces)
     face_normals /= np.linalg.norm(face_normals, axis=1, keepdims=True)
-    normals = np.zeros_like(points)
+    normals = np.zeros((group.max() + 1, 3))
     for corner in range(3):
-        here, after, before = (points[faces[:, (corner + k) % 3]] for k in range(3))
+        here, after, before = (vertices[faces[:, (corner + k) % 3]] for k in range(3))
         u, w = after - here, before - here
         angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ij,ij->i", u, w))
-        np.add.at(normals, faces[:, corner], angle[:, None] * face_normals)
+        np.add.at(normals, group[faces[:, corner]], angle[:, None] * face_normals)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    # Opposite faces of a sheet cancel out, and unused positions have no faces: any unit vector is as good.
-    return np.where(length > 1e-9, normals / np.maximum(length, 1e-9), np.array([0.0, 0.0, 1.0]))
+    # Opposite faces of a sheet cancel out: any unit vector is as good.
+    return np.where(length > 1e-9, normals / np.maximum(length, 1e-9), np.array([0.0, 0.0, 1.0]))[group]

@@ -74,6 +74,15 @@ def test_winding_becomes_outward(broken):
     assert (np.einsum("ij,ij->i", normals, mesh.normals[mesh.faces[:, 0]]) > 0).all(), centre.shape
 
 
+def test_a_box_keeps_flat_faces_and_sharp_edges():
+    box = trimesh.creation.box((0.1, 0.06, 0.04))
+    mesh = textured_mesh(box.vertices, box.faces, np.zeros((8, 2)), np.zeros((2, 2, 3), np.uint8), "box")
+    assert len(mesh.vertices) == 24
+    assert np.allclose(np.abs(mesh.normals).max(axis=1), 1)
+    outside = np.einsum("ij,ij->i", mesh.normals, mesh.vertices)
+    assert (outside > 0).all()
+
+
 def test_degenerate_triangles_are_dropped():
     ball = trimesh.creation.icosphere(1, 0.05)
     faces = np.vstack([ball.faces, [[0, 0, 1], [2, 2, 2]]])
