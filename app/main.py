@@ -15,6 +15,7 @@ from fastapi.responses import HTMLResponse
 from fastapi.routing import APIRoute
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 
 from app import problems, relay
 from app.routes import events, health, jobs, objects, scenes
@@ -46,10 +47,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redoc_url=None,
         lifespan=_lifespan,
         generate_unique_id_function=_operation_id,
-        max_body_size=settings.max_body_bytes,
     )
     app.state.settings = settings
-    app.add_middleware(
+    app.add_middleware(RequestBodyLimitMiddleware, max_body_size=settings.max_body_bytes)
+    app.add_middleware(  # outermost: also the limit's answer gets its headers and becomes a problem
         SecurityMiddleware,
         allowed_hosts=settings.allowed_hosts,
         allowed_origins=settings.allowed_origins,
