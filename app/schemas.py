@@ -27,10 +27,11 @@ from osfcore.scene import (
 )
 
 Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-Quaternion = Annotated[
-    list[FiniteFloat], Field(min_length=4, max_length=4, description="Unit quaternion (w, x, y, z).")
-]
-Position = Annotated[Vector3, Field(description="[m], world frame.")]
+# Bounds far beyond anything on a table keep numbers away whose squares overflow.
+Component = Annotated[FiniteFloat, Field(ge=-1.1, le=1.1)]
+Coordinate = Annotated[FiniteFloat, Field(ge=-100, le=100)]
+Quaternion = Annotated[list[Component], Field(min_length=4, max_length=4, description="Unit quaternion (w, x, y, z).")]
+Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3, description="[m], world frame.")]
 Velocity = Annotated[
     Vector3, Field(description="Pusher velocity (vx, vy, 0) [m/s], |vx| and |vy| at most 0.3, held for 0.2 s.")
 ]
@@ -43,9 +44,9 @@ ObjectName = Annotated[str, Field(min_length=1, max_length=64, examples=["006_mu
 
 
 class Input(BaseModel):
-    """What comes in: unknown fields are mistakes."""
+    """What comes in: unknown fields and wrong types are mistakes."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class ProblemPointer(BaseModel):

@@ -24,13 +24,18 @@ def until(condition, timeout_s=20.0):
     pytest.fail(f"did not happen within {timeout_s:g} s")
 
 
+def running(library, data_dir, **settings):
+    """A client of a running service with real objects, as a context."""
+    if not (data_dir / "objects").exists():
+        shutil.copytree(library.root, data_dir / "objects", copy_function=os.link)
+    app = create_app(Settings(data_dir=data_dir, **{"demo_scene": False, **settings}))
+    return TestClient(app, base_url=LOCALHOST, raise_server_exceptions=False)
+
+
 @pytest.fixture(scope="session")
 def service(library, tmp_path_factory):
-    """A client of a service with real objects and no scene yet; scenes and jobs of other tests may be there."""
-    data_dir = tmp_path_factory.mktemp("service")
-    shutil.copytree(library.root, data_dir / "objects", copy_function=os.link)
-    app = create_app(Settings(data_dir=data_dir, demo_scene=False, max_scenes=200))
-    with TestClient(app, base_url=LOCALHOST, raise_server_exceptions=False) as client:
+    """A service with real objects and no scene yet; scenes and jobs of other tests may be there."""
+    with running(library, tmp_path_factory.mktemp("service"), max_scenes=200) as client:
         yield client
 
 
