@@ -1,10 +1,15 @@
 """One running service for all tests that do not stop or break it."""
 
+import http.client
+import json
 import os
 import shutil
+import socket
+import threading
 import time
 
 import pytest
+import uvicorn
 from starlette.testclient import TestClient
 
 from app.main import create_app
@@ -50,3 +55,49 @@ def scene(service):
     made = service.post("/api/scenes", json={"seed": 1, "objects": ["003_cracker_box", "006_mustard_bottle"]}).json()
     yield made
     service.delete(f"/api/scenes/{made['id']}")
+
+
+class Live:
+    """A service behind a real socket, for what streams."""
+
+    def __init__(self, app):
+        self.app = app
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                app, port=0, log_level="warning", lifespan="on", ws_max_size=64 << 20, ws_per_message_deflate=False
+            )
+        )
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self._thread = threading.Thread(target=self._server.run, args=([self._listener],))
+        self._thread.start()
+        until(lambda: self._server.started)
+
+    @property
+    def services(self):
+        return self.app.state.services
+
+    def stop(self):
+        self.services.closing.set()
+        self._server.should_exit = True
+        self._thread.join()
+        self._listener.close()
+
+    def request(self, method, path, body=None):
+        """Status and JSON of one request."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        data = None if body is None else json.dumps(body)
+        connection.request(method, path, data, {"Content-Type": "application/json"} if data else {})
+        with connection.getresponse() as response:
+            text = response.read()
+            connection.close()
+            return response.status, json.loads(text) if text else None
+
+
+@pytest.fixture(scope="session")
+def live(library, tmp_path_factory):
+    """A service behind a real socket."""
+    live = Live(running(library, tmp_path_factory.mktemp("live")).app)
+    yield live
+    live.stop()

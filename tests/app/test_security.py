@@ -1,7 +1,7 @@
 import pytest
 from starlette.requests import HTTPConnection
 
-from app.security import host_name, is_known_host, is_same_origin
+from app.security import is_known_host, is_same_origin
 
 
 @pytest.mark.parametrize(
@@ -12,18 +12,15 @@ def test_own_names_are_known(host):
     assert is_known_host(host, ("lab.example",))
 
 
-@pytest.mark.parametrize("host", ["", "evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "[::1", "a b"])
+@pytest.mark.parametrize(
+    "host", ["", "evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "[::1", "a b"]
+)
 def test_other_names_are_not(host):
     assert not is_known_host(host, ("lab.example",))
-    assert is_known_host(host, ("*",)) or host_name_fails(host)
 
 
-def host_name_fails(host):
-    try:
-        host_name(host)
-    except ValueError:
-        return True
-    return False
+def test_all_names_may_be_allowed():
+    assert is_known_host("evil.example", ("*",))
 
 
 def connection(origin, host="localhost:8000"):

@@ -19,7 +19,8 @@ def store(tmp_path):
 
 def record(scene="a", revision=1, pusher=(0.1, 0.2, 0.06)):
     poses = Pose(np.array([[0.0, 0.1, 0.2], [0.3, 0.0, 0.1]]), np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]]))
-    state = SceneState(("x", "y"), poses, Light(np.array([0.0, 0.6, 0.8])), None if pusher is None else np.array(pusher))
+    hand = None if pusher is None else np.array(pusher)
+    state = SceneState(("x", "y"), poses, Light(np.array([0.0, 0.6, 0.8])), hand)
     return SceneRecord(scene, 7, "2026-01-01T00:00:00.000Z", 128, state, state, 0.4, revision)
 
 
@@ -88,7 +89,9 @@ def refused_and_untouched(tmp_path, match):
     assert (tmp_path / FILE).read_bytes() == before
 
 
-@pytest.mark.parametrize("content", [b"not a database at all, but long enough" * 50, b"SQLite format 3\0" + b"\xff" * 4096])
+@pytest.mark.parametrize(
+    "content", [b"not a database at all, but long enough" * 50, b"SQLite format 3\0" + b"\xff" * 4096]
+)
 def test_damaged_files_are_told_and_left(tmp_path, content):
     (tmp_path / FILE).write_bytes(content)
     refused_and_untouched(tmp_path, "damaged")

@@ -51,7 +51,8 @@ def test_one_runs_the_rest_wait_with_their_places(service, services):
     until(lambda: service.get(f"/api/jobs/{first['id']}").json()["done"] > 0)
     second, third = (service.post("/api/jobs", json=TABLE).json() for _ in range(2))
     assert (second["position"], third["position"]) == (1, 2)
-    assert [job["id"] for job in service.get("/api/jobs").json()["jobs"][:3]] == [third["id"], second["id"], first["id"]]
+    listed = [job["id"] for job in service.get("/api/jobs").json()["jobs"][:3]]
+    assert listed == [third["id"], second["id"], first["id"]]
 
     assert service.delete(f"/api/jobs/{second['id']}").json()["state"] == "cancelled"
     assert service.get(f"/api/jobs/{third['id']}").json()["position"] == 1

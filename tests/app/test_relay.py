@@ -1,0 +1,87 @@
+import socket
+
+import numpy as np
+import pytest
+import viser
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from tests.app.conftest import until
+
+PROTOCOL = f"viser-v{viser.__version__}"
+
+
+def viewer_socket(live, protocol=PROTOCOL, **options):
+    return connect(
+        f"ws://127.0.0.1:{live.port}/viewer",
+        subprotocols=[protocol],
+        compression=None,
+        max_size=None,
+        proxy=None,
+        **options,
+    )
+
+
+def test_the_client_page_is_served_and_not_kept(service):
+    for path in ("/viewer", "/viewer/"):
+        page = service.get(path)
+        assert page.status_code == 200
+        assert page.headers["content-type"].startswith("text/html")
+        assert page.headers["cache-control"] == "no-cache"
+
+
+def test_frames_pass_with_the_protocol_of_the_client(live):
+    with viewer_socket(live, origin=f"http://127.0.0.1:{live.port}") as browser:
+        assert browser.subprotocol == PROTOCOL
+        assert len(browser.recv(timeout=10)) > 0
+
+
+def test_another_version_is_told_so(live):
+    with viewer_socket(live, "viser-v0.0.1") as browser, pytest.raises(ConnectionClosed) as closed:
+        for _ in range(1000):
+            browser.recv(timeout=10)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1002
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null"])
+def test_other_sites_are_refused(live, origin):
+    with pytest.raises(InvalidStatus) as refused:
+        viewer_socket(live, origin=origin)
+    assert refused.value.response.status_code == 403
+
+
+def test_large_meshes_pass(live):
+    blob = np.random.default_rng(0).bytes(30 << 20)  # does not shrink on the way
+    node = live.services.viewer.server.scene.add_glb("/large", blob, visible=False)
+    try:
+        with viewer_socket(live) as browser:
+            while len(browser.recv(timeout=20)) < len(blob):
+                pass
+    finally:
+        node.remove()
+
+
+def test_many_visits_leave_nothing_behind(live):
+    viewer = live.services.viewer
+
+    def open_connections():
+        inner = viewer.port
+        with open("/proc/net/tcp") as table:
+            rows = [line.split() for line in table.readlines()[1:]]
+        return sum(1 for row in rows if row[2].endswith(f":{inner:04X}") and row[3] == "01")
+
+    before = open_connections()
+    for _ in range(30):
+        with viewer_socket(live) as browser:
+            browser.recv(timeout=10)
+    until(lambda: open_connections() <= before)
+    assert viewer.server.get_clients() == {}
+
+
+def test_a_browser_that_vanishes_is_let_go(live):
+    browser = viewer_socket(live)
+    browser.recv(timeout=10)
+    browser.socket.shutdown(socket.SHUT_RDWR)
+    browser.close()
+    until(lambda: live.services.viewer.server.get_clients() == {})

@@ -1,0 +1,181 @@
+import io
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import Pipe
+from threading import Thread
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from app.messages import (
+    Act,
+    CreateScene,
+    DropScene,
+    EditScene,
+    Failure,
+    FramesTaken,
+    Leave,
+    Reply,
+    Request,
+    ResetScene,
+    SceneChanged,
+    ShowScene,
+    TakeImage,
+    TakeMask,
+    WatchFrames,
+)
+from app.stage import MASK_COLOURS, Stage, draw_masks
+from osfcore.poses import Pose
+from osfcore.scene import STEP_S, Light
+
+BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
+
+
+class Director:
+    """The other end of a stage that runs in a thread."""
+
+    def __init__(self, library, max_live_worlds):
+        self._ours, theirs = Pipe()
+        self._executor = ThreadPoolExecutor(2)
+        self.stage = Stage(theirs, library, self._executor, max_live_worlds)
+        self._thread = Thread(target=self.stage.serve)
+        self._thread.start()
+        self._number = 0
+        self.events = []
+
+    def call(self, command):
+        self._number += 1
+        self._ours.send(Request(self._number, command))
+        while True:
+            message = self.next()
+            if isinstance(message, Reply | Failure):
+                assert message.number == self._number
+                return message.value if isinstance(message, Reply) else message
+            self.events.append(message)
+
+    def next(self):
+        assert self._ours.poll(20)
+        return self._ours.recv()
+
+    def close(self):
+        self._ours.send(Request(0, Leave()))
+        self._thread.join()
+        self.stage.close()
+        self._executor.shutdown()
+        self._ours.close()
+        self.stage._connection.close()
+
+
+@pytest.fixture
+def director(library):
+    director = Director(library, max_live_worlds=1)
+    yield director
+    director.close()
+
+
+def create(director, scene="a", names=(BOX, BOTTLE), seed=1, **fields):
+    return director.call(CreateScene(scene, seed, "now", 64, names, 2, fields.get("light"), fields.get("poses")))
+
+
+def changes(director):
+    return [event for event in director.events if isinstance(event, SceneChanged)]
+
+
+def test_acting_tells_the_way_and_the_end(director):
+    made = create(director)
+    director.events.clear()
+    end = director.call(Act("a", (np.array([0.1, 0, 0]), np.array([0, 0.1, 0]))))
+    first, second = changes(director)
+    assert (first.record.revision, second.record.revision) == (made.revision + 1, made.revision + 2)
+    assert end.revision == second.record.revision
+    for change in (first, second):
+        assert len(change.states) * change.interval_s == pytest.approx(STEP_S)
+        assert 0.01 < change.interval_s < 0.05
+        assert np.array_equal(change.states[-1].poses.position, change.record.state.poses.position)
+    way = [state.pusher[0] for state in first.states]
+    assert way == sorted(way)
+
+
+def test_a_scene_that_left_memory_comes_back_as_it_was(director):
+    create(director, "a")
+    before = director.call(Act("a", (np.array([0.1, 0.1, 0]),)))
+    create(director, "b", seed=2)  # only one simulation stays
+    after = director.call(Act("a", (np.zeros(3),)))
+    assert after.time_s == pytest.approx(before.time_s + STEP_S)
+    assert np.allclose(after.state.poses.position, before.state.poses.position, atol=2e-3)
+    back = director.call(ResetScene("a"))
+    assert np.allclose(back.state.poses.position, back.initial.poses.position, atol=1e-9)
+    assert back.time_s == 0
+
+
+def test_what_is_let_go_in_the_air_falls(director):
+    create(director)
+    up = Pose(np.array([0.0, 0.0, 0.35]), np.array([1.0, 0, 0, 0]))
+    held = director.call(EditScene("a", poses=((BOX, up),)))
+    assert held.state.pose(BOX).position[2] == pytest.approx(0.35)
+    director.events.clear()
+    fallen = director.call(EditScene("a", poses=((BOX, up),), settle=True))
+    assert fallen.state.pose(BOX).position[2] < 0.3
+    heights = [state.pose(BOX).position[2] for change in changes(director) for state in change.states]
+    assert heights[0] > heights[-1]
+    assert len(changes(director)[0].states) == 0  # the jump
+
+
+def test_light_is_given_or_drawn_from_the_seed(director):
+    light = Light(np.array([0.0, 0.6, 0.8]))
+    assert np.allclose(create(director, light=light).state.light.position, light.position)
+    first, second = create(director, "b", seed=5), create(director, "c", seed=5)
+    assert np.array_equal(first.state.light.position, second.state.light.position)
+
+
+def test_refusals_change_nothing(director):
+    made = create(director)
+    for command in (
+        EditScene("a", poses=(("teapot", Pose.identity()),)),
+        EditScene("a", poses=(("teapot", Pose.identity()), (BOX, Pose.identity()))),
+        EditScene("a", poses=((BOX, made.state.pose(BOTTLE)),)),
+        Act("a", (np.array([1.0, 0, 0]),)),
+        TakeImage("a", "9", 64),
+        TakeImage("a", "0", 4),
+        TakeMask("a", "0", "teapot", 64),
+        ResetScene("z"),
+    ):
+        assert isinstance(director.call(command), Failure)
+    assert director.call(DropScene("a")) is None
+    assert isinstance(director.call(ResetScene("a")), Failure)
+
+
+def test_live_images_come_when_watched_and_only_after_changes(director):
+    create(director)
+    director.call(ShowScene("a"))
+    director.call(WatchFrames(True))
+    taken = director.next()
+    assert isinstance(taken, FramesTaken)
+    assert taken.images.shape == (4, 64, 64, 3)
+    assert len(taken.jpegs) == 4
+    moved = director.call(Act("a", (np.array([0.1, 0, 0]),)))
+    while not (isinstance(taken, FramesTaken) and taken.revision == moved.revision):
+        taken = director.events.pop() if director.events else director.next()
+    director.call(WatchFrames(False))
+    director.events.clear()
+    director.call(Act("a", (np.array([0.1, 0, 0]),)))
+    assert not any(isinstance(event, FramesTaken) for event in director.events)
+
+
+def test_pictures_and_masks_belong_together(director):
+    create(director)
+    mask = np.array(Image.open(io.BytesIO(director.call(TakeMask("a", "0", BOX, 64)))))
+    plain = np.array(Image.open(io.BytesIO(director.call(TakeImage("a", "0", 64)))))
+    drawn = np.array(Image.open(io.BytesIO(director.call(TakeImage("a", "0", 64, masks=True)))))
+    expected = (plain[mask > 0].astype(int) + MASK_COLOURS[0]) // 2
+    assert np.array_equal(drawn[mask > 0], expected)
+
+
+def test_masks_are_drawn_over_where_they_are():
+    image = np.full((4, 4, 3), 100, np.uint8)
+    masks = np.zeros((10, 4, 4), bool)
+    masks[9, 1, 2] = True
+    drawn = draw_masks(image, masks)
+    assert np.array_equal(drawn[1, 2], (100 + MASK_COLOURS[1].astype(int)) // 2)
+    assert np.array_equal(image, np.full((4, 4, 3), 100))
+    assert (drawn != image).any(axis=-1).sum() == 1
