@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import os
 import signal
 import threading
 import time
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
-from app.processes import import_quietly, own_group, silence_stdout
+from app.processes import end_own_group, import_quietly, own_group, silence_stdout
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
 
@@ -85,7 +84,7 @@ def job_main(connection: Connection, kind: str, params: dict[str, Any], place: P
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
     own_group()
     silence_stdout()
-    orders = Orders(connection)
+    orders = Orders(connection, on_lost=end_own_group)
     if kind != "fetch_assets":
         import_quietly("osfcore.world.tabletop")
     with contextlib.suppress(OSError):  # the web process has gone
@@ -118,8 +117,9 @@ def _run(connection: Connection, orders: Orders, kind: str, params: dict[str, An
 class Orders:
     """Listens on the pipe in a thread of its own, so that an order counts even during a long step."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: Connection, on_lost: Callable[[], None]) -> None:
         self._connection = connection
+        self._on_lost = on_lost
         self._may_run = threading.Event()
         self._may_run.set()
         self._is_cancelled = threading.Event()
@@ -136,7 +136,7 @@ class Orders:
                 order = self._connection.recv()
             except (EOFError, OSError):
                 # The service died: nobody wants the result, and what is half-written counts as never begun.
-                os.killpg(0, signal.SIGKILL)
+                self._on_lost()
                 return
             match order:
                 case PauseJob():

@@ -56,6 +56,13 @@ def own_group() -> None:
     os.setpgid(0, 0)
 
 
+def end_own_group() -> None:
+    """End this process and its children at once; only for a process that called `own_group`."""
+    if os.getpgid(0) == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
 def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
     """Wait `grace_s` for a process to leave by itself, then end it and its group. Calling it again does nothing."""
     process.join(grace_s)

@@ -1,0 +1,106 @@
+from multiprocessing import Pipe
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+from app.job_process import KINDS, Orders, Place, job_main
+from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
+from app.processes import end, launch
+from tests.app.conftest import until
+
+TABLE = {"images": 60, "size": 16, "seed": 0}
+
+
+@pytest.fixture
+def start(data_dir, tmp_path):
+    """Starts a job process; gives its pipe. All of them end with the test."""
+    started = []
+
+    def start(kind, params):
+        folder = tmp_path / f"job{len(started)}"
+        folder.mkdir()
+        started.append((*launch(job_main, "job", kind, params, Place(data_dir, folder)), folder))
+        return started[-1]
+
+    yield start
+    for process, connection, _ in started:
+        end(process)
+        connection.close()
+
+
+def told(connection):
+    """All messages to the end."""
+    messages = []
+    try:
+        while True:
+            messages.append(connection.recv())
+    except EOFError:
+        return messages
+
+
+def test_steps_rise_to_the_end_and_files_are_there(start):
+    process, connection, folder = start("collect_table", TABLE)
+    *steps, last = told(connection)
+    assert isinstance(last, JobDone)
+    assert all(isinstance(step, JobStep) for step in steps)
+    counts = [step.done for step in steps]
+    assert counts == sorted(counts)
+    assert counts[-1] == steps[-1].total == 60
+    assert {path.name for path in folder.iterdir()} == {"table", "table.zip"}
+    end(process, 5)
+    assert process.exitcode == 0
+
+
+def test_a_refusal_is_told_in_its_words(start):
+    _, connection, _ = start("collect_object", {**TABLE, "name": "teapot"})
+    (failure,) = told(connection)
+    assert isinstance(failure, Failure)
+    assert failure.kind == "UnknownName"
+    assert "teapot" in failure.text
+
+
+def test_a_defect_is_told_without_a_traceback(start):
+    _, connection, _ = start("collect_table", {"sizes": 3})
+    (failure,) = told(connection)
+    assert failure.kind == "Internal"
+    assert "TypeError" in failure.text
+    assert "\n" not in failure.text
+
+
+def test_cancelling_ends_between_steps(start):
+    _, connection, folder = start("collect_table", {**TABLE, "images": 5000})
+    connection.recv()
+    connection.send(CancelJob())
+    assert isinstance(told(connection)[-1], JobCancelled)
+    assert not (folder / "table").exists()
+
+
+def test_a_job_whose_service_died_ends(start):
+    process, connection, _ = start("collect_table", {**TABLE, "images": 5000})
+    connection.recv()
+    connection.close()
+    until(lambda: not process.is_alive())
+
+
+def test_pausing_holds_and_cancelling_frees():
+    ours, theirs = Pipe()
+    lost = Event()
+    orders = Orders(theirs, on_lost=lost.set)
+    ours.send(PauseJob())
+    until(lambda: not orders._may_run.is_set())
+    ours.send(ResumeJob())
+    until(orders._may_run.is_set)
+    assert not orders.must_stop()
+    ours.send(PauseJob())
+    ours.send(CancelJob())
+    until(orders._is_cancelled.is_set)
+    assert orders.must_stop()
+    ours.close()
+    assert lost.wait(10)
+    theirs.close()
+
+
+def test_every_kind_that_rest_offers_exists():
+    assert set(KINDS) == {"collect_pushes", "collect_object", "collect_table", "fetch_assets"}
+    assert Place(Path("d"), Path("f")).library.root == Path("d/objects")

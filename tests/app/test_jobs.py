@@ -1,0 +1,158 @@
+import os
+import signal
+import time
+
+import pytest
+
+from app.jobs import STOPPED_NOTE, Jobs, QueueFull, WrongJobState
+from app.store import Store
+from osfcore.errors import UnknownName
+from tests.app.conftest import until
+
+TABLE = ("collect_table", {"images": 60, "size": 16, "seed": 0})
+LONG = ("collect_table", {"images": 5000, "size": 16, "seed": 0})
+
+
+@pytest.fixture
+def store(data_dir):
+    store = Store(data_dir)
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def open_jobs(store, data_dir):
+    """Opens the registry, as a service that starts; all are stopped in the end."""
+    opened = []
+
+    def open_jobs(**options):
+        events = []
+        jobs = Jobs(store, data_dir, events.append, **options)
+        jobs.start()
+        opened.append(jobs)
+        return jobs, events
+
+    yield open_jobs
+    for jobs in opened:
+        jobs.stop()
+
+
+def until_state(jobs, job, *states):
+    until(lambda: jobs.get(job.id).state in states, 60)
+    return jobs.get(job.id)
+
+
+def test_a_job_lives_and_every_change_is_told(open_jobs, store):
+    jobs, events = open_jobs()
+    job = jobs.submit(*TABLE)
+    done = until_state(jobs, job, "done", "failed")
+    assert (done.state, done.files, done.error) == ("done", ("table.zip",), None)
+    states = [event.job.state for event in events]
+    assert (states[0], states[-1]) == ("queued", "done")
+    assert set(states) == {"queued", "running", "done"}
+    numbers = [event.event for event in events]
+    assert numbers == sorted(set(numbers))
+    assert [number for number, _ in store.events_after(0)] == numbers
+
+
+def test_waiting_jobs_run_in_order(open_jobs):
+    jobs, _ = open_jobs()
+    first, second, third = (jobs.submit(*TABLE) for _ in range(3))
+    until_state(jobs, third, "done")
+    assert jobs.get(first.id).finished_at <= jobs.get(second.id).started_at
+    assert jobs.get(second.id).finished_at <= jobs.get(third.id).started_at
+    assert [job.id for job in jobs.all()] == [third.id, second.id, first.id]
+
+
+def test_the_queue_has_an_end(open_jobs):
+    jobs, _ = open_jobs(max_queued=2)
+    running = jobs.submit(*LONG)
+    until_state(jobs, running, "running")
+    jobs.submit(*TABLE)
+    jobs.submit(*TABLE)
+    with pytest.raises(QueueFull, match="2 jobs"):
+        jobs.submit(*TABLE)
+
+
+def test_cancelled_work_stops_within_a_second_and_leaves_nothing(open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    until_state(jobs, job, "running")
+    start = time.monotonic()
+    assert jobs.cancel(job.id).state == "cancelled"
+    assert time.monotonic() - start < 2.5  # a second, and slack for a loaded machine
+    assert not jobs.folder(job.id).exists()
+    with pytest.raises(WrongJobState):
+        jobs.cancel(job.id)
+
+
+def test_a_job_that_does_not_listen_is_ended(open_jobs):
+    jobs, _ = open_jobs(cancel_grace_s=0.2)
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(jobs._run.process.pid, signal.SIGSTOP)
+    assert jobs.cancel(job.id).state == "cancelled"
+    assert not jobs.folder(job.id).exists()
+
+
+def test_a_job_that_dies_fails_and_the_next_one_runs(open_jobs):
+    jobs, _ = open_jobs()
+    job, following = jobs.submit(*LONG), jobs.submit(*TABLE)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    failed = until_state(jobs, job, "failed")
+    assert "ended unexpectedly" in failed.error
+    assert until_state(jobs, following, "done").state == "done"
+
+
+def test_pausing_stops_progress_and_resuming_goes_on(open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    with pytest.raises(WrongJobState):
+        jobs.resume(job.id)
+    until(lambda: jobs.get(job.id).done > 0)
+    assert jobs.pause(job.id).state == "paused"
+    time.sleep(0.3)
+    held = jobs.get(job.id).done
+    time.sleep(0.4)
+    assert jobs.get(job.id).done == held
+    assert jobs.resume(job.id).state == "running"
+    until(lambda: jobs.get(job.id).done > held)
+
+
+def test_after_a_stop_running_jobs_failed_and_waiting_ones_go_on(open_jobs):
+    jobs, _ = open_jobs()
+    job, waiting = jobs.submit(*LONG), jobs.submit(*TABLE)
+    until(lambda: jobs.get(job.id).done > 0)
+    jobs.stop()
+    again, _ = open_jobs()
+    failed = again.get(job.id)
+    assert (failed.state, failed.error) == ("failed", STOPPED_NOTE)
+    assert until_state(again, waiting, "done", "failed").state == "done"
+
+
+def test_after_a_crash_running_jobs_failed_too(open_jobs, store):
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    kept = dict(store.jobs())
+    jobs.stop()
+    for number, fields in kept.items():
+        store.save_job(fields["id"], number, {**fields, "state": "paused"})  # as a killed service leaves it
+    again, events = open_jobs()
+    assert again.get(job.id).error == STOPPED_NOTE
+    assert events[0].job.state == "failed"
+    with pytest.raises(UnknownName):
+        again.get("none")
+
+
+def test_a_scene_is_held_only_by_the_running_job_that_names_it(open_jobs):
+    jobs, _ = open_jobs()
+    assert jobs.holder("s") is None
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    assert jobs.holder("s") is None
+    jobs._jobs[job.id].params["scene"] = "s"
+    assert jobs.holder("s") == job.id
+    jobs.pause(job.id)
+    assert jobs.holder("s") is None
