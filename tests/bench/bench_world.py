@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -57,11 +58,11 @@ def observations(library: AssetLibrary, scenes: int) -> None:
             fast.observe(masks=True)  # builds ray structures of objects not seen before
             plain.observe(masks=True)
             for name, world in (("embree, all cores", fast), ("embree, one core", plain)):
-                rows.setdefault(name, []).append(milliseconds(lambda world=world: world.observe(masks=True)))
+                rows.setdefault(name, []).append(milliseconds(partial(world.observe, masks=True)))
             for name, shadow in (("TinyRenderer with its shadow", True), ("TinyRenderer without", False)):
                 tiny = TinyScene(plain.assets, shadow=shadow)
                 state = plain.truth()
-                render = milliseconds(lambda tiny=tiny, state=state: tiny.render(state, default_cameras()), 3)
+                render = milliseconds(partial(tiny.render, state, default_cameras()), 3)
                 rows.setdefault(name, []).append(render)
                 tiny.close()
         for name, values in rows.items():
@@ -80,9 +81,9 @@ def physics(library: AssetLibrary) -> None:
             continue
         world = Tabletop(library, request=SceneRequest(count=count))
         world.arrange(0)
-        arrange = np.median([milliseconds(lambda seed=seed: world.arrange(seed), 1) for seed in range(10)])
+        arrange = np.median([milliseconds(partial(world.arrange, seed), 1) for seed in range(10)])
         actions = np.column_stack([np.random.default_rng(0).uniform(-0.3, 0.3, (50, 2)), np.zeros(50)])
-        act = np.median([milliseconds(lambda action=action: world.act(action), 1) for action in actions])
+        act = np.median([milliseconds(partial(world.act, action), 1) for action in actions])
         print(
             f"{count} objects: new scene {arrange:.0f} ms, action of 0.2 s {act:.1f} ms ({200 / act:.0f} x real time)"
         )

@@ -1,0 +1,107 @@
+// The camera strip: live images from the event stream, masks and the goal view by request, a large view on click.
+import { byId, el } from "./dom.js";
+import { current, watch } from "./state.js";
+import { toast } from "./toasts.js";
+
+const NAMES = ["0", "1", "2", "3", "goal"];
+const tiles = new Map();
+let showsMasks = false;
+let largeCamera = null;
+
+/** Loads the newest image asked for, one at a time, so that a fast scene never piles up requests. */
+class LatestImage {
+  constructor(image) {
+    this.image = image;
+    this.busy = false;
+    this.next = null;
+  }
+
+  show(url) {
+    this.next = url;
+    if (!this.busy) this.#load();
+  }
+
+  async #load() {
+    this.busy = true;
+    while (this.next) {
+      const url = this.next;
+      this.next = null;
+      const loader = new Image();
+      loader.src = url;
+      try {
+        await loader.decode();
+        this.image.src = url;
+      } catch {
+        // A scene that was deleted meanwhile; the next one brings its own image.
+      }
+    }
+    this.busy = false;
+  }
+}
+
+function url(scene, camera, size, { pusher = true } = {}) {
+  const query = new URLSearchParams({ size, masks: showsMasks, pusher, v: scene.revision });
+  return `api/scenes/${scene.id}/images/${camera}.png?${query}`;
+}
+
+function refresh(scene) {
+  for (const [name, tile] of tiles) {
+    if (!scene) tile.image.removeAttribute("src");
+    else if (name === "goal" || showsMasks) tile.latest.show(url(scene, name, 128, { pusher: name !== "goal" }));
+  }
+  if (scene && largeCamera) large.show(url(scene, largeCamera, 512, { pusher: largeCamera !== "goal" }));
+}
+
+const large = new LatestImage(byId("camera-large"));
+
+function enlarge(name) {
+  const scene = current();
+  if (!scene) return;
+  largeCamera = name;
+  byId("camera-dialog-title").textContent = name === "goal" ? "Goal camera, without the pusher" : `Camera ${name}`;
+  byId("camera-large").alt = byId("camera-dialog-title").textContent;
+  byId("camera-large").removeAttribute("src");
+  refresh(scene);
+  byId("camera-dialog").showModal();
+}
+
+export function showFrames({ scene, cameras }) {
+  if (showsMasks || scene !== current()?.id) return;
+  for (const [name, data] of Object.entries(cameras)) if (tiles.has(name)) tiles.get(name).image.src = data;
+}
+
+export function toggleMasks(on = !showsMasks) {
+  showsMasks = on;
+  byId("masks").checked = on;
+  const scene = current();
+  if (!scene) return;
+  refresh(scene);
+  // Without masks the live images come with the next change; until then the plain ones are asked for.
+  if (!on) for (const [name, tile] of tiles) tile.latest.show(url(scene, name, 128, { pusher: name !== "goal" }));
+}
+
+export function setUpCameras() {
+  for (const name of NAMES) {
+    const label = name === "goal" ? "Goal view" : `Camera ${name}`;
+    const image = el("img", { alt: label, width: 128, height: 128 });
+    image.dataset.camera = name;
+    const button = el("button", { type: "button", title: `Enlarge: ${label.toLowerCase()}` }, image, el("span", { textContent: label }));
+    button.addEventListener("click", () => enlarge(name));
+    byId("camera-strip").append(button);
+    tiles.set(name, { image, latest: new LatestImage(image) });
+  }
+  byId("camera-dialog").addEventListener("close", () => { largeCamera = null; });
+  byId("masks").addEventListener("change", (event) => toggleMasks(event.target.checked));
+  let shown = null;
+  watch("scene", (scene) => {
+    refresh(scene);
+    if (scene && scene.id !== shown && !showsMasks) {
+      for (const [name, tile] of tiles) if (name !== "goal") tile.latest.show(url(scene, name, 128));
+    }
+    shown = scene?.id ?? null;
+  });
+}
+
+export function tellMissingScene() {
+  toast("There is no scene yet; make one under Scenes.", "warning");
+}

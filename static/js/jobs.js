@@ -1,0 +1,138 @@
+// Long work: starting it, watching it, pausing, cancelling, and taking the results.
+import { get, post, remove } from "./api.js";
+import { byId, el, whileDisabled } from "./dom.js";
+import { refreshObjects } from "./objects.js";
+import { objects, watch } from "./state.js";
+import { tellFailure } from "./toasts.js";
+
+const KINDS = {
+  collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
+};
+const LIVE = new Set(["queued", "running", "paused"]);
+const number = (name, label, value, min, max) => ({ name, label, value, min, max, type: "number" });
+const FIELDS = {
+  collect_pushes: () => [
+    number("episodes", "Episodes", 100, 1, 100000),
+    number("steps", "Steps each", 50, 1, 1000),
+    number("objects", "Objects", 3, 1, 8),
+    { name: "policy", label: "Policy", options: [["paper", "random, as in the paper"], ["directed", "seeks contact"]] },
+    number("seed", "Seed", 0, 0, 4294967295),
+  ],
+  collect_object: () => [
+    { name: "name", label: "Object", options: objects().filter((o) => o.available).map((o) => [o.name, o.label]) },
+    number("images", "Images", 300, 60, 5000),
+    number("size", "Size in px", 128, 16, 1024),
+    number("seed", "Seed", 0, 0, 4294967295),
+  ],
+  collect_table: () => [
+    number("images", "Images", 300, 60, 5000),
+    number("size", "Size in px", 128, 16, 1024),
+    number("seed", "Seed", 0, 0, 4294967295),
+  ],
+};
+const jobs = new Map();
+const nodes = new Map();
+
+function field({ name, label, options, ...properties }) {
+  const input = options
+    ? el("select", { name }, ...options.map(([value, text]) => el("option", { value, textContent: text })))
+    : el("input", { name, required: true, step: 1, ...properties });
+  return el("label", { className: "field" }, label, input);
+}
+
+function drawFields() {
+  const kind = byId("new-job").elements.kind.value;
+  byId("job-fields").replaceChildren(...FIELDS[kind]().map(field));
+}
+
+async function start(event) {
+  event.preventDefault();
+  const form = byId("new-job");
+  const params = {};
+  for (const input of byId("job-fields").querySelectorAll("input, select")) {
+    params[input.name] = input.type === "number" ? Number(input.value) : input.value;
+  }
+  await whileDisabled(form.querySelector("[type=submit]"), () =>
+    tellFailure(async () => showJob(await post("jobs", { kind: form.elements.kind.value, params }))));
+}
+
+function timeLeft(seconds) {
+  if (seconds === null) return "";
+  if (seconds < 90) return `, about ${Math.ceil(seconds)} s left`;
+  return seconds < 5400 ? `, about ${Math.round(seconds / 60)} min left` : `, about ${(seconds / 3600).toFixed(1)} h left`;
+}
+
+function stateText(job) {
+  if (job.state === "queued") return `waiting, number ${job.position ?? "?"} in line`;
+  if (job.state === "running") return `${job.note || "running"}${timeLeft(job.eta_s)}`;
+  if (job.state === "paused") return "paused";
+  return { done: "done", failed: "failed", cancelled: "cancelled" }[job.state];
+}
+
+function command(text, className, action) {
+  const button = el("button", { type: "button", className, textContent: text });
+  button.addEventListener("click", () => whileDisabled(button, () => tellFailure(async () => showJob(await action()))));
+  return button;
+}
+
+function controls(job) {
+  const buttons = [];
+  if (job.state === "running") buttons.push(command("Pause", "plain", () => post(`jobs/${job.id}/pause`)));
+  if (job.state === "paused") buttons.push(command("Resume", "plain", () => post(`jobs/${job.id}/resume`)));
+  if (LIVE.has(job.state)) buttons.push(command("Cancel", "plain danger", () => remove(`jobs/${job.id}`)));
+  for (const name of job.files) {
+    buttons.push(el("a", { href: `api/jobs/${job.id}/files/${encodeURIComponent(name)}`, textContent: name, download: name }));
+  }
+  return buttons;
+}
+
+function controlsKey(job) {
+  return `${job.state} ${job.files.join()}`;
+}
+
+/** Draws a job once and then changes what changed, so that a button under the pointer stays. */
+function draw(job) {
+  let node = nodes.get(job.id);
+  if (!node) {
+    const what = job.params.name ? `${KINDS[job.kind]}: ${job.params.name}` : KINDS[job.kind];
+    node = {
+      bar: el("progress", { max: 1 }), text: el("span", { className: "hint" }), error: el("span", { className: "error" }),
+      actions: el("div", { className: "actions" }), key: "",
+    };
+    node.item = el("li", {}, el("span", { className: "title", textContent: what }), node.bar, node.text, node.error, node.actions);
+    node.item.dataset.job = job.id;
+    nodes.set(job.id, node);
+    byId("job-list").prepend(node.item);
+  }
+  node.item.dataset.state = job.state;
+  node.bar.hidden = !LIVE.has(job.state);
+  node.bar.value = job.total ? job.done / job.total : 0;
+  node.text.textContent = stateText(job);
+  node.error.textContent = job.error ?? "";
+  node.error.hidden = !job.error;
+  if (node.key !== controlsKey(job)) node.actions.replaceChildren(...controls(job));
+  node.key = controlsKey(job);
+}
+
+export function showJob(job) {
+  const before = jobs.get(job.id);
+  jobs.set(job.id, job);
+  draw(job);
+  byId("no-jobs").hidden = jobs.size > 0;
+  const live = [...jobs.values()].filter((other) => LIVE.has(other.state)).length;
+  byId("jobs-count").textContent = live;
+  byId("jobs-count").hidden = live === 0;
+  if (job.kind === "fetch_assets" && job.state === "done" && before && before.state !== "done") refreshObjects();
+}
+
+export async function refreshJobs() {
+  const answer = await tellFailure(() => get("jobs"));
+  if (answer) for (const job of [...answer.jobs].reverse()) showJob(job);
+}
+
+export function setUpJobs() {
+  const form = byId("new-job");
+  form.addEventListener("submit", start);
+  form.elements.kind.addEventListener("change", drawFields);
+  watch("objects", drawFields);
+}

@@ -1,0 +1,29 @@
+// Keys of the whole page; none of them while typing or while a dialog is open.
+import { toggleMasks } from "./cameras.js";
+import { byId } from "./dom.js";
+import { pushKey } from "./push.js";
+import { anotherScene, resetScene } from "./scenes.js";
+
+const isTyping = (target) => target.closest?.("input, select, textarea, [role=tab]") !== null && !target.matches?.("[type=checkbox], [type=radio]");
+const isDialogOpen = () => document.querySelector("dialog[open]") !== null;
+
+const COMMANDS = {
+  r: resetScene,
+  n: anotherScene,
+  m: () => toggleMasks(),
+  "?": () => byId("help-dialog").showModal(),
+};
+
+export function setUpKeyboard() {
+  window.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || isDialogOpen() || isTyping(event.target)) return;
+    if (pushKey(event.key, true)) {
+      event.preventDefault();
+    } else if (event.key in COMMANDS && !event.repeat) {
+      event.preventDefault();
+      COMMANDS[event.key]();
+    }
+  });
+  window.addEventListener("keyup", (event) => pushKey(event.key, false));
+  byId("help-button").addEventListener("click", () => byId("help-dialog").showModal());
+}

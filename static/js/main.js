@@ -1,0 +1,71 @@
+// Puts the page together: sets the pieces up, follows the event stream, keeps the status line honest.
+import { get } from "./api.js";
+import { setUpCameras, showFrames } from "./cameras.js";
+import { byId } from "./dom.js";
+import { listen } from "./events.js";
+import { refreshJobs, setUpJobs, showJob } from "./jobs.js";
+import { setUpKeyboard } from "./keyboard.js";
+import { setUpLight } from "./light.js";
+import { setUpNumbers } from "./numbers.js";
+import { refreshObjects, setUpObjects } from "./objects.js";
+import { setUpPush } from "./push.js";
+import { refreshScenes, setUpScenes } from "./scenes.js";
+import { set } from "./state.js";
+import { setUpTabs } from "./tabs.js";
+import { setUpTheme } from "./theme.js";
+import { toast } from "./toasts.js";
+import { isViewerShown, showViewer } from "./viewer.js";
+
+const STARTING = { starting: "Simulation starting", restarting: "Simulation restarting" };
+
+function status(text, state) {
+  byId("status").textContent = text;
+  byId("status").dataset.state = state;
+}
+
+/** Asks until the simulation is ready, then shows the 3D view. */
+async function followHealth(again) {
+  for (;;) {
+    try {
+      const health = await get("health");
+      if (health.stage === "ready") {
+        status("Live", "live");
+        if (again || !isViewerShown()) showViewer();
+        return;
+      }
+      status(STARTING[health.stage] ?? "Starting", "wait");
+    } catch {
+      status("Reconnecting", "lost");
+      return; // the event stream tells when the service is back
+    }
+    await new Promise((resolve) => setTimeout(resolve, 300));
+  }
+}
+
+setUpTheme(() => { if (isViewerShown()) showViewer(); });
+setUpTabs();
+setUpCameras();
+setUpPush();
+setUpLight();
+setUpNumbers();
+setUpScenes();
+setUpObjects();
+setUpJobs();
+setUpKeyboard();
+refreshObjects();
+
+listen({
+  open(again) {
+    followHealth(again);
+    refreshJobs();
+    if (again) {
+      refreshScenes();
+      refreshObjects();
+    }
+  },
+  lost: () => status("Reconnecting", "lost"),
+  scene: (scene) => set("scene", scene),
+  frame: showFrames,
+  job: showJob,
+  notice: ({ level, text }) => toast(text, level),
+});

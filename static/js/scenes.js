@@ -1,0 +1,103 @@
+// New scenes and the list of those there are.
+import { get, post, remove } from "./api.js";
+import { byId, el, whileDisabled } from "./dom.js";
+import { current, set, watch } from "./state.js";
+import { tellFailure, toast } from "./toasts.js";
+
+const MOST_OBJECTS = 8;
+const form = () => byId("new-scene");
+const randomSeed = () => Math.floor(Math.random() * 1_000_000);
+
+function chosenObjects() {
+  return [...byId("chips").querySelectorAll("input:checked")].map((box) => box.value);
+}
+
+async function make(body) {
+  const scene = await post("scenes", body);
+  set("scene", { ...scene, is_current: true });
+  await refreshScenes();
+}
+
+async function submit(event) {
+  event.preventDefault();
+  const fields = form().elements;
+  const body = { seed: Number(fields.seed.value) };
+  if (fields.which.value === "chosen") {
+    body.objects = chosenObjects();
+    if (!body.objects.length) return toast("Choose at least one object.", "warning");
+  } else {
+    body.count = Number(fields.count.value);
+  }
+  if (fields["own-light"].checked && current()) body.light = { position: current().light.position };
+  return whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(() => make(body)));
+}
+
+/** Another random scene with as many objects as this one. */
+export function anotherScene() {
+  const seed = randomSeed();
+  form().elements.seed.value = seed;
+  return tellFailure(() => make({ seed, count: current()?.objects.length ?? 3 }));
+}
+
+export function resetScene() {
+  const scene = current();
+  if (!scene) return undefined;
+  return whileDisabled(byId("reset"), () =>
+    tellFailure(async () => set("scene", { ...(await post(`scenes/${scene.id}/reset`)), is_current: true })));
+}
+
+function entry(scene, currentId) {
+  const isCurrent = scene.id === currentId;
+  const show = el("button", { type: "button", className: "plain", textContent: "Show", disabled: isCurrent });
+  show.addEventListener("click", () => whileDisabled(show, () => tellFailure(async () => {
+    set("scene", await post(`scenes/${scene.id}/activate`));
+    await refreshScenes();
+  })));
+  const drop = el("button", { type: "button", className: "plain danger", textContent: "Delete" });
+  drop.addEventListener("click", () => whileDisabled(drop, () => tellFailure(async () => {
+    await remove(`scenes/${scene.id}`);
+    await refreshScenes();
+  })));
+  const names = scene.objects.map((object) => object.label).join(", ");
+  const made = new Date(scene.created_at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+  return el(
+    "li",
+    {},
+    el("span", { className: "title", textContent: names || "Empty table" }),
+    el("span", { className: "hint", textContent: `Seed ${scene.seed}, made ${made}` }),
+    el("div", { className: "actions" }, show, drop, isCurrent ? el("span", { className: "current", textContent: "shown now" }) : null),
+  );
+}
+
+export async function refreshScenes() {
+  const answer = await tellFailure(() => get("scenes"));
+  if (!answer) return;
+  byId("scene-list").replaceChildren(...[...answer.scenes].reverse().map((scene) => entry(scene, answer.current)));
+}
+
+export function setUpScenes() {
+  form().addEventListener("submit", submit);
+  form().addEventListener("change", () => {
+    const isChosen = form().elements.which.value === "chosen";
+    byId("chips").hidden = !isChosen;
+    byId("count-field").hidden = isChosen;
+    const boxes = [...byId("chips").querySelectorAll("input")];
+    const isFull = boxes.filter((box) => box.checked).length >= MOST_OBJECTS;
+    for (const box of boxes) box.disabled = isFull && !box.checked;
+  });
+  byId("dice").addEventListener("click", () => { form().elements.seed.value = randomSeed(); });
+  byId("reset").addEventListener("click", resetScene);
+  let shown;
+  watch("scene", (scene) => {
+    if ((scene?.id ?? null) === shown) return;
+    shown = scene?.id ?? null;
+    refreshScenes();
+  });
+  watch("objects", (objects) => {
+    const there = objects.filter((object) => object.available);
+    byId("chips").replaceChildren(...there.map((object) => el(
+      "label", {}, el("input", { type: "checkbox", value: object.name }), el("span", { textContent: object.label }),
+    )));
+    form().elements.count.max = Math.max(Math.min(MOST_OBJECTS, there.length), 1);
+  });
+}

@@ -1,0 +1,29 @@
+// The panel's tabs, with arrow keys as the ARIA pattern wants them.
+import { byId } from "./dom.js";
+
+const tabs = () => [...document.querySelectorAll('[role="tab"]')];
+
+export function showTab(name) {
+  for (const tab of tabs()) {
+    const chosen = tab.id === `tab-${name}`;
+    tab.setAttribute("aria-selected", String(chosen));
+    tab.tabIndex = chosen ? 0 : -1;
+    byId(tab.getAttribute("aria-controls")).hidden = !chosen;
+  }
+}
+
+export function setUpTabs() {
+  for (const tab of tabs()) {
+    tab.addEventListener("click", () => showTab(tab.id.slice(4)));
+    tab.addEventListener("keydown", (event) => {
+      const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+      if (!step) return;
+      event.preventDefault();
+      event.stopPropagation();
+      const all = tabs();
+      const next = all[(all.indexOf(tab) + step + all.length) % all.length];
+      showTab(next.id.slice(4));
+      next.focus();
+    });
+  }
+}
