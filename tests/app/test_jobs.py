@@ -149,7 +149,7 @@ def test_after_a_crash_running_jobs_failed_too(open_jobs, store):
 def test_a_scene_is_held_only_by_the_running_job_that_names_it(open_jobs):
     jobs, _ = open_jobs()
     assert jobs.holder("s") is None
-    job = jobs.submit(*LONG)
+    job = jobs.submit(LONG[0], dict(LONG[1]))
     until(lambda: jobs.get(job.id).done > 0)
     assert jobs.holder("s") is None
     jobs._jobs[job.id].params["scene"] = "s"

@@ -1,0 +1,150 @@
+import asyncio
+import os
+import shutil
+import signal
+
+import numpy as np
+import pytest
+
+from app.job import JobChanged
+from app.messages import CurrentScene, Notice, SceneChanged, TakeImage
+from app.runner import Runner, SceneHeld, TooManyScenes
+from app.settings import Settings
+from app.store import Store
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.objects.library import AssetLibrary
+from osfcore.poses import Pose
+from osfcore.scene import Light
+from tests.app.conftest import until
+from tests.app.test_jobs import LONG, TABLE
+
+BOX = "003_cracker_box"
+
+
+@pytest.fixture
+def open_runner(data_dir):
+    """Opens a runner on the data directory, as a service that starts; closed in the end, or by `close`."""
+    opened = []
+
+    def close():
+        while opened:
+            runner, store = opened.pop()
+            runner.stop()
+            store.close()
+
+    def open_runner(**settings):
+        close()
+        settings = Settings(data_dir=data_dir, **settings)
+        store = Store(data_dir)
+        runner = Runner(settings, store, AssetLibrary(data_dir / "objects"))
+        opened.append((runner, store))
+        runner.events = []
+        runner.hub.subscribe(runner.events.append)
+        runner.start()
+        return runner
+
+    yield open_runner
+    close()
+
+
+def test_the_first_start_shows_a_scene_by_itself(open_runner):
+    runner = open_runner()
+    until(lambda: runner.current is not None)
+    (record,) = runner.scenes()
+    assert (record.seed, len(record.state.names)) == (0, 3)
+    assert any(isinstance(event, CurrentScene) for event in runner.events)
+
+
+def test_without_objects_there_is_no_scene_until_some_come(open_runner, data_dir, tmp_path):
+    shutil.move(data_dir / "objects", tmp_path / "later")
+    runner = open_runner()
+    runner.ensure_demo_scene()
+    assert runner.scenes() == ()
+    shutil.move(tmp_path / "later", data_dir / "objects")
+    runner.ensure_demo_scene()
+    until(runner.scenes)
+
+
+def test_everything_is_there_after_a_restart(open_runner):
+    runner = open_runner(demo_scene=False)
+    first = runner.create_scene(names=(BOX,), seed=3)
+    runner.create_scene(count=2, seed=4)
+    moved = runner.act(first.id, [(0.1, 0.1, 0.0)] * 2)
+    runner.activate(first.id)
+    again = open_runner()
+    assert again.current == first.id
+    assert [record.seed for record in again.scenes()] == [3, 4]
+    found = again.scene(first.id)
+    assert found.time_s == moved.time_s
+    assert np.array_equal(found.state.poses.position, moved.state.poses.position)
+    back = again.reset_scene(first.id)
+    assert np.allclose(back.state.poses.position, first.state.poses.position, atol=1e-9)
+
+
+def test_a_dying_stage_is_told_and_the_scenes_live_on(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    until(lambda: runner.stage_status == "ready")
+    process = runner._stage.process
+    os.kill(process.pid, signal.SIGKILL)
+    until(lambda: runner._stage.process is not process)
+    assert any(isinstance(event, Notice) and event.level == "error" for event in runner.events)
+    assert runner.act(scene.id, [(0.1, 0, 0)]).revision > scene.revision
+
+
+def test_scenes_have_a_limit(open_runner):
+    runner = open_runner(demo_scene=False, max_scenes=1)
+    runner.create_scene(names=(BOX,))
+    with pytest.raises(TooManyScenes, match="1 scenes"):
+        runner.create_scene(names=(BOX,))
+
+
+def test_changes_are_told_and_refusals_are_not(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    runner.events.clear()
+    with pytest.raises(InvalidInput):
+        runner.act(scene.id, [(9, 0, 0)])
+    with pytest.raises(InvalidInput, match="repetition"):
+        runner.edit_scene(scene.id, poses=((BOX, Pose.identity()), (BOX, Pose.identity())))
+    with pytest.raises(UnknownName):
+        runner.edit_scene("none", light=Light(np.array([0, 0, 1.0])))
+    assert runner.events == []
+    runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))
+    (change,) = [event for event in runner.events if isinstance(event, SceneChanged)]
+    assert np.allclose(change.record.state.light.position, [0, 0, 1])
+
+
+def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    job = runner.jobs.submit(LONG[0], dict(LONG[1]))
+    until(lambda: runner.jobs.get(job.id).done > 0)
+    runner.jobs._jobs[job.id].params["scene"] = scene.id
+    for command in (
+        lambda: runner.act(scene.id, [(0.1, 0, 0)]),
+        lambda: runner.reset_scene(scene.id),
+        lambda: runner.delete_scene(scene.id),
+        lambda: runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0]))),
+    ):
+        with pytest.raises(SceneHeld, match=job.id):
+            command()
+
+
+def test_an_image_is_made_once_for_each_revision(open_runner):
+
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    command = TakeImage(scene.id, "0", 64)
+    first = asyncio.run(runner.image(command))
+    assert asyncio.run(runner.image(command)) is first
+    runner.edit_scene(scene.id, light=Light(np.array([0.0, 1.0, 0.2])))
+    second = asyncio.run(runner.image(command))
+    assert second != first
+
+
+def test_jobs_are_told_to_those_who_listen(open_runner):
+    runner = open_runner(demo_scene=False)
+    job = runner.submit_job(*TABLE)
+    until(lambda: runner.jobs.get(job.id).state == "done", 60)
+    until(lambda: any(isinstance(e, JobChanged) and e.job.state == "done" for e in runner.events))
