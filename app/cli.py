@@ -45,12 +45,15 @@ def main(arguments: list[str] | None = None) -> int:
     except OsfError as error:
         print(f"osf: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("osf: interrupted", file=sys.stderr)
-        return 130
     except BrokenPipeError:  # whoever read our output has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        print(f"osf: {error.strerror or error}{f': {error.filename}' if error.filename else ''}.", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("osf: interrupted", file=sys.stderr)
+        return 130
     if command.json:
         print(json.dumps(result))
     return 0

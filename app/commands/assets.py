@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,13 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from app.commands.progress_bar import follow
+from app.commands.workers import worker_pool
 from app.paths import default_data_dir
-from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from osfcore.objects.library import AssetLibrary
-
-MAX_WORKERS = 16
 
 
 @dataclass(frozen=True)
@@ -65,17 +60,13 @@ class AssetsFetch:
         from osfcore.objects.fetch import fetch
         from osfcore.objects.sources import source_from
 
-        if not 1 <= self.workers <= MAX_WORKERS:
-            raise InvalidInput("workers", self.workers, f"between 1 and {MAX_WORKERS}")
         library = _library(self.data_dir)
         source = source_from(self.source, self.data_dir / "cache")
         wanted = self.names or source.names()
-        with _executor(self.workers) if self.workers > 1 and self._work(library, wanted) else nullcontext() as executor:
+        is_work = any(self.force or not library.has(name) for name in wanted)
+        with worker_pool(self.workers if is_work else 1) as executor:
             follow(fetch(wanted, source, library, executor, force=self.force))
         return {"objects": list(wanted), "available": list(library.names()), "data_dir": str(self.data_dir)}
-
-    def _work(self, library: AssetLibrary, wanted: tuple[str, ...]) -> int:
-        return sum(self.force or not library.has(name) for name in wanted)
 
 
 @dataclass(frozen=True)
@@ -147,17 +138,6 @@ def _library(data_dir: Path) -> AssetLibrary:
     from osfcore.objects.library import AssetLibrary
 
     return AssetLibrary(data_dir / "objects")
-
-
-def _executor(workers: int) -> ProcessPoolExecutor:
-    from multiprocessing import get_context
-
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_die_on_interrupt)
-
-
-def _die_on_interrupt() -> None:
-    """Let Ctrl-C end a worker at once and silently; objects are written whole or not at all."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _row(library: AssetLibrary, name: str) -> dict[str, Any]:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from app.commands.progress_bar import follow
-from app.paths import default_data_dir
 
-from osfcore.errors import InvalidInput
+from app.commands.progress_bar import follow
+from app.commands.workers import worker_pool
+from app.paths import default_data_dir
 
 
 @dataclass(frozen=True)
@@ -101,12 +97,10 @@ class CollectPushesCommand:
         from osfcore.objects.library import AssetLibrary
         from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
-        if not 1 <= self.workers <= 256:
-            raise InvalidInput("number of workers", self.workers, "between 1 and 256")
         config = CollectPushes(
             self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images, self.renderer
         )
-        with _executor(self.workers) as executor:
+        with worker_pool(self.workers) as executor:
             last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor))
         result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}
         if last is not None:
@@ -116,19 +110,6 @@ class CollectPushesCommand:
                 "episodes_per_s": round(last.episodes_per_s, 2),
             }
         return result
-
-
-@contextmanager
-def _executor(workers: int) -> Iterator[Executor | None]:
-    """Worker processes, or none for one worker."""
-    if workers == 1:
-        yield None
-        return
-    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-    try:
-        yield executor
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
 
 
 Collect = Annotated[

@@ -1,0 +1,28 @@
+import json
+
+import pytest
+
+from app.commands.check import Check
+from osfcore.errors import CorruptFile
+from osfcore.world.collect_images import CollectTable, collect_table
+
+
+def test_a_good_set_is_described_and_drawn(tmp_path, capsys):
+    out = tmp_path / "table"
+    list(collect_table(CollectTable(out, images=60, size=16)))
+    result = Check(out, overlay=tmp_path / "overlay.png").run()
+    assert result == {"path": str(out), "kind": "image set", "train": 20, "test": 40}
+    assert "good image set: 20 train and 40 test images" in capsys.readouterr().out
+    assert (tmp_path / "overlay.png").stat().st_size > 1000
+
+
+def test_with_json_nothing_else_is_printed(tmp_path, capsys):
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps({"objects": [], "light": {"position": [0, 0, 1]}}))
+    assert Check(path, json=True).run()["objects"] == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_what_is_not_there_is_told(tmp_path):
+    with pytest.raises(CorruptFile, match="no such file"):
+        Check(tmp_path / "nothing").run()
