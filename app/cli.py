@@ -19,7 +19,10 @@ from osfcore.errors import OsfError
 class Command(Protocol):
     """What every command offers."""
 
-    json: bool
+    @property
+    def json(self) -> bool:
+        """Whether the result is printed as JSON."""
+        ...
 
     def run(self) -> dict[str, Any]:
         """Do it; return what `--json` prints."""

@@ -102,9 +102,8 @@ def main() -> None:
             watcher.join()
     every = np.concatenate(list(measured.values()))
     for path, values in measured.items():
-        print(
-            f"GET {path.replace(scene, 'ID')}: median {np.median(values):.1f} ms, p99 {np.quantile(values, 0.99):.1f} ms"
-        )
+        where = path.replace(scene, "ID")
+        print(f"GET {where}: median {np.median(values):.1f} ms, p99 {np.quantile(values, 0.99):.1f} ms")
     print(f"all: median {np.median(every):.1f} ms, p99 {np.quantile(every, 0.99):.1f} ms over {len(every)} requests")
     print(f"meanwhile {sum(actions) / elapsed:.1f} actions of 0.2 s a second, viewer updates {rate[0]:.0f} a second")
 
