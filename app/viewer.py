@@ -29,7 +29,6 @@ from osfcore.scene import (
     MIN_LIGHT_ELEVATION_DEG,
     PUSHER_HEIGHT_M,
     PUSHER_RADIUS_M,
-    SCENE_CENTRE,
     TABLE_SIDE_M,
     Camera,
     Light,
@@ -40,10 +39,11 @@ from osfcore.world.optics import PUSHER_ALBEDO, TABLE_ALBEDO
 
 PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
 PUSH_STEPS = 2
-VIEW_FROM, VIEW_FOV_RAD = (1.0, -1.0, 0.95), 0.75
+VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.95, -0.95, 0.9), (0.0, 0.0, 0.1), 0.8
 TABLE_THICKNESS_M = 0.04
 LIGHT_CUBE_M = 0.06
 LABEL_GAP_M = 0.01
+AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
 _STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
@@ -276,7 +276,7 @@ class SceneDrawing:
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
         camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.up = VIEW_FROM, SCENE_CENTRE, (0.0, 0.0, 1.0)
+        camera.position, camera.look_at, camera.up = VIEW_FROM, VIEW_AT, (0.0, 0.0, 1.0)
         camera.fov = VIEW_FOV_RAD
         camera.near, camera.far = 0.01, 20.0
         scene.add_box(
@@ -286,6 +286,10 @@ class SceneDrawing:
             position=(0.0, 0.0, -TABLE_THICKNESS_M / 2),
             cast_shadow=False,
         )
+        corner = (0.06 - TABLE_SIDE_M / 2, 0.06 - TABLE_SIDE_M / 2, 0.002)
+        scene.add_frame("/axes", position=corner, axes_length=AXES_M, axes_radius=0.004, origin_radius=0.006)
+        for name, offset in (("x", (AXES_M, 0, 0)), ("y", (0, AXES_M, 0))):
+            scene.add_label(f"/axes/{name}", name, position=offset, font_screen_scale=0.8)
         self._pusher = scene.add_cylinder(
             "/pusher", radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, color=_colour(PUSHER_ALBEDO), visible=False
         )
@@ -302,6 +306,7 @@ class SceneDrawing:
         self._cube = scene.add_box(
             "/light", color=(40, 200, 60), dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
         )
+        self._ray = scene.add_line_segments("/light_ray", _ray_from(np.array(start)), (40, 200, 60), thickness=0.004)
         self._light_gizmo = scene.add_transform_controls(
             "/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
         )
@@ -327,7 +332,7 @@ class SceneDrawing:
             f"/cameras/{camera.name}",
             fov=camera.fov_y_rad,
             aspect=camera.width / camera.height,
-            scale=0.09,
+            scale=0.06,
             thickness=0.003,
             color=(90, 100, 115),
             wxyz=pose.quaternion,
@@ -378,6 +383,12 @@ class SceneDrawing:
     def _place_light(self, position: np.ndarray) -> None:
         _put(self._cube, position)
         _put(self._lamp, position)
+        self._ray.points = _ray_from(position)
+
+
+def _ray_from(position: np.ndarray) -> np.ndarray:
+    """A stretch of the line along which the light falls, which leads the eye to a lamp that is out of view."""
+    return np.stack([0.55 * position, position])[None].astype(np.float32)
 
 
 def light_toward(position: np.ndarray) -> Light | None:
