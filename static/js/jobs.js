@@ -66,7 +66,25 @@ function stateText(job) {
   if (job.state === "queued") return `waiting, number ${job.position ?? "?"} in line`;
   if (job.state === "running") return `${job.note || "running"}${timeLeft(job.eta_s)}`;
   if (job.state === "paused") return "paused";
-  return { done: "done", failed: "failed", cancelled: "cancelled" }[job.state];
+  return `${job.state}${job.total ? `, ${job.done} of ${job.total}` : ""}${outcome(job)}`;
+}
+
+function outcome({ result }) {
+  if (result?.contact_share === undefined || !result.episodes_per_s) return "";
+  const percent = (share) => `${(100 * share).toFixed(0)} %`;
+  return `, contact in ${percent(result.contact_share)} of the steps, motion in ${percent(result.motion_share)}`;
+}
+
+/** What was asked for, in one line. */
+function orderText({ kind, params: p }) {
+  if (kind === "collect_pushes") return `${p.episodes} × ${p.steps} steps, ${p.objects} objects, ${p.policy} policy, seed ${p.seed}`;
+  if (kind === "fetch_assets") return p.names?.length ? p.names.join(", ") : "all from the package index";
+  return `${p.images} images of ${p.size} px, seed ${p.seed}`;
+}
+
+function titleText({ kind, params }) {
+  const label = objects().find((object) => object.name === params.name)?.label ?? params.name;
+  return label ? `${KINDS[kind]}: ${label}` : KINDS[kind];
 }
 
 function command(text, className, action) {
@@ -94,12 +112,14 @@ function controlsKey(job) {
 function draw(job) {
   let node = nodes.get(job.id);
   if (!node) {
-    const what = job.params.name ? `${KINDS[job.kind]}: ${job.params.name}` : KINDS[job.kind];
     node = {
-      bar: el("progress", { max: 1 }), text: el("span", { className: "hint" }), error: el("span", { className: "error" }),
+      bar: el("progress", { max: 1 }), text: el("span", { className: "state" }), error: el("span", { className: "error" }),
       actions: el("div", { className: "actions" }), key: "",
     };
-    node.item = el("li", {}, el("span", { className: "title", textContent: what }), node.bar, node.text, node.error, node.actions);
+    const made = new Date(job.created_at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+    const head = el("span", { className: "title", textContent: titleText(job), title: `${job.id}, asked for ${made}` });
+    const order = el("span", { className: "hint", textContent: orderText(job) });
+    node.item = el("li", {}, head, order, node.bar, node.text, node.error, node.actions);
     node.item.dataset.job = job.id;
     nodes.set(job.id, node);
     byId("job-list").prepend(node.item);
@@ -107,6 +127,7 @@ function draw(job) {
   node.item.dataset.state = job.state;
   node.bar.hidden = !LIVE.has(job.state);
   node.bar.value = job.total ? job.done / job.total : 0;
+  node.bar.setAttribute("aria-label", `${titleText(job)}, ${job.done} of ${job.total}`);
   node.text.textContent = stateText(job);
   node.error.textContent = job.error ?? "";
   node.error.hidden = !job.error;

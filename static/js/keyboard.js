@@ -4,7 +4,8 @@ import { byId } from "./dom.js";
 import { pushKey } from "./push.js";
 import { anotherScene, resetScene } from "./scenes.js";
 
-const isTyping = (target) => target.closest?.("input, select, textarea, [role=tab]") !== null && !target.matches?.("[type=checkbox], [type=radio]");
+// Radio buttons and sliders need the arrows themselves; a checkbox needs no key of ours.
+const isTyping = (target) => Boolean(target.closest?.("input:not([type=checkbox]), select, textarea, [role=tab]"));
 const isDialogOpen = () => document.querySelector("dialog[open]") !== null;
 
 const COMMANDS = {

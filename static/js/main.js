@@ -10,11 +10,12 @@ import { setUpNumbers } from "./numbers.js";
 import { refreshObjects, setUpObjects } from "./objects.js";
 import { setUpPush } from "./push.js";
 import { refreshScenes, setUpScenes } from "./scenes.js";
-import { set } from "./state.js";
+import { expectOlder, set } from "./state.js";
 import { setUpTabs } from "./tabs.js";
 import { setUpTheme } from "./theme.js";
 import { toast } from "./toasts.js";
 import { isViewerShown, showViewer } from "./viewer.js";
+import { setUpWelcome } from "./welcome.js";
 
 const STARTING = { starting: "Simulation starting", restarting: "Simulation restarting" };
 
@@ -23,14 +24,20 @@ function status(text, state) {
   byId("status").dataset.state = state;
 }
 
-/** Asks until the simulation is ready, then shows the 3D view. */
+let follower = 0;
+let isViewerOld = false;
+
+/** Asks until the simulation is ready, then shows the 3D view. A later call takes over from an earlier one. */
 async function followHealth(again) {
-  for (;;) {
+  follower += 1;
+  isViewerOld ||= again;
+  for (const me = follower; me === follower; ) {
     try {
       const health = await get("health");
       if (health.stage === "ready") {
         status("Live", "live");
-        if (again || !isViewerShown()) showViewer();
+        if (isViewerOld || !isViewerShown()) showViewer();
+        isViewerOld = false;
         return;
       }
       status(STARTING[health.stage] ?? "Starting", "wait");
@@ -51,6 +58,7 @@ setUpNumbers();
 setUpScenes();
 setUpObjects();
 setUpJobs();
+setUpWelcome();
 setUpKeyboard();
 refreshObjects();
 
@@ -59,6 +67,7 @@ listen({
     followHealth(again);
     refreshJobs();
     if (again) {
+      expectOlder();
       refreshScenes();
       refreshObjects();
     }
@@ -67,5 +76,8 @@ listen({
   scene: (scene) => set("scene", scene),
   frame: showFrames,
   job: showJob,
-  notice: ({ level, text }) => toast(text, level),
+  notice({ level, text }) {
+    toast(text, level);
+    followHealth(false); // it may be that the simulation is being restarted
+  },
 });

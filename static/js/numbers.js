@@ -39,7 +39,6 @@ async function copy() {
 export function setUpNumbers() {
   byId("copy-scene").addEventListener("click", copy);
   watch("scene", (scene) => {
-    byId("no-scene").hidden = Boolean(scene);
     byId("drive").hidden = !scene;
     if (!scene) return;
     byId("poses").replaceChildren(...scene.objects.map(row));

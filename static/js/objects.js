@@ -5,6 +5,7 @@ import { objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { tellFailure } from "./toasts.js";
 
+const FETCHABLE = 10; // as many as the package index has; more come from folders
 const SYMMETRY = { none: "no symmetry", discrete: "discrete symmetry", continuous: "turns freely" };
 
 function entry(object) {
@@ -13,7 +14,7 @@ function entry(object) {
   return el(
     "li",
     { className: object.available ? "" : "absent" },
-    el("span", { className: "title", textContent: object.label, title: object.name }),
+    el("span", { className: "title", textContent: object.label, title: `${object.name}, ${object.licence}, ${object.attribution}` }),
     el(
       "span",
       { className: "hint" },
@@ -29,16 +30,21 @@ export async function refreshObjects() {
   if (answer) set("objects", answer.objects);
 }
 
-export function setUpObjects() {
-  const button = byId("fetch-objects");
-  button.addEventListener("click", () => whileDisabled(button, () => tellFailure(async () => {
+/** Starts the job that fetches objects and shows it. */
+export function fetchObjects(button) {
+  return whileDisabled(button, () => tellFailure(async () => {
     await post("jobs", { kind: "fetch_assets", params: {} });
     showTab("jobs");
-  })));
+  }));
+}
+
+export function setUpObjects() {
+  const button = byId("fetch-objects");
+  button.addEventListener("click", () => fetchObjects(button));
   watch("objects", () => {
     const there = objects().filter((object) => object.available).length;
     byId("object-list").replaceChildren(...objects().map(entry));
     byId("objects-hint").textContent = objects().length ? `${there} of ${objects().length} are on this machine.` : "";
-    button.hidden = !objects().length || there >= 10;
+    button.hidden = !objects().length || there >= FETCHABLE;
   });
 }

@@ -16,6 +16,7 @@ const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowRight: [1, 0], ArrowLef
 
 const held = new Map(); // what is held down -> direction
 let isRunning = false;
+let tapped = null; // pressed while an action ran and perhaps let go before its end
 
 const speed = () => Number(byId("speed").value);
 
@@ -26,7 +27,6 @@ function direction() {
 
 /** Acts until nothing is held; a short tap still makes one whole action. */
 async function run(first) {
-  if (isRunning) return;
   isRunning = true;
   let [x, y] = first;
   try {
@@ -41,10 +41,13 @@ async function run(first) {
       const velocity = [(x * speed()) / length, (y * speed()) / length, 0];
       set("scene", { ...(await post(`scenes/${scene.id}/actions`, { actions: [velocity] })), is_current: true });
       await new Promise((resolve) => setTimeout(resolve, Math.max(STEP_MS - (performance.now() - start), 0)));
-      [x, y] = direction();
+      const next = direction();
+      [x, y] = next[0] || next[1] ? next : (tapped ?? next);
+      tapped = null;
     }
   } catch (error) {
     held.clear();
+    tapped = null;
     toast(error.message, "error");
   } finally {
     isRunning = false;
@@ -54,7 +57,8 @@ async function run(first) {
 export function press(what, way) {
   if (held.has(what)) return;
   held.set(what, way);
-  run(direction());
+  if (isRunning) tapped = direction();
+  else run(direction());
 }
 
 export const release = (what) => held.delete(what);

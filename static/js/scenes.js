@@ -36,7 +36,7 @@ async function submit(event) {
 export function anotherScene() {
   const seed = randomSeed();
   form().elements.seed.value = seed;
-  return tellFailure(() => make({ seed, count: current()?.objects.length ?? 3 }));
+  return tellFailure(() => make({ seed, count: current()?.objects.length ?? Number(form().elements.count.value) }));
 }
 
 export function resetScene() {
@@ -48,7 +48,7 @@ export function resetScene() {
 
 function entry(scene, currentId) {
   const isCurrent = scene.id === currentId;
-  const show = el("button", { type: "button", className: "plain", textContent: "Show", disabled: isCurrent });
+  const show = el("button", { type: "button", className: "plain", textContent: "Show" });
   show.addEventListener("click", () => whileDisabled(show, () => tellFailure(async () => {
     set("scene", await post(`scenes/${scene.id}/activate`));
     await refreshScenes();
@@ -65,13 +65,14 @@ function entry(scene, currentId) {
     {},
     el("span", { className: "title", textContent: names || "Empty table" }),
     el("span", { className: "hint", textContent: `Seed ${scene.seed}, made ${made}` }),
-    el("div", { className: "actions" }, show, drop, isCurrent ? el("span", { className: "current", textContent: "shown now" }) : null),
+    el("div", { className: "actions" }, isCurrent ? el("span", { className: "current", textContent: "Shown now" }) : show, drop),
   );
 }
 
 export async function refreshScenes() {
   const answer = await tellFailure(() => get("scenes"));
   if (!answer) return;
+  byId("no-scenes").hidden = answer.scenes.length > 0;
   byId("scene-list").replaceChildren(...[...answer.scenes].reverse().map((scene) => entry(scene, answer.current)));
 }
 
@@ -89,7 +90,7 @@ export function setUpScenes() {
   byId("reset").addEventListener("click", resetScene);
   let shown;
   watch("scene", (scene) => {
-    if ((scene?.id ?? null) === shown) return;
+    if (scene === undefined || (scene?.id ?? null) === shown) return;
     shown = scene?.id ?? null;
     refreshScenes();
   });
@@ -98,6 +99,11 @@ export function setUpScenes() {
     byId("chips").replaceChildren(...there.map((object) => el(
       "label", {}, el("input", { type: "checkbox", value: object.name }), el("span", { textContent: object.label }),
     )));
-    form().elements.count.max = Math.max(Math.min(MOST_OBJECTS, there.length), 1);
+    const { count } = form().elements;
+    if (there.length) {
+      count.max = Math.min(MOST_OBJECTS, there.length);
+      if (Number(count.value) > Number(count.max)) count.value = count.max;
+    }
+    byId("no-objects").hidden = !objects.length || there.length > 0;
   });
 }

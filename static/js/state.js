@@ -1,6 +1,7 @@
 // What the page knows of the service; modules subscribe to what they show.
 
-const state = { scene: null, objects: [] };
+// The scene is undefined until the service has told, and null when there is none.
+const state = { scene: undefined, objects: [] };
 const listeners = { scene: [], objects: [] };
 
 export const current = () => state.scene;
@@ -10,6 +11,11 @@ export const objects = () => state.objects;
 export function watch(what, listener) {
   listeners[what].push(listener);
   listener(state[what]);
+}
+
+/** A service that was started again may count revisions from further back: take whatever it says next. */
+export function expectOlder() {
+  if (state.scene) state.scene = { ...state.scene, revision: -1 };
 }
 
 export function set(what, value) {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.live import free_port, start_service, stop_service
+from tests.live import free_port, live_service, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
 WAIT_MS = 20_000
@@ -89,6 +89,8 @@ def camera_source(page, camera: str) -> str:
 def test_page_loads_without_errors_or_foreign_requests(page, service):
     assert page.title() == "OSF manipulation"
     wait_until(lambda: all(camera_source(page, camera) for camera in ("0", "1", "2", "3", "goal")))
+    sides = page.eval_on_selector_all("#camera-strip img", "all => all.map((i) => [i.clientWidth, i.clientHeight])")
+    assert all(width == height > 100 for width, height in sides)
     assert page.problems == []
     assert page.hosts == {f"127.0.0.1:{service.port}"}
 
@@ -148,8 +150,23 @@ def test_keys_do_not_push_while_typing(page, service):
     before = service.scene()["time_s"]
     page.focus('input[name="seed"]')
     page.keyboard.press("ArrowUp")
+    page.focus('input[name="which"][value="chosen"]')
+    page.keyboard.press("ArrowLeft")
+    assert page.is_checked('input[name="which"][value="random"]')
     time.sleep(0.5)
     assert service.scene()["time_s"] == before
+
+
+def test_quick_taps_each_count(page, service):
+    page.locator("h1").click()
+    before = service.scene()
+    page.keyboard.press("ArrowDown")
+    time.sleep(0.05)  # the first action takes 0.2 s
+    page.keyboard.press("ArrowDown")
+    wait_until(lambda: service.scene()["time_s"] >= before["time_s"] + 0.4 - 1e-6)
+    time.sleep(0.5)
+    moved = np.array(service.scene()["pusher"]["position"]) - before["pusher"]["position"]
+    np.testing.assert_allclose(moved, [0, -0.12, 0], atol=1e-6)
 
 
 def test_masks_change_the_images_and_go_away_again(page):
@@ -220,8 +237,9 @@ def test_a_mistake_is_told_in_words(page, service):
 
 def test_page_finds_the_service_again_after_a_restart(page, service):
     page.locator("h1").click()
+    start_s = service.scene()["time_s"]
     page.keyboard.press("ArrowRight")
-    wait_until(lambda: service.scene()["time_s"] > 0)
+    wait_until(lambda: service.scene()["time_s"] > start_s + 0.2 - 1e-6)
     before = service.scene()
     stop_service(service.process)
     wait_until(lambda: page.get_attribute("#status", "data-state") == "lost")
@@ -235,6 +253,19 @@ def test_page_finds_the_service_again_after_a_restart(page, service):
     page.keyboard.press("ArrowLeft")
     wait_until(lambda: service.scene()["revision"] != after["revision"])
     page.problems.clear()  # the browser notes refused connections
+
+
+def test_page_without_objects_says_what_to_do(browser, tmp_path):
+    with live_service(tmp_path) as url:
+        page = browser.new_page()
+        page.goto(url)
+        page.wait_for_selector("#welcome", timeout=WAIT_MS)
+        assert page.inner_text("#welcome-button") == "Fetch objects"
+        page.click("#tab-scenes")
+        assert page.is_visible("#no-objects")
+        page.click("#new-scene [type=submit]")
+        page.wait_for_selector(".error-toast", timeout=WAIT_MS)  # the service says why not
+        page.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
