@@ -22,7 +22,7 @@ from app.playback import Playback
 from app.runner import Runner
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
-from osfcore.poses import Pose, quaternion_to_matrix
+from osfcore.poses import Pose, quaternion_multiply, quaternion_to_matrix
 from osfcore.scene import (
     AMBIENT,
     DIFFUSE,
@@ -44,6 +44,7 @@ TABLE_THICKNESS_M = 0.04
 LIGHT_CUBE_M = 0.06
 LABEL_GAP_M = 0.01
 AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
@@ -200,7 +201,9 @@ class SceneDrawing:
         self._labels: dict[str, viser.SceneNodeHandle] = {}
         self._gizmos: dict[str, viser.SceneNodeHandle] = {}
         self._sizes_m: dict[str, np.ndarray] = {}
-        self._held: set[str] = set()  # what someone is dragging follows the hand, not the scene
+        # What someone is dragging follows the hand, not the scene.
+        self._grabbed: dict[str, np.ndarray] = {}
+        self._is_light_held = False
         self._has_names = True
         self._has_gizmos = False
         self._add_room()
@@ -217,7 +220,8 @@ class SceneDrawing:
             for name in names:
                 if name not in self._bodies:
                     self._add_object(name)
-            self._held.clear()
+            self._grabbed.clear()
+            self._is_light_held = False
             self._pusher.visible = record is not None
             for frustum in self._frustums.values():
                 frustum.image = None
@@ -228,11 +232,11 @@ class SceneDrawing:
         """Move everything to where it is in a state."""
         with self._lock, self._changes():
             for name in state.names:
-                if name in self._bodies and name not in self._held:
+                if name in self._bodies and name not in self._grabbed:
                     self._place_object(name, state.pose(name))
             if state.pusher is not None:
                 _put(self._pusher, state.pusher)
-            if "light" not in self._held:
+            if not self._is_light_held:
                 self._place_light(state.light.position)
                 _put(self._light_gizmo, state.light.position)
 
@@ -314,11 +318,11 @@ class SceneDrawing:
         async def drag(event: viser.TransformControlsEvent) -> None:
             light = light_toward(np.asarray(event.target.position))
             if event.phase != "end":
-                self._held.add("light")
+                self._is_light_held = True
                 if light is not None:
                     self._place_light(light.position)
                 return
-            self._held.discard("light")
+            self._is_light_held = False
             if light is not None:
                 self._place_light(light.position)
                 event.target.position = tuple(light.position)
@@ -353,18 +357,22 @@ class SceneDrawing:
         self._labels[name] = self._scene.add_label(
             f"/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
         )
-        gizmo = self._scene.add_transform_controls(f"/handles/{name}", scale=0.12, visible=self._has_gizmos)
+        gizmo = self._scene.add_transform_controls(
+            f"/handles/{name}", scale=0.12, visible=self._has_gizmos, depth_test=False
+        )
         self._gizmos[name] = gizmo
 
         async def drag(event: viser.TransformControlsEvent) -> None:
-            pose = Pose(np.array(event.target.position, float), np.array(event.target.wxyz, float))
-            if event.phase != "end":
-                self._held.add(name)
-                self._follow(name, pose)
+            body = self._bodies.get(name)
+            if body is None:
                 return
-            self._held.discard(name)
+            # Handles stay along the table's axes: what they turn is added to how the object lay when it was grabbed.
+            turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
+            pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
             self._follow(name, pose)
-            self._on_move(name, pose, event.client)
+            if event.phase == "end":
+                self._grabbed.pop(name, None)
+                self._on_move(name, pose, event.client)
 
         gizmo.on_update(drag)
 
@@ -378,7 +386,7 @@ class SceneDrawing:
 
     def _place_object(self, name: str, pose: Pose) -> None:
         self._follow(name, pose)
-        _put(self._gizmos[name], pose.position, pose.quaternion)
+        _put(self._gizmos[name], pose.position, NO_TURN)
 
     def _place_light(self, position: np.ndarray) -> None:
         _put(self._cube, position)

@@ -1,8 +1,11 @@
+import asyncio
+
 import numpy as np
 import pytest
+import viser
 
 from app.viewer import VIEW_FROM, LoopbackViser, light_toward
-from osfcore.poses import Pose
+from osfcore.poses import Pose, quaternion_multiply
 from osfcore.scene import MIN_LIGHT_ELEVATION_DEG, PUSHER_HEIGHT_M
 from tests.app.conftest import until
 
@@ -121,3 +124,37 @@ def test_a_dragged_light_stays_on_the_hemisphere(position):
 @pytest.mark.parametrize("position", [[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 1]])
 def test_no_light_comes_from_nowhere(position):
     assert light_toward(np.array(position)) is None
+
+
+def drag(gizmo, phase, position, quaternion):
+    """As a browser reports it."""
+    gizmo.position, gizmo.wxyz = np.array(position), np.array(quaternion)
+    (callback,) = gizmo._impl_aux.update_cb
+    asyncio.run(callback(viser.TransformControlsEvent(client=None, client_id=None, target=gizmo, phase=phase)))
+
+
+def test_dragged_objects_turn_about_the_axes_of_the_table(live, drawing, shown):
+    until(lambda: agrees(drawing, shown))
+    gizmo, body = drawing._gizmos[BOX], drawing._bodies[BOX]
+    lying = np.array(body.wxyz)
+    quarter = np.array([0.5**0.5, 0, 0, 0.5**0.5])
+    drag(gizmo, "start", body.position, [1, 0, 0, 0])
+    drag(gizmo, "update", [0, 0, 0.5], quarter)
+    assert np.allclose(body.position, [0, 0, 0.5])
+    assert np.allclose(body.wxyz, quaternion_multiply(quarter, lying))
+    live.request("POST", f"/api/scenes/{shown['id']}/actions", {"actions": [[0, 0, 0]]})
+    assert np.allclose(body.position, [0, 0, 0.5])  # the hand has it, not the scene
+    drag(gizmo, "end", [0, 0, 0.5], quarter)
+    until(lambda: body.position[2] < 0.3)
+    until(lambda: np.allclose(gizmo.wxyz, [1, 0, 0, 0]) and np.allclose(gizmo.position, body.position))
+
+
+def test_a_dragged_light_lights_the_scene_when_let_go(live, drawing, shown):
+    until(lambda: agrees(drawing, shown))
+    for phase in ("start", "update", "end"):
+        drag(drawing._light_gizmo, phase, [0, 3, 4], [1, 0, 0, 0])
+    assert np.allclose(drawing._lamp.position, [0, 0.6, 0.8])
+    light = until(
+        lambda: np.allclose(live.request("GET", f"/api/scenes/{shown['id']}")[1]["light"]["position"], [0, 0.6, 0.8])
+    )
+    assert light
