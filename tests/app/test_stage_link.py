@@ -93,7 +93,7 @@ def test_a_stage_that_hangs_is_replaced(library, desk):
 
 def test_too_much_at_once_is_refused(link):
     create(link)
-    futures: list[Future] = [link.submit(TakeImage("a", "0", 256)) for _ in range(3 * MAX_PENDING)]
+    futures: list[Future] = [link.submit(TakeImage("a", "0", 48)) for _ in range(3 * MAX_PENDING)]
     outcomes = [future.exception(60) for future in futures]
     assert {type(outcome) for outcome in outcomes} == {type(None), StageBusy}
 
