@@ -197,15 +197,8 @@ class Stage:
             self._worlds.move_to_end(scene)
             return self._worlds[scene]
         world = Tabletop(self._library, request=SceneRequest(record.state.names), executor=self._executor)
-        try:
-            world.load(record.state)
-        except OsfError:
-            # Contact may leave bodies a little inside each other; the initial state never has that.
-            world.load(record.initial)
-            self._keep_world(scene, world, time_offset_s=0.0)
-            self._report(replace(record, time_s=0.0))
-        else:
-            self._keep_world(scene, world, time_offset_s=record.time_s)
+        world.restore(record.state)
+        self._keep_world(scene, world, time_offset_s=record.time_s)
         return world
 
     def _keep_world(self, scene: str, world: Tabletop, *, time_offset_s: float) -> None:

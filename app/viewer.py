@@ -222,7 +222,7 @@ class SceneDrawing:
                     self._add_object(name)
             self._grabbed.clear()
             self._is_light_held = False
-            self._pusher.visible = record is not None
+            self._pusher.visible = self._ray.visible = record is not None
             for frustum in self._frustums.values():
                 frustum.image = None
             if record is not None:

@@ -199,6 +199,19 @@ class Tabletop:
             raise
         self._steps = 0
 
+    def restore(self, state: SceneState) -> None:
+        """Put back a state that a world has told before.
+
+        Unlike `load` it does not look for overlaps: contact may have left bodies a little inside each other.
+
+        Raises:
+            UnknownName, MissingAssets: if an object is not in the library.
+        """
+        for name in state.names:
+            _check_object(self._library, name)
+        self._place_all(state)
+        self._steps = 0
+
     def act_steps(self, action: Float[np.ndarray, "3"], rate_hz: float = 60.0) -> Iterator[SceneState]:
         """Like `act`, telling the state about `rate_hz` times a second of simulated time; the last one is the end.
 

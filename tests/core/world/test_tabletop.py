@@ -130,6 +130,18 @@ def test_overlapping_state_is_refused_and_the_table_stays(world):
     np.testing.assert_allclose(world.truth().poses.position, before.poses.position, atol=1e-7)
 
 
+def test_restored_state_may_overlap_a_little(library, world):
+    state = world.truth()
+    sunk = state.poses.position - [0, 0, 0.004]
+    pressed = SceneState(state.names, Pose(sunk, state.poses.quaternion), state.light, state.pusher)
+    twin = Tabletop(library)
+    with pytest.raises(OverlappingObjects):
+        twin.load(pressed)
+    twin.restore(pressed)
+    np.testing.assert_allclose(twin.truth().poses.position, sunk, atol=1e-7)
+    twin.close()
+
+
 def test_objects_move_by_hand_unless_they_would_overlap(world):
     state = world.truth()
     name = state.names[0]
