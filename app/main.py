@@ -104,6 +104,9 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
             schemas[model.__name__] = own
+        stream = schema["paths"]["/api/events"]["get"]["responses"]["200"]["content"]
+        # FastAPI describes the stream in terms of OpenAPI 3.2, which readers of 3.1 refuse.
+        stream["text/event-stream"] = {"schema": {"type": "string"}}
         app.openapi_schema = schema
     return app.openapi_schema
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 
 from osfcore.errors import InvalidInput
 
@@ -33,11 +36,19 @@ def worker_pool(workers: int) -> Iterator[Executor | None]:
 def _processes(workers: int) -> Executor | None:
     try:
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(workers, mp_context=context, initializer=_die_on_interrupt)
+        return ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
     except OSError:  # no shared memory, as in some sandboxes: slower, but it works
         return None
 
 
-def _die_on_interrupt() -> None:
-    """Let Ctrl-C end a worker at once and silently: what it writes appears whole or not at all."""
+def _end_with_parent() -> None:
+    """Let Ctrl-C or the parent's death end a worker at once and silently: what it writes is whole or not there."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=_leave_after, args=(parent.sentinel,), daemon=True).start()
+
+
+def _leave_after(sentinel: int) -> None:
+    wait([sentinel])
+    os._exit(1)

@@ -21,7 +21,8 @@ from osfcore.world.optics import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp, lamber
 from osfcore.world.pusher import pusher_mesh
 from osfcore.world.traced import NO_HIT, TracedMesh, into_frame
 
-DEFAULT_SAMPLES = 3  # samples along each side of a pixel
+DEFAULT_SAMPLES = 3  # samples along each side of a pixel, in images of 96 pixels and more
+_SMALL_SIDE = 96  # below, bodies may be thinner than a pixel: corners miss them and three samples are too few
 _BIAS_M = np.float32(5e-4)  # shadow rays start this far above curved facets, which smooth normals make look round
 _CHUNK = 1 << 17  # samples traced at once, to bound memory at large image sizes
 
@@ -89,7 +90,7 @@ class RayTracer:
         state: SceneState,
         cameras: tuple[Camera, ...],
         *,
-        samples: int = DEFAULT_SAMPLES,
+        samples: int | None = None,
         sharp: bool = False,
     ) -> tuple[Picture, ...]:
         """Trace the state from each camera.
@@ -97,7 +98,7 @@ class RayTracer:
         Args:
             state: objects, light and pusher (drawn if it is not None).
             cameras: the views.
-            samples: samples along each side of a pixel.
+            samples: samples along each side of a pixel; by default 3, and more in small images.
             sharp: take textures at their finest level and sample every pixel alike: slow, the yardstick of tests.
 
         Raises:
@@ -107,7 +108,7 @@ class RayTracer:
         if state.pusher is not None:
             bodies.append(_Body(self._pusher, Pose(state.pusher, Pose.identity().quaternion)))
         light = state.light.direction.astype(np.float32)
-        shots = [_Shot(tuple(bodies), light, c, self._lamp, True, samples, sharp) for c in cameras]
+        shots = [_Shot(tuple(bodies), light, c, self._lamp, True, samples or _samples_for(c), sharp) for c in cameras]
         mapped = map(_trace, shots) if self._executor is None else self._executor.map(_trace, shots)
         return tuple(mapped)
 
@@ -125,6 +126,11 @@ class RayTracer:
         bodies = (_Body(self._meshes[name], Pose.identity()),)
         light = np.asarray(light_direction, np.float32)
         return _trace(_Shot(bodies, light, camera, self._lamp, False, samples, False))
+
+
+def _samples_for(camera: Camera) -> int:
+    side = min(camera.width, camera.height)
+    return DEFAULT_SAMPLES if side >= _SMALL_SIDE else 4 if side >= _SMALL_SIDE / 2 else 6
 
 
 def masks_of(picture: Picture, count: int) -> Bool[np.ndarray, "N h w"]:
@@ -158,6 +164,9 @@ def _near_bodies(shot: _Shot) -> Bool[np.ndarray, "h w"]:
         box = _screen_box(body, shot.camera)
         if box is not None:
             left, top, right, bottom = box
+            if min(height, width) < _SMALL_SIDE:
+                on_body[top : bottom + 1, left : right + 1] = True
+                continue
             y, x = np.mgrid[top : bottom + 1, left : right + 1]
             directions = _directions(shot, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32))
             origins = np.broadcast_to(shot.origin, directions.shape)

@@ -22,6 +22,7 @@ from osfcore.scene import (
     MAX_OBJECTS,
     PUSHER_CENTRE_Z_M,
     PUSHER_REACH_M,
+    TABLE_SIDE_M,
     Camera,
     Light,
     Observation,
@@ -38,6 +39,7 @@ from osfcore.world.traced import TracedMesh
 
 Renderer = Literal["embree", "tiny"]
 OVERLAP_TOLERANCE_M = 0.002
+MAX_HEIGHT_M = 1.0  # of an object's centre when it is put somewhere by hand
 _SETTLE_LIMIT_S = 3.0
 
 
@@ -183,10 +185,12 @@ class Tabletop:
 
         Raises:
             UnknownName, MissingAssets: if an object is not in the library.
+            InvalidInput: if an object is not over the table.
             OverlappingObjects: if bodies penetrate by more than 2 mm; then the table is as before.
         """
         for name in state.names:
             _check_object(self._library, name)
+            _check_place(name, state.pose(name).position)
         before = (self._names, self.truth() if self._physics is not None else None)
         self._place_all(state)
         try:
@@ -245,12 +249,13 @@ class Tabletop:
 
         Raises:
             UnknownName: if it is not on the table.
-            InvalidInput: if the pose is not finite, its quaternion not unit, or it is off the table.
+            InvalidInput: if the pose is not finite, its quaternion not unit, or it is not over the table.
             OverlappingObjects: if it would penetrate something by more than 2 mm; then nothing moved.
         """
         if name not in self._names:
             raise UnknownName("object on the table", name, self._names)
         position = finite_vector(pose.position, 3, f"position of {name} [m]")
+        _check_place(name, position)
         quaternion = unit_quaternion(pose.quaternion, f"quaternion of {name}")
         bodies = self._bodies
         before = bodies.pose(name)
@@ -354,6 +359,13 @@ def _check_object(library: AssetLibrary, name: str) -> None:
     if not library.has(name):
         library.info(name)  # raises UnknownName for what no catalogue knows
         raise MissingAssets([name])
+
+
+def _check_place(name: str, position: Float[np.ndarray, "3"]) -> None:
+    half = TABLE_SIDE_M / 2
+    if np.abs(position[:2]).max() > half or not 0 <= position[2] <= MAX_HEIGHT_M:
+        allowed = f"over the table: |x|, |y| at most {half:g} and z between 0 and {MAX_HEIGHT_M:g}"
+        raise InvalidInput(f"position of {name} [m]", np.round(position, 4).tolist(), allowed)
 
 
 def _check_request(library: AssetLibrary, request: SceneRequest) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import openapi_spec_validator
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, settings
@@ -92,3 +93,7 @@ def test_operation_names_are_unique_and_every_error_is_a_problem():
         for status, answer in operation["responses"].items():
             if not status.startswith("2"):
                 assert list(answer["content"]) == ["application/problem+json"]
+
+
+def test_schema_is_valid_openapi():
+    openapi_spec_validator.validate(create_app().openapi())

@@ -157,13 +157,14 @@ def test_views_in_threads_equal_views_one_by_one():
         np.testing.assert_array_equal(x.rgb, y.rgb)
 
 
-def test_default_quality_is_within_38_db_of_supersampling(library):
+@pytest.mark.parametrize("size", [16, 32, 64, 95, 128])
+def test_default_quality_is_within_38_db_of_supersampling(library, size):
     names = ("006_mustard_bottle", "003_cracker_box", "035_power_drill")
     assets = {name: library.load(name) for name in names}
     positions = np.array([[0.05, 0.1, 0.0955], [-0.12, -0.05, 0.1065], [0.12, -0.1, 0.0285]])
     turns = quaternion_exp(np.array([[0, 0, 0.2], [0, 0, 0.7], [0, 0, 2.0]]))
     meshes = RayTracer({name: TracedMesh(asset.mesh) for name, asset in assets.items()})
-    cameras = (*default_cameras(), goal_camera())
+    cameras = (*default_cameras(size), goal_camera(size))
     for azimuth, elevation in ((0.7, 30), (3.0, 8), (-1.5, 75)):
         light = Light.from_angles(azimuth, np.deg2rad(elevation))
         state = SceneState(names, Pose(positions, turns), light, np.array([0.0, -0.15, PUSHER_CENTRE_Z_M]))
@@ -173,4 +174,5 @@ def test_default_quality_is_within_38_db_of_supersampling(library):
             mask = masks_of(truth, 3).any(axis=0)
             psnr = -10 * np.log10(np.mean((picture.rgb - truth.rgb)[mask] ** 2))
             assert psnr >= 38
-            assert np.mean(masks_of(picture, 3) == masks_of(truth, 3)) > 0.999
+            differing = (masks_of(picture, 3) != masks_of(truth, 3)).sum()
+            assert differing <= max(3, 0.03 * mask.sum())  # pixels that are covered by half

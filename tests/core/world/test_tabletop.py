@@ -130,6 +130,14 @@ def test_overlapping_state_is_refused_and_the_table_stays(world):
     np.testing.assert_allclose(world.truth().poses.position, before.poses.position, atol=1e-7)
 
 
+def test_states_off_the_table_are_refused(world):
+    state = world.truth()
+    below = SceneState(state.names, Pose(state.poses.position - [0, 0, 50], state.poses.quaternion), state.light, None)
+    with pytest.raises(InvalidInput, match="over the table"):
+        world.load(below)
+    np.testing.assert_allclose(world.truth().poses.position, state.poses.position, atol=1e-7)
+
+
 def test_restored_state_may_overlap_a_little(library, world):
     state = world.truth()
     sunk = state.poses.position - [0, 0, 0.004]
@@ -151,7 +159,7 @@ def test_objects_move_by_hand_unless_they_would_overlap(world):
     for step in world.settle():
         last = step
     assert last.pose(name).position[2] < 0.2
-    into_table = Pose(state.poses.position[0] - [0, 0, 0.02], state.poses.quaternion[0])
+    into_table = Pose(state.poses.position[0] - [0, 0, 0.01], state.poses.quaternion[0])
     before = world.truth()
     with pytest.raises(OverlappingObjects, match="the table"):
         world.move_object(name, into_table)
@@ -165,6 +173,9 @@ def test_hand_moves_are_checked(world):
         world.move_object(world.names[0], Pose(np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0])))
     with pytest.raises(InvalidInput):
         world.move_object(world.names[0], Pose(np.array([0.0, 0, 1]), np.array([1.0, 1, 0, 0])))
+    for place in ([0.61, 0, 0.1], [0, 100, 0.1], [0, 0, -50], [0, 0, -0.75], [0, 0, 1.1]):
+        with pytest.raises(InvalidInput, match="over the table"):
+            world.move_object(world.names[0], Pose(np.array(place), np.array([1.0, 0, 0, 0])))
     with pytest.raises(InvalidInput):
         world.move_pusher(np.array([0.5, 0, 0]))
     with pytest.raises(OverlappingObjects):
@@ -220,8 +231,9 @@ def test_an_empty_table_says_so(library):
 
 
 def test_fallen_objects_lie_on_the_floor(world):
-    name = world.names[0]
-    world.move_object(name, Pose(np.array([0.8, 0, 0.1]), np.array([1.0, 0, 0, 0])))
+    name, state = world.names[0], world.truth()
+    pushed_off = state.poses.position + [[0.8, 0, 0.1], [0, 0, 0], [0, 0, 0]]
+    world.restore(SceneState(state.names, Pose(pushed_off, state.poses.quaternion), state.light, state.pusher))
     for _ in range(15):
         world.act(np.zeros(3))
     assert -0.76 < world.truth().pose(name).position[2] < -0.5
