@@ -130,7 +130,9 @@ class RayTracer:
 
 def _samples_for(camera: Camera) -> int:
     side = min(camera.width, camera.height)
-    return DEFAULT_SAMPLES if side >= _SMALL_SIDE else 4 if side >= _SMALL_SIDE / 2 else 6
+    if side >= _SMALL_SIDE:
+        return DEFAULT_SAMPLES
+    return 4 if side >= 48 else 6 if side >= 24 else 8
 
 
 def masks_of(picture: Picture, count: int) -> Bool[np.ndarray, "N h w"]:
