@@ -76,7 +76,7 @@ def test_a_new_scene_is_shown_and_can_be_left_again(service, scene):
         ({"count": 9}, "count"),
         ({"image_size": 2000}, "image_size"),
         ({"poses": [{"name": BOX, "position": [0, 0, 0.2], "quaternion": [1, 1, 0, 0]}]}, "unit quaternion"),
-        ({"poses": [{"name": BOX, "position": [0, 0, -0.05], "quaternion": UPRIGHT}]}, "overlap"),
+        ({"poses": [{"name": BOX, "position": [0, 0, 0.03], "quaternion": UPRIGHT}]}, "overlap"),
         (
             {
                 "poses": [
