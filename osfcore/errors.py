@@ -86,6 +86,20 @@ class CorruptFile(OsfError):
         super().__init__(f"{path} cannot be used: {reason}.")
 
 
+class CannotWrite(OsfError):
+    """A place where results cannot be written; what was there before is untouched."""
+
+    def __init__(self, path: Path | str, reason: str) -> None:
+        super().__init__(f"{path} cannot be written: {reason}.")
+
+
+class WorkerDied(OsfError):
+    """A worker process that ended in the middle of its work."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"A worker process died while {what}; start it again, with fewer workers if memory ran out.")
+
+
 class FetchFailed(OsfError):
     """Something that could not be downloaded, verified or written; nothing was changed."""
 

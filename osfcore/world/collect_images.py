@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import FetchFailed, InvalidInput, MissingAssets
+from osfcore.errors import CannotWrite, InvalidInput, MissingAssets
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose
 from osfcore.progress import Progress
@@ -133,10 +134,16 @@ def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -
     image_side(size)
     if not MIN_IMAGES <= images <= MAX_IMAGES:
         raise InvalidInput("number of images", images, f"between {MIN_IMAGES} and {MAX_IMAGES}")
+    if seed < 0:
+        raise InvalidInput("seed", seed, "0 or more")
+    out = out.absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
-    partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise CannotWrite(out, error.strerror or str(error)) from error
     test = max(TEST_IMAGES, images // 8)
     counts: dict[Split, int] = {"train": images - test, "test": test}
     done = 0
@@ -152,11 +159,10 @@ def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -
                 done += 1
                 yield Progress(done, images, f"Image {done} of {images} of {what}")
             (folder / "anno.json").write_text(json.dumps(annotations))
-        if out.exists():
-            out.rmdir()
-        partial.rename(out)
+        partial.chmod(0o755)  # temporary folders are private
+        partial.rename(out)  # replaces an empty folder
     except OSError as error:
-        raise FetchFailed(f"The image set {out}", error.strerror or str(error)) from error
+        raise CannotWrite(out, error.strerror or str(error)) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

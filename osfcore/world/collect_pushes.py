@@ -6,12 +6,13 @@ import functools
 import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from osfcore.errors import FetchFailed, InvalidInput
+from osfcore.errors import CannotWrite, InvalidInput, WorkerDied
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import rotation_angle
 from osfcore.scene import DEFAULT_IMAGE_SIDE, MAX_OBJECTS, SceneState, default_cameras
@@ -96,19 +97,28 @@ def collect_pushes(
     }
     try:
         config.out.parent.mkdir(parents=True, exist_ok=True)
-        folder = EpisodeFolder(config.out, settings)
-        tally = _Tally(config)
-        done = folder.finished()
-        for index in sorted(i for i in done if i < config.episodes):
-            tally.add(load_episode(folder.path(index)))
-        yield tally.step()
-        missing = (i for i in range(config.episodes) if i not in done)
-        for episode in _episodes(config, library.root, folder, missing, executor):
-            tally.add(episode, is_new=True)
-            yield tally.step()
-        folder.combine(config.episodes)
+        with EpisodeFolder(config.out, settings) as folder:
+            yield from _collect(config, library.root, folder, executor)
+    except BrokenProcessPool as error:
+        raise WorkerDied("collecting pushes") from error
     except OSError as error:
-        raise FetchFailed(f"The push file {config.out}", error.strerror or str(error)) from error
+        raise CannotWrite(config.out, error.strerror or str(error)) from error
+
+
+def _collect(
+    config: CollectPushes, root: Path, folder: EpisodeFolder, executor: Executor | None
+) -> Iterator[CollectStep]:
+    """Count what is there, run what is missing, put everything into one file."""
+    tally = _Tally(config)
+    done = folder.finished()
+    for index in sorted(i for i in done if i < config.episodes):
+        tally.add(load_episode(folder.path(index)))
+    yield tally.step()
+    missing = (i for i in range(config.episodes) if i not in done)
+    for episode in _episodes(config, root, folder, missing, executor):
+        tally.add(episode, is_new=True)
+        yield tally.step()
+    folder.combine(config.episodes)
 
 
 def _check(config: CollectPushes) -> None:

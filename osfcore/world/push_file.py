@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import h5py
 import numpy as np
@@ -52,13 +55,32 @@ class EpisodeFolder:
         settings: what the episodes depend on; a folder begun with other settings is refused.
 
     Raises:
-        InvalidInput: if the folder was begun with other settings.
+        InvalidInput: if the folder was begun with other settings, or another process is collecting into it.
     """
 
     def __init__(self, out: Path, settings: Mapping[str, object]) -> None:
         self._out = out
         self._folder = out.with_name(out.name + ".partial")
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._lock = (self._folder / "lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._adopt(settings)
+        except BlockingIOError:
+            self._lock.close()
+            raise InvalidInput("output file", out, "one that no other collection is writing") from None
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.close()
+
+    def _adopt(self, settings: Mapping[str, object]) -> None:
+        """Clean up after a killed run and make sure that it had the same settings."""
         for leftover in self._folder.glob("*.tmp"):
             leftover.unlink()
         text = json.dumps(dict(settings), sort_keys=True)
@@ -80,8 +102,8 @@ class EpisodeFolder:
         return self._folder / f"{index:07d}.npz"
 
     def finished(self) -> frozenset[int]:
-        """Indices of the episodes that are there."""
-        return frozenset(int(path.stem) for path in self._folder.glob("*.npz"))
+        """Indices of the episodes that are there and whole; a damaged one is collected again."""
+        return frozenset(int(path.stem) for path in self._folder.glob("*.npz") if _is_whole(path))
 
     def combine(self, count: int) -> None:
         """Write episodes 0 to count - 1 into the HDF5 file, then remove the folder."""
@@ -95,6 +117,15 @@ class EpisodeFolder:
         shutil.rmtree(self._folder)
 
 
+def _is_whole(path: Path) -> bool:
+    """Whether an episode can be read: a power cut may have cut it short."""
+    try:
+        load_episode(path)
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
+        return False
+    return True
+
+
 def save_episode(path: Path, episode: PushEpisode) -> None:
     """Write one episode; the file appears complete or not at all."""
     arrays = {name: getattr(episode, name) for name in _ARRAYS}
@@ -103,12 +134,14 @@ def save_episode(path: Path, episode: PushEpisode) -> None:
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
         np.savez_compressed(file, names=np.array(episode.names), seed=episode.seed, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
     os.replace(temporary, path)
 
 
 def load_episode(path: Path) -> PushEpisode:
     """Read what `save_episode` wrote."""
-    with np.load(path) as data:
+    with path.open("rb") as file, np.load(file) as data:
         arrays = {name: data[name] for name in _ARRAYS}
         frames = data.get("frames")
         return PushEpisode(tuple(data["names"].tolist()), int(data["seed"]), **arrays, frames=frames)
@@ -123,7 +156,7 @@ def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
     try:
         with h5py.File(path) as file:
             return tuple(_from_group(group) for _, group in sorted(file.items()))
-    except (OSError, KeyError) as error:
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise CorruptFile(path, f"it is not a push file ({error})") from error
 
 

@@ -112,9 +112,9 @@ def push_file(tmp_path, **changes):
         "actions": np.zeros((2, 3)),
         "contact": np.zeros((2, 1), bool),
     }
-    folder = EpisodeFolder(tmp_path / "pushes.h5", {})
-    save_episode(folder.path(0), PushEpisode(("a",), 0, **(arrays | changes)))
-    folder.combine(1)
+    with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
+        save_episode(folder.path(0), PushEpisode(("a",), 0, **(arrays | changes)))
+        folder.combine(1)
     return tmp_path / "pushes.h5"
 
 

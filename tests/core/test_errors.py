@@ -10,6 +10,8 @@ SENTENCES = [
     errors.NoRoom(["a", "b"], 60),
     errors.CorruptFile("file.obj", "it has no faces"),
     errors.FetchFailed("The wheel", "there is no network"),
+    errors.CannotWrite("Sets", "the disk is full"),
+    errors.WorkerDied("collecting pushes"),
 ]
 
 

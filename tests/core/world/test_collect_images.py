@@ -1,11 +1,12 @@
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from osfcore.check import read_annotations
-from osfcore.errors import InvalidInput, MissingAssets, UnknownName
+from osfcore.errors import CannotWrite, InvalidInput, MissingAssets, UnknownName
 from osfcore.world.collect_images import CollectObject, CollectTable, collect_object, collect_table
 from osfcore.world.optics import TABLE_ALBEDO
 
@@ -103,6 +104,32 @@ def test_unknown_and_missing_objects_are_told(library, tmp_path):
         list(collect_object(CollectObject("teapot", tmp_path / "out"), library))
     with pytest.raises(MissingAssets):
         list(collect_object(CollectObject("024_bowl", tmp_path / "out"), library))
+
+
+def test_a_negative_seed_and_an_unwritable_place_are_told(tmp_path):
+    with pytest.raises(InvalidInput, match="seed"):
+        list(collect_table(CollectTable(tmp_path / "out", seed=-1)))
+    with pytest.raises(CannotWrite, match="/proc/sets"):
+        list(collect_table(CollectTable(Path("/proc/sets/table"))))
+
+
+def test_the_current_folder_will_do_if_it_is_empty(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    list(collect_table(CollectTable(Path("."), images=60, size=16)))
+    assert (tmp_path / "here" / "test" / "anno.json").exists()
+
+
+def test_two_collections_into_one_folder_do_not_destroy_each_other(tmp_path):
+    config = CollectTable(tmp_path / "table", images=60, size=16)
+    first, second = collect_table(config), collect_table(config)
+    next(first)
+    next(second)
+    list(first)
+    with pytest.raises(CannotWrite):
+        list(second)
+    assert len(read_annotations(tmp_path / "table", "test")) == 40
+    assert [path.name for path in tmp_path.iterdir()] == ["table"]
 
 
 def test_full_folder_is_left_alone_and_an_abandoned_set_leaves_nothing(library, tmp_path):

@@ -1,3 +1,4 @@
+import h5py
 import numpy as np
 import pytest
 
@@ -35,31 +36,50 @@ def test_episode_survives_its_file(tmp_path, frames):
 
 def test_combined_file_holds_all_episodes_in_order_and_the_folder_goes(tmp_path):
     out = tmp_path / "pushes.h5"
-    folder = EpisodeFolder(out, {"seed": 0})
-    for index in (2, 0, 1):
-        save_episode(folder.path(index), episode(index))
-    assert folder.finished() == {0, 1, 2}
-    folder.combine(3)
+    with EpisodeFolder(out, {"seed": 0}) as folder:
+        for index in (2, 0, 1):
+            save_episode(folder.path(index), episode(index))
+        assert folder.finished() == {0, 1, 2}
+        folder.combine(3)
     for index, stored in enumerate(read_pushes(out)):
         assert_same(stored, episode(index))
     assert list(tmp_path.iterdir()) == [out]
 
 
 def test_half_written_episodes_do_not_count(tmp_path):
-    folder = EpisodeFolder(tmp_path / "pushes.h5", {})
-    folder.path(0).with_suffix(".123.tmp").write_bytes(b"half")
-    assert EpisodeFolder(tmp_path / "pushes.h5", {}).finished() == frozenset()
+    with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
+        folder.path(0).with_suffix(".123.tmp").write_bytes(b"half")
+        save_episode(folder.path(1), episode(1))
+        folder.path(2).write_bytes(folder.path(1).read_bytes()[:200])  # cut short
+    with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
+        assert folder.finished() == {1}
     assert not list((tmp_path / "pushes.h5.partial").glob("*.tmp"))
 
 
+def test_two_collections_do_not_share_a_folder(tmp_path):
+    with (
+        EpisodeFolder(tmp_path / "pushes.h5", {}),
+        pytest.raises(InvalidInput, match="no other collection"),
+        EpisodeFolder(tmp_path / "pushes.h5", {}),
+    ):
+        pass
+    with EpisodeFolder(tmp_path / "pushes.h5", {}):
+        pass
+
+
 def test_folder_of_other_settings_is_refused(tmp_path):
-    EpisodeFolder(tmp_path / "pushes.h5", {"seed": 0})
-    with pytest.raises(InvalidInput, match="other settings"):
-        EpisodeFolder(tmp_path / "pushes.h5", {"seed": 1})
+    with EpisodeFolder(tmp_path / "pushes.h5", {"seed": 0}):
+        pass
+    with pytest.raises(InvalidInput, match="other settings"), EpisodeFolder(tmp_path / "pushes.h5", {"seed": 1}):
+        pass
 
 
 def test_what_is_no_push_file_is_told(tmp_path):
     path = tmp_path / "pushes.h5"
     path.write_bytes(b"not HDF5")
+    with pytest.raises(CorruptFile, match="not a push file"):
+        read_pushes(path)
+    with h5py.File(path, "w") as file:
+        file["positions"] = 3.0
     with pytest.raises(CorruptFile, match="not a push file"):
         read_pushes(path)
