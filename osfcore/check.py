@@ -10,10 +10,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.poses import Pose
-from osfcore.scene import Camera
+from osfcore.scene import MAX_IMAGE_SIDE, Camera
 from osfcore.scenefile import read_scene
 
 _OVERLAY_IMAGES = 8
@@ -56,6 +57,8 @@ def _check_pushes(path: Path) -> Report:
     from osfcore.world.push_file import read_pushes
 
     episodes = read_pushes(path)
+    if not episodes:
+        raise CorruptFile(path, "it holds no episodes")
     for number, episode in enumerate(episodes):
         steps, count = len(episode.actions), len(episode.names)
         shapes = {
@@ -67,6 +70,8 @@ def _check_pushes(path: Path) -> Report:
         }
         for name, shape in shapes.items():
             array = getattr(episode, name)
+            if array.dtype.kind not in "bfiu":
+                raise CorruptFile(path, f"{name} of episode {number} are not numbers")
             if array.shape != shape:
                 raise CorruptFile(path, f"{name} of episode {number} has shape {array.shape}, not {shape}")
             if not np.all(np.isfinite(array)):
@@ -120,7 +125,7 @@ def _annotated(path: Path, number: int, entry: Any) -> AnnotatedImage:  # noqa: 
         K = np.array(entry["K"], float).reshape(3, 3)
         light = np.array(entry["light_pos"], float).reshape(3)
         image = path.parent / str(entry["filename"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CorruptFile(path, f"{where} lacks or garbles one of filename, RT, K, light_pos") from error
     rotation = RT[:, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
@@ -128,18 +133,27 @@ def _annotated(path: Path, number: int, entry: Any) -> AnnotatedImage:  # noqa: 
     length = np.linalg.norm(light)
     if not np.isfinite(length) or length < 1e-9:
         raise CorruptFile(path, f"light_pos of {where} has no direction")
-    header = cv2.imread(str(image), cv2.IMREAD_UNCHANGED) if image.is_file() else None
-    if header is None:
-        raise CorruptFile(image, "there is no readable image")
-    if header.ndim != 3 or header.shape[2] != 4:
-        raise CorruptFile(image, "it has no transparency; images of this format are RGBA")
-    height, width = header.shape[:2]
+    width, height = _rgba_size(image)
     T_camera_world = Pose.from_matrix(np.vstack([RT, [0, 0, 0, 1]]))
     try:
         camera = Camera(image.stem, T_camera_world.inverse(), K, width, height)
     except InvalidInput as error:
         raise CorruptFile(path, str(error).rstrip(".")) from error
     return AnnotatedImage(image, camera, light / length)
+
+
+def _rgba_size(path: Path) -> tuple[int, int]:
+    """Width and height [px], read from the header before anything is decoded."""
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            if max(image.size) > MAX_IMAGE_SIDE:
+                raise CorruptFile(path, f"it is {image.width} x {image.height} px; at most {MAX_IMAGE_SIDE} are read")
+            if image.mode != "RGBA":
+                raise CorruptFile(path, "it has no transparency; images of this format are RGBA")
+            image.load()
+            return image.size
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CorruptFile(path, "there is no readable PNG") from error
 
 
 def draw_overlay(folder: Path, out: Path) -> None:

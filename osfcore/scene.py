@@ -44,7 +44,7 @@ def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "siz
     """
     try:
         vector = np.array(value, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InvalidInput(what, repr(value)[:80], f"{size} finite numbers") from None
     if vector.shape != (size,) or not np.all(np.isfinite(vector)):
         raise InvalidInput(what, repr(vector.tolist())[:80], f"{size} finite numbers")
@@ -85,8 +85,10 @@ class Camera:
         image_side(self.width, f"width of camera {self.name} [px]")
         image_side(self.height, f"height of camera {self.name} [px]")
         K = self.intrinsics
-        if K.shape != (3, 3) or not np.all(np.isfinite(K)) or K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise InvalidInput(f"K of camera {self.name}", K.tolist(), "a 3 x 3 matrix with positive focal lengths")
+        is_sane = K.shape == (3, 3) and np.all(np.isfinite(K)) and K[0, 0] > 0 and K[1, 1] > 0
+        if not is_sane or not np.array_equal(K[2], (0, 0, 1)):
+            allowed = "a 3 x 3 matrix with positive focal lengths and last row 0, 0, 1"
+            raise InvalidInput(f"K of camera {self.name}", K.tolist(), allowed)
 
     @staticmethod
     def look_at(

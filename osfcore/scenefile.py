@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -80,6 +80,8 @@ def scene_from_json(data: object) -> Scene:
             _entry(_mapping(root["pusher"], "pusher"), "position", "pusher"), 3, "pusher position [m]"
         )
     cameras = tuple(camera_from_json(c) for c in _sequence(root, "cameras")) if "cameras" in root else ()
+    if len({camera.name for camera in cameras}) != len(cameras):
+        raise InvalidInput("names of the cameras", [camera.name for camera in cameras], "all different")
     return Scene(SceneState(names, poses, light, pusher), cameras)
 
 
@@ -92,16 +94,26 @@ def camera_from_json(data: object) -> Camera:
     entry = _mapping(data, "camera")
     name = str(_entry(entry, "name", "camera"))
     pose = finite_vector(
-        np.ravel(_entry(entry, "T_world_camera", f"camera {name}")), 16, f"T_world_camera of camera {name}"
+        _flat(_entry(entry, "T_world_camera", f"camera {name}")), 16, f"T_world_camera of camera {name}"
     )
-    K = finite_vector(np.ravel(_entry(entry, "K", f"camera {name}")), 9, f"K of camera {name}")
+    K = finite_vector(_flat(_entry(entry, "K", f"camera {name}")), 9, f"K of camera {name}")
     rotation = pose.reshape(4, 4)[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+    is_rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    if not is_rigid or not np.allclose(pose[12:], (0, 0, 0, 1)):
         raise InvalidInput(f"T_world_camera of camera {name}", pose.tolist(), "a rotation and a translation, 4 x 4")
     sizes = [_entry(entry, key, f"camera {name}") for key in ("width", "height")]
     if not all(isinstance(size, int) for size in sizes):
         raise InvalidInput(f"size of camera {name} [px]", sizes, "two whole numbers")
     return Camera(name, Pose.from_matrix(pose.reshape(4, 4)), K.reshape(3, 3), *sizes)
+
+
+def _flat(rows: object) -> list[Any]:
+    """Numbers of nested lists in one list; what is not nested lists comes back as it is, for the check to refuse."""
+    return [entry for row in rows for entry in row] if _is_rows(rows) else [rows]
+
+
+def _is_rows(rows: object) -> TypeGuard[list[list[Any]]]:
+    return isinstance(rows, list) and all(isinstance(row, list) for row in rows)
 
 
 def read_scene(path: Path) -> Scene:
@@ -118,8 +130,12 @@ def read_scene(path: Path) -> Scene:
         raise CorruptFile(path, "it is not a text file") from error
     except json.JSONDecodeError as error:
         raise CorruptFile(path, f"it is not valid JSON (line {error.lineno}: {error.msg})") from error
+    except RecursionError as error:
+        raise CorruptFile(path, "it is nested too deeply") from error
     except OsfError as error:
         raise CorruptFile(path, str(error).rstrip(".")) from error
+    except ValueError as error:  # a number with thousands of digits
+        raise CorruptFile(path, f"it is not valid JSON ({error})") from error
 
 
 def _mapping(value: object, what: str) -> dict[str, Any]:

@@ -73,9 +73,10 @@ def test_public_sets_with_two_and_a_half_metre_cameras_are_read(tmp_path):
     [
         (lambda e: e.pop("light_pos"), "entry 3"),
         (lambda e: e.update(light_pos=[0, 0, 0]), "no direction"),
+        (lambda e: e.update(light_pos=[10**400, 0, 0]), "entry 3"),
         (lambda e: e.update(RT=np.zeros((3, 4)).tolist()), "rotation"),
         (lambda e: e.update(K=np.zeros((3, 3)).tolist()), "focal"),
-        (lambda e: e.update(filename="gone.png"), "no readable image"),
+        (lambda e: e.update(filename="gone.png"), "no readable PNG"),
     ],
 )
 def test_broken_sets_are_told_with_their_place(image_set, change, words):
@@ -119,6 +120,10 @@ def push_file(tmp_path, **changes):
 
 
 def test_push_files_are_checked(tmp_path):
+    with EpisodeFolder(tmp_path / "empty.h5", {}) as folder:
+        folder.combine(0)
+    with pytest.raises(CorruptFile, match="no episodes"):
+        check_path(tmp_path / "empty.h5")
     assert check_path(push_file(tmp_path)).facts == {"episodes": 1, "steps": 2}
     with pytest.raises(CorruptFile, match="not finite"):
         check_path(push_file(tmp_path, pusher=np.full((3, 3), np.nan)))

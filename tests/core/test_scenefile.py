@@ -50,6 +50,11 @@ def test_pusher_and_cameras_may_be_missing():
         (("light",), None, "light"),
         (("pusher",), [0, 0, 0], "pusher"),
         (("cameras", 0, "K"), [[1, 0, 0]], "K of camera 0"),
+        (("cameras", 0, "K"), [[100, 0, 64], [0, 100, 64], [0, 0, 0]], "last row"),
+        (("cameras", 0, "T_world_camera"), [[1, 0], [0]], "T_world_camera of camera 0"),
+        (("cameras", 0, "T_world_camera"), [*np.eye(4)[:3].tolist(), [5, 5, 5, 5]], "rotation"),
+        (("cameras", 1, "name"), "0", "all different"),
+        (("objects", 0, "position"), [10**400, 0, 0], "006_mustard_bottle"),
         (("cameras", 0, "width"), 1.5, "camera 0"),
         (("cameras", 0, "width"), 5000, "between 16 and 1024"),
         (("cameras", 0, "T_world_camera"), (2 * np.eye(4)).tolist(), "rotation"),
@@ -71,7 +76,15 @@ def test_mistakes_are_told_with_their_place(tmp_path, path, value, words):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [(b"\xff\xfe\x00", "text"), (b'{"objects": [', "JSON"), (b"[]", "object"), (b"NaN", "object")]
+    ("content", "words"),
+    [
+        (b"\xff\xfe\x00", "text"),
+        (b'{"objects": [', "JSON"),
+        (b"[]", "object"),
+        (b"NaN", "object"),
+        (b"1" * 5000, "JSON"),
+        (b"[" * 100_000, "deep"),
+    ],
 )
 def test_other_files_are_told_from_scenes(tmp_path, content, words):
     file = tmp_path / "scene.json"
