@@ -98,7 +98,7 @@ async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, RequestValidationError)
-    pointers = [_pointer(entry) for entry in error.errors()]
+    pointers = [_pointer(entry, error.body) for entry in error.errors()]
     first = pointers[0] if pointers else ProblemPointer(pointer="#", detail="unreadable")
     more = f" (and {len(pointers) - 1} more)" if len(pointers) > 1 else ""
     return problem(422, f"{first.pointer or first.parameter}: {first.detail}{more}", pointers)
@@ -109,11 +109,13 @@ async def _on_defect(request: Request, error: Exception) -> ProblemResponse:
     return problem(500, f"The service failed on this request ({type(error).__name__}); its log tells more.")
 
 
-def _pointer(entry: dict[str, Any]) -> ProblemPointer:
+def _pointer(entry: dict[str, Any], body: object) -> ProblemPointer:
     """Where and what; the input itself is left out, for it may be NaN, huge or secret."""
     where, *path = [str(part) for part in entry["loc"]] or ["body"]
     detail = str(entry["msg"]).encode("utf-8", "replace").decode("utf-8")
     if where == "body":
+        if path and isinstance(body, dict) and path[0] not in body and path[0] == body.get("kind"):
+            path = path[1:]  # the name of the chosen variant, which is no place in the body
         escaped = (part.replace("~", "~0").replace("/", "~1") for part in path)
         return ProblemPointer(pointer="#" + "".join(f"/{part}" for part in escaped), detail=detail)
     return ProblemPointer(parameter="/".join(path), detail=detail)

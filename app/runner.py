@@ -36,7 +36,7 @@ from app.messages import (
     WatchFrames,
 )
 from app.settings import Settings
-from app.stage_link import StageLink, StageUnavailable, Status
+from app.stage_link import StageLink, Status
 from app.store import Store, now_utc
 from osfcore.errors import InvalidInput, MissingAssets, OsfError, UnknownName
 from osfcore.objects.library import AssetLibrary
@@ -46,6 +46,9 @@ from osfcore.scene import DEFAULT_IMAGE_SIDE, MAX_OBJECTS, Light, check_action, 
 DEMO_OBJECTS = 3
 MAX_SEED = 2**31 - 1
 _log = logging.getLogger(__name__)
+
+
+ImageKey = tuple[int, TakeImage | TakeMask]  # revision of the scene, and what is asked for
 
 
 class SceneHeld(OsfError):
@@ -87,6 +90,8 @@ class Runner:
         self._current: str | None = None
         self._watchers = 0
         self._images = _ImageCache(settings.image_cache_bytes)
+        self._images_in_the_making: dict[ImageKey, asyncio.Future[bytes]] = {}
+        self._scenes_in_the_making = 0
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
 
@@ -163,8 +168,9 @@ class Runner:
             names = posed
         self._check_names(names)
         with self._lock:
-            if len(self._records) >= self._settings.max_scenes:
+            if len(self._records) + self._scenes_in_the_making >= self._settings.max_scenes:
                 raise TooManyScenes(self._settings.max_scenes)
+            self._scenes_in_the_making += 1
         command = CreateScene(
             id=uuid.uuid4().hex[:12],
             seed=secrets.randbelow(MAX_SEED) if seed is None else seed,
@@ -175,10 +181,14 @@ class Runner:
             light=light,
             poses=None if poses is None else _stacked([pose for _, pose in poses]),
         )
-        record: SceneRecord = self._stage.call(command)
-        with self._lock:
-            self._records[record.id] = record
-            self._store.save_scene(record)
+        try:
+            record: SceneRecord = self._stage.call(command)
+            with self._lock:
+                self._store.save_scene(record)
+                self._records[record.id] = record
+        finally:
+            with self._lock:
+                self._scenes_in_the_making -= 1
         self.activate(record.id)
         return record
 
@@ -192,8 +202,8 @@ class Runner:
         self._check_free(scene)
         with self._lock:
             self.scene(scene)
-            del self._records[scene]
             self._store.delete_scene(scene)
+            del self._records[scene]
             self._stage.submit(DropScene(scene))
             was_current = self._current == scene
             if was_current:
@@ -262,17 +272,27 @@ class Runner:
         image_side(command.size)
         key = (self.scene(command.id).revision, command)
         found = self._images.get(key)
-        if found is None:
-            answer = asyncio.wrap_future(await asyncio.to_thread(self._stage.submit, command))
-            try:
-                found = await asyncio.wait_for(answer, self._settings.stage_timeout_s)
-            except TimeoutError:
-                self._stage.kill()
-                raise StageUnavailable(f"did not answer within {self._settings.stage_timeout_s:g} s") from None
-            # After a change in between, what was made shows the later state, so it is not kept.
-            if key[0] == self.scene(command.id).revision:
-                self._images.put(key, found)
-        return found
+        if found is not None:
+            return found
+        making = self._images_in_the_making.get(key)
+        if making is None:
+            making = asyncio.ensure_future(self._make_image(key))
+            self._images_in_the_making[key] = making
+            making.add_done_callback(lambda done: self._image_made(key, done))
+        return await asyncio.shield(making)  # whoever asked first may leave, others still wait
+
+    async def _make_image(self, key: ImageKey) -> bytes:
+        revision, command = key
+        image = await self._stage.call_async(command)
+        # After a change in between, what was made shows the later state, so it is not kept.
+        if revision == self.scene(command.id).revision:
+            self._images.put(key, image)
+        return image
+
+    def _image_made(self, key: ImageKey, done: asyncio.Future[bytes]) -> None:
+        del self._images_in_the_making[key]
+        if not done.cancelled():
+            done.exception()  # taken note of, in case that everybody has left
 
     def watch_frames(self, change: int) -> None:
         """Tell that `change` more (or less, if negative) listeners look at live images."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
@@ -31,6 +33,7 @@ from osfcore.errors import OsfError
 
 Status = Literal["starting", "ready", "restarting"]
 MAX_PENDING = 64
+_LOOK_S = 1.0  # how often a waiting caller looks whether the stage still answers anybody
 _LEAVE_GRACE_S = 1.0
 _RESTART_PAUSES_S = (0.0, 1.0, 5.0, 30.0)  # longer and longer while it keeps dying without answering anything
 _log = logging.getLogger(__name__)
@@ -97,6 +100,7 @@ class StageLink:
         self._connection: Connection | None = None
         self._stopping = threading.Event()
         self._deaths = 0
+        self._answered_at = time.monotonic()
         self._thread: threading.Thread | None = None
         self.status: Status = "starting"
 
@@ -149,11 +153,28 @@ class StageLink:
             StageError: if the stage refused it.
             StageUnavailable: if the stage died or took too long.
         """
-        try:
-            return self.submit(command).result(self._timeout_s)
-        except FutureTimeoutError:
+        future, asked = self.submit(command), time.monotonic()
+        while True:
+            try:
+                return future.result(min(_LOOK_S, self._timeout_s))
+            except FutureTimeoutError:
+                self._refuse_to_wait_longer(asked)
+
+    async def call_async(self, command: Command) -> Any:  # noqa: ANN401
+        """The same without blocking the event loop."""
+        future, asked = await asyncio.to_thread(self.submit, command), time.monotonic()
+        answer = asyncio.wrap_future(future)
+        while not answer.done():
+            await asyncio.wait({answer}, timeout=min(_LOOK_S, self._timeout_s))
+            if not answer.done():
+                self._refuse_to_wait_longer(asked)
+        return answer.result()
+
+    def _refuse_to_wait_longer(self, asked: float) -> None:
+        """End the stage if it has not answered anybody for too long; waiting behind others is no sign of that."""
+        if time.monotonic() - max(asked, self._answered_at) > self._timeout_s:
             self.kill()
-            raise StageUnavailable(f"did not answer within {self._timeout_s:g} s") from None
+            raise StageUnavailable(f"did not answer within {self._timeout_s:g} s")
 
     def kill(self) -> None:
         """End a stage that hangs; it is restarted."""
@@ -199,9 +220,11 @@ class StageLink:
             case StageReady():
                 self.status = "ready"
             case Reply(number, value):
+                self._answered_at = time.monotonic()
                 self._deaths = 0
                 self._settle(number, lambda future: future.set_result(value))
             case Failure(number, kind, text):
+                self._answered_at = time.monotonic()
                 self._settle(number, lambda future: future.set_exception(StageError(kind, text)))
             case SceneChanged() | FramesTaken():
                 self._on_event(message)

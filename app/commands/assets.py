@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ import tyro
 from app.commands.progress_bar import follow
 from app.commands.workers import worker_pool
 from app.paths import default_data_dir
+from osfcore.errors import OsfError
 
 if TYPE_CHECKING:
     from osfcore.objects.library import AssetLibrary
@@ -31,7 +33,12 @@ class AssetsList:
 
         library = _library(self.data_dir)
         names = sorted({*CATALOGUE, *library.names()})
-        rows = [_row(library, name) for name in names]
+        rows = []
+        for name in names:
+            try:
+                rows.append(_row(library, name))
+            except OsfError as error:  # a damaged object must not hide the others
+                print(f"osf: {error}", file=sys.stderr)
         if not self.json:
             _show(rows)
         return {"objects": rows, "data_dir": str(self.data_dir)}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.paths import default_data_dir
-from osfcore.errors import OsfError
+from osfcore.errors import InvalidInput, OsfError
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -87,11 +87,18 @@ def bound_socket(host: str, port: int) -> socket.socket:
 def _server(serve: Serve, url: str) -> uvicorn.Server:
     """A server that tells its address once it is ready, and ends event streams before it waits for them."""
     import uvicorn
+    from pydantic import ValidationError
 
     from app.main import create_app
     from app.settings import Settings
 
-    app = create_app(Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir))
+    try:
+        settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "OSF_" + "_".join(str(part) for part in first["loc"]).upper()
+        raise InvalidInput(name, repr(first["input"])[:60], f"valid ({first['msg']})") from None
+    app = create_app(settings)
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:

@@ -1,5 +1,6 @@
 """Which objects there are."""
 
+import contextlib
 from typing import Annotated
 
 from fastapi import APIRouter, Path
@@ -18,7 +19,11 @@ router = APIRouter(prefix="/api/objects", tags=["objects"], responses=problems()
 def list_all(services: ServicesDep) -> ObjectList:
     """List the objects of the catalogue and those that were added."""
     names = dict.fromkeys((*CATALOGUE, *services.shelf.names()))
-    return ObjectList(objects=[_object(services, name) for name in names])
+    listed = []
+    for name in names:
+        with contextlib.suppress(OsfError):  # a damaged object of the user's must not hide the others
+            listed.append(_object(services, name))
+    return ObjectList(objects=listed)
 
 
 @router.get("/{name}", responses=problems(404))

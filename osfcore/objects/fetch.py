@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, UnknownName, WorkerDied
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, Symmetry, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.download import temporary_folder, told_as_fetch_failed
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from osfcore.objects.sources import MeshFiles, Source
 
 MAX_MASS_KG = 20.0
+MAX_TEXT = 200  # characters of a label or licence
 
 
 def fetch(
@@ -96,13 +98,20 @@ def _converted(
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
                 label = running.pop(future)
-                future.result()
+                _result(future)
                 done += 1
                 yield Progress(done, total, f"Converted {label} ({done - 1} of {objects})")
     finally:
         for future in running:
             future.cancel()
         wait(running)  # those that run already would lose their input with the folder
+
+
+def _result(future: Future[None]) -> None:
+    try:
+        future.result()
+    except BrokenProcessPool as error:
+        raise WorkerDied("converting objects") from error
 
 
 def convert(files: MeshFiles, info: ObjectInfo, library: AssetLibrary, source: str) -> None:
@@ -168,6 +177,9 @@ def add_object(
         raise InvalidInput("mass [kg]", mass_kg, f"above 0 and at most {MAX_MASS_KG:g}")
     if not (math.isfinite(scale) and scale > 0):
         raise InvalidInput("scale", scale, "above 0")
+    for what, text in (("label", label), ("licence", licence)):
+        if not text.isprintable() or len(text) > MAX_TEXT:  # unprintable: surrogates of broken encodings too
+            raise InvalidInput(what, ascii(text)[:40], f"printable text of at most {MAX_TEXT} characters")
     from osfcore.objects.mesh import read_mesh
 
     mesh = read_mesh(Path(mesh_path), scale)

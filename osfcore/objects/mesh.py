@@ -18,7 +18,7 @@ from osfcore.objects.texture import clean_texture
 
 MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0
 MAX_FACES = 200_000
-MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae")
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
 _Y_UP_SUFFIXES = (".glb", ".gltf")
 _CREASE_RAD = np.deg2rad(50.0)  # edges sharper than this stay sharp: a box must not shade like a pillow
 _MIN_THICKNESS = 1e-3  # of the longest side; thinner is a sheet, which no solver can rest on a table

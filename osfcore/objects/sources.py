@@ -204,8 +204,12 @@ class UrlSource:
     def __init__(self, base: str, cache: Path) -> None:
         from urllib.parse import urlsplit
 
-        parts = urlsplit(base)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        try:
+            parts = urlsplit(base)
+            is_address = parts.scheme in ("http", "https") and bool(parts.hostname) and base.isascii()
+        except ValueError:  # half an IPv6 address
+            is_address = False
+        if not is_address:
             raise InvalidInput("source", repr(base), "an address that starts with http:// or https://")
         self._base = base.rstrip("/")
         self._cache = Path(cache) / "archives" / hashlib.sha256(self._base.encode()).hexdigest()[:16]
@@ -227,7 +231,11 @@ class UrlSource:
         """The mesh of one object, from its archive or from single files, whichever the server has."""
         archive = self._archive(name)
         if archive is not None:
-            unpack(archive, folder)
+            try:
+                unpack(archive, folder)
+            except CorruptFile:
+                archive.unlink(missing_ok=True)  # the next try asks the server again
+                raise
             found = next((p for lay in _LAYOUTS if (p := folder / lay.format(name=name)).is_file()), None)
             if found is None:
                 archive.unlink(missing_ok=True)
