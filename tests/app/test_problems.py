@@ -73,5 +73,8 @@ def test_pointers_name_what_is_wrong(service):
     body = {"count": 99, "poses": [{"name": "x", "position": [0, 0], "quaternion": [1, 0, 0, 0]}]}
     errors = is_problem(service.post("/api/scenes", json=body), 422)["errors"]
     assert [error["pointer"] for error in errors] == ["#/count", "#/poses/0/position"]
+    job = {"kind": "collect_table", "params": {"seed": -1}}
+    errors = is_problem(service.post("/api/jobs", json=job), 422)["errors"]
+    assert [error["pointer"] for error in errors] == ["#/params/seed"]
     wrong = is_problem(service.get("/api/scenes/x/images/0.png?size=7"), 422)["errors"]
     assert wrong[0]["parameter"] == "size"

@@ -2,6 +2,8 @@ import asyncio
 import os
 import shutil
 import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -97,6 +99,49 @@ def test_scenes_have_a_limit(open_runner):
     runner.create_scene(names=(BOX,))
     with pytest.raises(TooManyScenes, match="1 scenes"):
         runner.create_scene(names=(BOX,))
+
+
+def test_the_limit_holds_for_scenes_made_at_the_same_time(open_runner):
+    runner = open_runner(demo_scene=False, max_scenes=2)
+
+    def make(_):
+        try:
+            return runner.create_scene(names=(BOX,))
+        except TooManyScenes:
+            return None
+
+    with ThreadPoolExecutor(8) as executor:
+        made = [record for record in executor.map(make, range(8)) if record is not None]
+    assert len(made) == len(runner.scenes()) == 2
+
+
+def test_a_busy_stage_is_not_taken_for_a_hanging_one(open_runner):
+    """Each answer comes in time, the last one long after the limit for one answer."""
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    single = time.monotonic()
+    asyncio.run(runner.image(TakeImage(scene.id, "0", 700)))
+    single = time.monotonic() - single
+    runner._stage._timeout_s = max(3 * single, 0.5)
+    pid = runner._stage._process.pid
+
+    async def many():
+        return await asyncio.gather(*(runner.image(TakeImage(scene.id, "1", 700 + k)) for k in range(16)))
+
+    images = asyncio.run(many())
+    assert len({*images}) == 16
+    assert runner._stage._process.pid == pid
+
+
+def test_an_image_that_many_ask_for_at_once_is_made_once(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+
+    async def many():
+        return await asyncio.gather(*(runner.image(TakeImage(scene.id, "2", 256)) for _ in range(10)))
+
+    first, *others = asyncio.run(many())
+    assert all(other is first for other in others)
 
 
 def test_changes_are_told_and_refusals_are_not(open_runner):

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from app.commands.serve import CannotListen, bound_socket
+from app.commands.serve import CannotListen, Serve, bound_socket
 from app.store import FILE
+from osfcore.errors import InvalidInput
 from tests.app.conftest import until
 from tests.app.test_processes import is_running
 
@@ -117,6 +118,12 @@ def test_a_damaged_database_stops_it_in_one_sentence(serve, data_dir):
     assert out == ""
     assert err.splitlines()[-1].startswith("osfcore.errors.CorruptFile")
     assert "damaged" in err
+
+
+def test_a_senseless_setting_is_told(data_dir, monkeypatch):
+    monkeypatch.setenv("OSF_MAX_SCENES", "many")
+    with pytest.raises(InvalidInput, match="OSF_MAX_SCENES is 'many'"):
+        Serve(port=0, data_dir=data_dir).run()
 
 
 def test_a_port_in_use_is_told():

@@ -1,3 +1,5 @@
+import shutil
+
 import numpy as np
 
 from osfcore.objects.catalogue import CATALOGUE
@@ -16,6 +18,17 @@ def test_one_object_has_its_size(service, library):
     assert np.allclose(found["size_m"], library.size_m("006_mustard_bottle"))
     assert found["mass_kg"] == CATALOGUE["006_mustard_bottle"].mass_kg
     assert found["licence"] == "CC-BY-4.0"
+
+
+def test_a_damaged_object_does_not_hide_the_others(service, services, library):
+    damaged = services.runner.library.root / "zz"
+    damaged.mkdir()
+    (damaged / "object.json").write_text('{"format_version": 1}')
+    try:
+        listed = {o["name"] for o in service.get("/api/objects").json()["objects"]}
+    finally:
+        shutil.rmtree(damaged)
+    assert listed >= set(library.names())
 
 
 def test_unknown_objects_are_not_found(service):

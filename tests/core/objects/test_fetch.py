@@ -157,6 +157,14 @@ def test_absurd_masses_are_refused(glb, shelf, mass):
         add_object(glb, "ball", mass, shelf)
 
 
+@pytest.mark.parametrize("text", ["\udcff", "two\nlines", "x" * 300])
+def test_labels_that_cannot_be_shown_are_refused(glb, shelf, text):
+    with pytest.raises(InvalidInput, match="label"):
+        add_object(glb, "mine", 0.2, shelf, label=text)
+    with pytest.raises(InvalidInput, match="licence"):
+        add_object(glb, "mine", 0.2, shelf, licence=text)
+
+
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), 1e9])
 def test_absurd_scales_are_refused(glb, shelf, scale):
     with pytest.raises(InvalidInput, match=r"scale|size"):

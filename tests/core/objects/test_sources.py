@@ -107,6 +107,23 @@ def test_an_archive_without_the_object_is_told_and_not_kept(served, tmp_path, ma
     assert not list((tmp_path / "cache").rglob("*.tgz"))
 
 
+def test_a_damaged_archive_is_asked_for_again(served, tmp_path, make_object):
+    root, address, _ = served
+    (root / f"{NAME}_google_16k.tgz").write_bytes(b"<html>not an archive</html>")
+    source = UrlSource(address, tmp_path / "cache")
+    with pytest.raises(CorruptFile):
+        source.files(NAME, tmp_path / "out")
+    make_object(tmp_path / "ycb", NAME)
+    pack(tmp_path / "ycb", NAME, root / f"{NAME}_google_16k.tgz")
+    assert source.files(NAME, tmp_path / "again").mesh.is_file()
+
+
+@pytest.mark.parametrize("address", ["http://[::1", "http://127.0.0.1:9/\N{SNOWMAN}/", "ftp://example", "http://"])
+def test_addresses_that_are_none_are_refused(tmp_path, address):
+    with pytest.raises(InvalidInput, match="source"):
+        UrlSource(address, tmp_path)
+
+
 def test_a_wheel_with_another_checksum_is_refused(tmp_path):
     downloaded = tmp_path / WheelSource.FILE
     downloaded.write_bytes(b"not the wheel")
