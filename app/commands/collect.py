@@ -101,7 +101,7 @@ class CollectPushesCommand:
             self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images, self.renderer
         )
         with worker_pool(self.workers) as executor:
-            last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor))
+            last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, self.workers + 2))
         result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}
         if last is not None:
             result |= {

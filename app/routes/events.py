@@ -66,9 +66,11 @@ async def stream(
     """Follow what happens: "job", "scene", "frame" and "notice" events."""
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
-    if frames:
-        await run_in_threadpool(services.runner.watch_frames, 1)
+    is_watching = False
     try:
+        if frames:
+            is_watching = True  # before the call: a page that leaves during it must be counted out again
+            await run_in_threadpool(services.runner.watch_frames, 1)
         yield ServerSentEvent(comment="connected", retry=1000)
         last = 0
         if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
@@ -80,7 +82,7 @@ async def stream(
             yield event
     finally:
         leave()
-        if frames:
+        if is_watching:
             services.runner.watch_frames(-1)
 
 

@@ -23,7 +23,6 @@ from osfcore.world.tabletop import Renderer, SceneRequest, Tabletop
 MOVED_M = 1e-3
 MOVED_RAD = np.deg2rad(0.5)
 _MAX_EPISODES, _MAX_STEPS = 1_000_000, 1000
-_QUEUE = 8  # episodes handed out beyond those finished: few, so that cancelling is quick
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +72,19 @@ class CollectStep:
 
 
 def collect_pushes(
-    config: CollectPushes, library: AssetLibrary, executor: Executor | None = None
+    config: CollectPushes, library: AssetLibrary, executor: Executor | None = None, in_flight: int = 8
 ) -> Iterator[CollectStep]:
     """Collect episodes; what was finished before a kill is kept and neither lost nor repeated.
 
     The content depends on the settings, not on the executor. An abandoned generator leaves its finished episodes in
     `OUT.partial`, from which the next run goes on.
+
+    Args:
+        config: what to collect.
+        library: the objects.
+        executor: simulates episodes side by side, if given; processes serve.
+        in_flight: episodes handed to the executor at once: more than it has workers, but few, so that cancelling is
+            quick.
 
     Raises:
         InvalidInput: if a number is out of range, the file exists, or the partial folder has other settings.
@@ -98,7 +104,7 @@ def collect_pushes(
     try:
         config.out.parent.mkdir(parents=True, exist_ok=True)
         with EpisodeFolder(config.out, settings) as folder:
-            yield from _collect(config, library.root, folder, executor)
+            yield from _collect(config, library.root, folder, executor, in_flight)
     except BrokenProcessPool as error:
         raise WorkerDied("collecting pushes") from error
     except OSError as error:
@@ -106,7 +112,7 @@ def collect_pushes(
 
 
 def _collect(
-    config: CollectPushes, root: Path, folder: EpisodeFolder, executor: Executor | None
+    config: CollectPushes, root: Path, folder: EpisodeFolder, executor: Executor | None, in_flight: int
 ) -> Iterator[CollectStep]:
     """Count what is there, run what is missing, put everything into one file."""
     tally = _Tally(config)
@@ -115,7 +121,7 @@ def _collect(
         tally.add(load_episode(folder.path(index)))
     yield tally.step()
     missing = (i for i in range(config.episodes) if i not in done)
-    for episode in _episodes(config, root, folder, missing, executor):
+    for episode in _episodes(config, root, folder, missing, executor, in_flight):
         tally.add(episode, is_new=True)
         yield tally.step()
     folder.combine(config.episodes)
@@ -161,7 +167,12 @@ class _Tally:
 
 
 def _episodes(
-    config: CollectPushes, root: Path, folder: EpisodeFolder, missing: Iterator[int], executor: Executor | None
+    config: CollectPushes,
+    root: Path,
+    folder: EpisodeFolder,
+    missing: Iterator[int],
+    executor: Executor | None,
+    in_flight: int,
 ) -> Iterator[PushEpisode]:
     """Run the missing episodes, here or in the executor, a few at a time."""
     if executor is None:
@@ -173,7 +184,7 @@ def _episodes(
         while True:
             for index in missing:
                 running.add(executor.submit(_run_episode, config, root, index, folder.path(index)))
-                if len(running) >= _QUEUE:
+                if len(running) >= in_flight:
                     break
             if not running:
                 return
