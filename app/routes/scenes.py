@@ -9,7 +9,7 @@ from app.problems import NotFound
 from app.routes import problems
 from app.schemas import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
 from app.services import Services, ServicesDep
-from osfcore.errors import UnknownName
+from osfcore.errors import OsfError, UnknownName
 from osfcore.scene import CAMERA_POSITIONS
 
 router = APIRouter(prefix="/api/scenes", tags=["scenes"], responses=problems(503, 507))
@@ -101,8 +101,7 @@ async def image(
 ) -> Response:
     """Take an image with one camera."""
     record = _view(services, scene, camera)
-    png = await services.runner.image(TakeImage(scene, camera, size or record.image_size, masks, pusher))
-    return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
+    return await _png(services, TakeImage(scene, camera, size or record.image_size, masks, pusher))
 
 
 @router.get("/{scene}/masks/{camera}/{name}.png", response_class=Response, responses={**problems(404), **_PNG})
@@ -117,7 +116,15 @@ async def mask(
     record = _view(services, scene, camera)
     if name not in record.state.names:
         raise NotFound(str(UnknownName("object on the table", name, record.state.names)))
-    png = await services.runner.image(TakeMask(scene, camera, name, size or record.image_size))
+    return await _png(services, TakeMask(scene, camera, name, size or record.image_size))
+
+
+async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
+    try:
+        png = await services.runner.image(command)
+    except OsfError:
+        _found(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the stage says of it
+        raise
     return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.stage_link import StageError
 from osfcore.scene import STEP_S
 from tests.app.test_problems import is_problem
 
@@ -182,3 +183,12 @@ def test_masks_are_binary_disjoint_and_drawn(service, scene):
 @pytest.mark.parametrize(("method", "tail"), [("get", ""), ("delete", ""), ("post", "/reset"), ("post", "/activate")])
 def test_missing_scenes_are_not_found(service, method, tail):
     is_problem(getattr(service, method)(f"/api/scenes/none{tail}"), 404)
+
+
+def test_an_image_of_a_scene_deleted_meanwhile_is_not_found(service, services, scene, monkeypatch):
+    async def gone(command):
+        services.runner.delete_scene(command.id)
+        raise StageError("UnknownName", "There is no scene.")
+
+    monkeypatch.setattr(services.runner, "image", gone)
+    is_problem(service.get(f"/api/scenes/{scene['id']}/images/0.png"), 404)
