@@ -60,6 +60,8 @@ def _check_pushes(path: Path) -> Report:
     if not episodes:
         raise CorruptFile(path, "it holds no episodes")
     for number, episode in enumerate(episodes):
+        if episode.actions.ndim != 2:
+            raise CorruptFile(path, f"actions of episode {number} have shape {episode.actions.shape}, not (T, 3)")
         steps, count = len(episode.actions), len(episode.names)
         shapes = {
             "positions": (steps + 1, count, 3),
@@ -111,7 +113,7 @@ def read_annotations(folder: Path, split: str) -> tuple[AnnotatedImage, ...]:
         entries = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise CorruptFile(folder, f"it has no readable {split}/anno.json") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CorruptFile(path, "it is not valid JSON") from error
     if not isinstance(entries, list) or not entries:
         raise CorruptFile(path, "it is not a list of images")

@@ -98,20 +98,15 @@ def _converted(
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
                 label = running.pop(future)
-                _result(future)
+                future.result()
                 done += 1
                 yield Progress(done, total, f"Converted {label} ({done - 1} of {objects})")
+    except BrokenProcessPool as error:  # when a result is taken, or already when the next object is handed over
+        raise WorkerDied("converting objects") from error
     finally:
         for future in running:
             future.cancel()
         wait(running)  # those that run already would lose their input with the folder
-
-
-def _result(future: Future[None]) -> None:
-    try:
-        future.result()
-    except BrokenProcessPool as error:
-        raise WorkerDied("converting objects") from error
 
 
 def convert(files: MeshFiles, info: ObjectInfo, library: AssetLibrary, source: str) -> None:

@@ -85,6 +85,12 @@ def test_broken_sets_are_told_with_their_place(image_set, change, words):
         check_path(image_set)
 
 
+def test_annotations_nested_too_deeply_are_refused(image_set):
+    (image_set / "train" / "anno.json").write_text("[" * 100_000)
+    with pytest.raises(CorruptFile, match="not valid JSON"):
+        check_path(image_set)
+
+
 def test_images_without_transparency_are_refused(image_set):
     cv2.imwrite(str(image_set / "test" / "0000.png"), np.zeros((16, 16, 3), np.uint8))
     with pytest.raises(CorruptFile, match="RGBA"):
@@ -127,5 +133,7 @@ def test_push_files_are_checked(tmp_path):
     assert check_path(push_file(tmp_path)).facts == {"episodes": 1, "steps": 2}
     with pytest.raises(CorruptFile, match="not finite"):
         check_path(push_file(tmp_path, pusher=np.full((3, 3), np.nan)))
+    with pytest.raises(CorruptFile, match="actions of episode 0 have shape"):
+        check_path(push_file(tmp_path, actions=np.zeros(3)))
     with pytest.raises(CorruptFile, match="shape"):
         check_path(push_file(tmp_path, actions=np.zeros((4, 3))))
