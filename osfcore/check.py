@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import contextlib
+import tempfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.poses import Pose
-from osfcore.scene import MAX_IMAGE_SIDE, Camera
+from osfcore.fields.hull import carve, silhouette_box
+from osfcore.fields.image_set import read_image_set, read_splits
+from osfcore.fields.overlay import overlay_sheet
+from osfcore.fields.set_archive import unpack_set
 from osfcore.scenefile import read_scene
-
-_OVERLAY_IMAGES = 8
-_OVERLAY_SIDE = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +41,16 @@ def check_path(path: Path) -> Report:
     Raises:
         CorruptFile: if it is of no known kind or broken; the message says where.
     """
-    if path.is_dir():
-        return _check_image_set(path)
+    if path.is_dir() or path.suffix.lower() == ".zip":
+        with _unpacked(path) as folder:
+            return _check_image_set(folder)
     if path.suffix.lower() == ".json":
         scene = read_scene(path)
         counts = {"objects": len(scene.state.names), "cameras": len(scene.cameras)}
         return Report("scene", f"{counts['objects']} objects, {counts['cameras']} cameras", counts)
     if path.suffix.lower() in (".h5", ".hdf5"):
         return _check_pushes(path)
-    raise CorruptFile(path, "it is neither a .json scene, a .h5 push file nor an image set folder")
+    raise CorruptFile(path, "it is neither a .json scene, a .h5 push file nor the folder or .zip of an image set")
 
 
 def _check_pushes(path: Path) -> Report:
@@ -83,112 +83,53 @@ def _check_pushes(path: Path) -> Report:
 
 
 def _check_image_set(folder: Path) -> Report:
-    counts = {split: len(read_annotations(folder, split)) for split in ("train", "test")}
-    return Report("image set", f"{counts['train']} train and {counts['test']} test images", counts)
+    train, test = read_splits(folder)
+    facts = {"train": len(train.cameras), "test": len(test.cameras)}
+    what = "the bare table"
+    if not train.is_opaque:
+        box = silhouette_box(train, test, where=folder)
+        what = "an object of " + " x ".join(f"{side:.3g}" for side in box[1] - box[0])
+    return Report("image set", f"{facts['train']} train and {facts['test']} test images of {what}", facts)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class AnnotatedImage:
-    """One image of an OSF-format set.
-
-    Attributes:
-        path: of the PNG.
-        camera: its view.
-        light_direction: unit vector toward the light; sets whose lights have another length are normalised.
-    """
-
-    path: Path
-    camera: Camera
-    light_direction: np.ndarray
-
-
-def read_annotations(folder: Path, split: str) -> tuple[AnnotatedImage, ...]:
-    """The images of one split of an OSF-format set.
-
-    Raises:
-        CorruptFile: if anno.json is missing or wrong, or an image is missing or of another size.
-    """
-    path = folder / split / "anno.json"
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CorruptFile(folder, f"it has no readable {split}/anno.json") from error
-    except (ValueError, RecursionError) as error:
-        raise CorruptFile(path, "it is not valid JSON") from error
-    if not isinstance(entries, list) or not entries:
-        raise CorruptFile(path, "it is not a list of images")
-    return tuple(_annotated(path, number, entry) for number, entry in enumerate(entries))
+@contextlib.contextmanager
+def _unpacked(path: Path) -> Iterator[Path]:
+    """The folder of an image set, or of a zipped one for as long as it is looked at."""
+    if path.suffix.lower() != ".zip":
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="osf-check-") as place:
+        try:
+            yield unpack_set(path, Path(place) / path.stem)
+        except CorruptFile as error:
+            if str(error).startswith(str(path)):
+                raise
+            inside = str(error).replace(f"{place}/", "").rstrip(".")
+            raise CorruptFile(path, inside) from error
 
 
-def _annotated(path: Path, number: int, entry: Any) -> AnnotatedImage:  # noqa: ANN401
-    where = f"entry {number}"
-    try:
-        RT = np.array(entry["RT"], float).reshape(3, 4)
-        K = np.array(entry["K"], float).reshape(3, 3)
-        light = np.array(entry["light_pos"], float).reshape(3)
-        image = path.parent / str(entry["filename"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise CorruptFile(path, f"{where} lacks or garbles one of filename, RT, K, light_pos") from error
-    rotation = RT[:, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise CorruptFile(path, f"RT of {where} does not start with a rotation")
-    length = np.linalg.norm(light)
-    if not np.isfinite(length) or length < 1e-9:
-        raise CorruptFile(path, f"light_pos of {where} has no direction")
-    width, height = _rgba_size(image)
-    T_camera_world = Pose.from_matrix(np.vstack([RT, [0, 0, 0, 1]]))
-    try:
-        camera = Camera(image.stem, T_camera_world.inverse(), K, width, height)
-    except InvalidInput as error:
-        raise CorruptFile(path, str(error).rstrip(".")) from error
-    return AnnotatedImage(image, camera, light / length)
+def draw_overlay(path: Path, out: Path) -> None:
+    """Draw what was understood of a set into some of its images, as one PNG.
 
+    That is the world's axes (x red, y green, z blue), the direction of the light (yellow) and the box that holds every
+    silhouette (magenta). Where cameras and silhouettes contradict each other there is no such box; one of about the
+    object's size is drawn where most cameras look, and lies beside the silhouettes.
 
-def _rgba_size(path: Path) -> tuple[int, int]:
-    """Width and height [px], read from the header before anything is decoded."""
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            if max(image.size) > MAX_IMAGE_SIDE:
-                raise CorruptFile(path, f"it is {image.width} x {image.height} px; at most {MAX_IMAGE_SIDE} are read")
-            if image.mode != "RGBA":
-                raise CorruptFile(path, "it has no transparency; images of this format are RGBA")
-            image.load()
-            return image.size
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise CorruptFile(path, "there is no readable PNG") from error
-
-
-def draw_overlay(folder: Path, out: Path) -> None:
-    """Draw the world's axes (x red, y green, z blue) and the light (yellow) into some images of a set, as one PNG.
+    Args:
+        path: folder or zip of an image set; it may be one in which `check_path` found contradicting silhouettes.
+        out: PNG to write.
 
     Raises:
-        CorruptFile: if the folder is not an image set.
+        CorruptFile: if it is no image set.
         InvalidInput: if the PNG cannot be written.
     """
-    images = read_annotations(folder, "test")
-    chosen = [images[i] for i in np.linspace(0, len(images) - 1, min(_OVERLAY_IMAGES, len(images))).astype(int)]
-    half = (len(chosen) + 1) // 2
-    tiles = [_overlay(image) for image in chosen]
-    tiles += [np.zeros_like(tiles[0])] * (2 * half - len(tiles))
-    sheet = np.vstack([np.hstack(tiles[:half]), np.hstack(tiles[half:])])
+    with _unpacked(path) as folder:
+        sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))
+    has_box = not any(images.is_opaque for images in sets)
+    sheet = overlay_sheet(sets, carve(*sets).box if has_box else None)
     try:
         is_written = cv2.imwrite(str(out), sheet)
     except cv2.error:
         is_written = False
     if not is_written:
         raise InvalidInput("overlay file", out, "a writable path that ends in .png")
-
-
-def _overlay(image: AnnotatedImage) -> np.ndarray:
-    bgra = np.asarray(cv2.imread(str(image.path), cv2.IMREAD_UNCHANGED))
-    alpha = bgra[..., 3:].astype(float) / 255
-    bgr = (bgra[..., :3] * alpha + 96 * (1 - alpha)).astype(np.uint8)
-    bgr = cv2.resize(bgr, (_OVERLAY_SIDE, _OVERLAY_SIDE), interpolation=cv2.INTER_AREA)
-    camera = image.camera.resized(_OVERLAY_SIDE, _OVERLAY_SIDE)
-    length = 0.25 * float(np.linalg.norm(camera.T_world_camera.position))
-    ends = length * np.stack([*np.eye(3), image.light_direction])
-    colours = ((0, 0, 255), (0, 255, 0), (255, 0, 0), (0, 255, 255))
-    (start,) = np.round(camera.project(np.zeros((1, 3)))).astype(int)
-    for end, colour in zip(np.round(camera.project(ends)).astype(int), colours, strict=True):
-        cv2.arrowedLine(bgr, start.tolist(), end.tolist(), colour, 2, cv2.LINE_AA, tipLength=0.15)
-    return bgr

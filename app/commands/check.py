@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from osfcore.errors import CorruptFile
+from osfcore.errors import CorruptFile, OsfError
 
 
 @dataclass(frozen=True)
@@ -16,9 +17,9 @@ class Check:
     """Validate a scene.json, an image set folder or a push file, and draw an overlay if asked to."""
 
     path: tyro.conf.Positional[Path]
-    """File or folder to check."""
+    """File or folder to check; an image set may be zipped."""
     overlay: Path | None = None
-    """For an image set: PNG to write, with the object frame's axes and the light drawn into some of its images."""
+    """For an image set: PNG to write, with axes, light and the silhouettes' box drawn into some of its images."""
     json: bool = False
     """Print the result as one JSON object in the last line."""
 
@@ -28,9 +29,20 @@ class Check:
 
         if not self.path.exists():
             raise CorruptFile(self.path, "there is no such file or folder")
-        report = check_path(self.path)
+        try:
+            report = check_path(self.path)
+        except CorruptFile:
+            if self.overlay is not None:
+                # What contradicts itself is best seen; what cannot even be drawn was told already.
+                with contextlib.suppress(OsfError):
+                    draw_overlay(self.path, self.overlay)
+                    self._say(f"{self.overlay} shows how cameras, light and silhouettes were understood.")
+            raise
         if self.overlay is not None:
             draw_overlay(self.path, self.overlay)
-        if not self.json:
-            print(f"{self.path} is a good {report.kind}: {report.summary}.")
+        self._say(f"{self.path} is a good {report.kind}: {report.summary}.")
         return {"path": str(self.path), "kind": report.kind, **report.facts}
+
+    def _say(self, sentence: str) -> None:
+        if not self.json:
+            print(sentence)

@@ -1,105 +1,100 @@
-import json
+import shutil
+import zipfile
 
 import cv2
 import numpy as np
 import pytest
 
-from osfcore.check import check_path, draw_overlay, read_annotations
+from osfcore.check import check_path, draw_overlay
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.scene import Camera
 from osfcore.world.collect_images import CollectTable, collect_table
 from osfcore.world.push_file import EpisodeFolder, PushEpisode, save_episode
+from tests.core.fields.sets import edit, turn_cameras, write_set
 
 
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sets") / "table"
-    list(collect_table(CollectTable(out, images=60, size=16)))
-    return out
+    return write_set(tmp_path_factory.mktemp("sets") / "ellipsoid")
 
 
 @pytest.fixture
 def image_set(pristine, tmp_path):
-    import shutil
-
-    return shutil.copytree(pristine, tmp_path / "table")
+    return shutil.copytree(pristine, tmp_path / "ellipsoid")
 
 
-def edit(image_set, change) -> None:
-    path = image_set / "train" / "anno.json"
-    entries = json.loads(path.read_text())
-    change(entries[3])
-    path.write_text(json.dumps(entries))
+def zipped(folder, path):
+    with zipfile.ZipFile(path, "w") as file:
+        for source in folder.rglob("*.*"):
+            file.write(source, source.relative_to(folder.parent))
+    return path
 
 
-def test_good_image_set_passes_and_its_overlay_shows_axes(image_set, tmp_path):
+def count(path, colour) -> int:
+    return np.all(cv2.imread(str(path)) == colour, axis=-1).sum()
+
+
+def test_a_good_set_of_an_object_passes_with_its_size_and_its_overlay_shows_all(image_set, tmp_path):
     report = check_path(image_set)
-    assert (report.kind, dict(report.facts)) == ("image set", {"train": 20, "test": 40})
+    assert (report.kind, dict(report.facts)) == ("image set", {"train": 12, "test": 4})
+    size = [float(word) for word in report.summary.split(" of an object of ")[1].split(" x ")]
+    np.testing.assert_allclose(size, (1.0, 0.6, 0.4), atol=0.35)
     draw_overlay(image_set, tmp_path / "overlay.png")
-    sheet = cv2.imread(str(tmp_path / "overlay.png"))
-    assert sheet.shape == (512, 1024, 3)
-    for colour in ((0, 0, 255), (0, 255, 0), (255, 0, 0)):
-        assert np.all(sheet == colour, axis=-1).sum() > 50
+    assert cv2.imread(str(tmp_path / "overlay.png")).shape == (512, 1024, 3)
+    for colour in ((0, 0, 255), (0, 255, 0), (255, 0, 0), (0, 255, 255), (255, 0, 255)):
+        assert count(tmp_path / "overlay.png", colour) > 50
 
 
-def test_lights_of_any_length_are_normalised(image_set):
-    edit(image_set, lambda entry: entry.update(light_pos=[0, 0, 15.0]))
-    np.testing.assert_allclose(read_annotations(image_set, "train")[3].light_direction, [0, 0, 1])
+def test_the_bare_table_has_no_box(tmp_path):
+    out = tmp_path / "table"
+    list(collect_table(CollectTable(out, images=60, size=16)))
+    assert check_path(out).summary == "20 train and 40 test images of the bare table"
+    draw_overlay(out, tmp_path / "overlay.png")
+    assert count(tmp_path / "overlay.png", (0, 0, 255)) > 50
+    assert count(tmp_path / "overlay.png", (255, 0, 255)) == 0
 
 
-def test_public_sets_with_two_and_a_half_metre_cameras_are_read(tmp_path):
-    camera = Camera.look_at("view", (2.5, 0, 0.1), (0, 0, 0), size=256, fov_y_deg=39.6)
-    entry = {
-        "filename": "r_0.png",
-        "RT": camera.T_world_camera.inverse().matrix()[:3].tolist(),
-        "K": camera.intrinsics.tolist(),
-        "light_pos": [0, 9, 12],
-        "resolution": 256,
-        "objects": {},
-        "light_rgb": None,
-    }
-    for split in ("train", "test"):
-        (tmp_path / split).mkdir()
-        (tmp_path / split / "anno.json").write_text(json.dumps([entry]))
-        cv2.imwrite(str(tmp_path / split / "r_0.png"), np.zeros((256, 256, 4), np.uint8))
-    assert check_path(tmp_path).facts == {"train": 1, "test": 1}
-    np.testing.assert_allclose(
-        read_annotations(tmp_path, "test")[0].camera.T_world_camera.position, (2.5, 0, 0.1), atol=1e-6
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda e: e.pop("light_pos"), "entry 3"),
-        (lambda e: e.update(light_pos=[0, 0, 0]), "no direction"),
-        (lambda e: e.update(light_pos=[10**400, 0, 0]), "entry 3"),
-        (lambda e: e.update(RT=np.zeros((3, 4)).tolist()), "rotation"),
-        (lambda e: e.update(K=np.zeros((3, 3)).tolist()), "focal"),
-        (lambda e: e.update(filename="gone.png"), "no readable PNG"),
-    ],
-)
-def test_broken_sets_are_told_with_their_place(image_set, change, words):
-    edit(image_set, change)
-    with pytest.raises(CorruptFile, match=words):
+def test_wrong_cameras_are_told_and_can_still_be_drawn(image_set, tmp_path):
+    turn_cameras(image_set, lambda RT: np.diag([1, -1, -1]) @ RT)
+    with pytest.raises(CorruptFile, match="ellipsoid cannot be used: the silhouettes .* share no volume: RT must be"):
         check_path(image_set)
+    draw_overlay(image_set, tmp_path / "overlay.png")
+    assert count(tmp_path / "overlay.png", (0, 0, 255)) > 100
 
 
-def test_annotations_nested_too_deeply_are_refused(image_set):
-    (image_set / "train" / "anno.json").write_text("[" * 100_000)
-    with pytest.raises(CorruptFile, match="not valid JSON"):
+def test_a_wrong_camera_in_the_test_split_is_found_too(tmp_path):
+    folder = write_set(tmp_path / "set", train=30, test=4)
+    turn_cameras(folder, lambda RT: np.diag([1, -1, -1]) @ RT, ("test",), 2)
+    with pytest.raises(CorruptFile, match="silhouettes of test/r_2.png contradict"):
+        check_path(folder)
+
+
+def test_broken_and_leaking_sets_are_told(image_set, tmp_path):
+    shutil.copyfile(image_set / "train" / "r_2.png", image_set / "test" / "r_1.png")
+    with pytest.raises(CorruptFile, match="1 of 4 test images are also training images"):
         check_path(image_set)
-
-
-def test_images_without_transparency_are_refused(image_set):
-    cv2.imwrite(str(image_set / "test" / "0000.png"), np.zeros((16, 16, 3), np.uint8))
-    with pytest.raises(CorruptFile, match="RGBA"):
+    edit(image_set, lambda e: e.update(light_pos=[0, 0, 0]))
+    with pytest.raises(CorruptFile, match="light_pos of entry 3"):
         check_path(image_set)
-
-
-def test_a_folder_that_is_no_set_and_an_unwritable_overlay_are_told(image_set, tmp_path):
-    with pytest.raises(CorruptFile, match="train/anno.json"):
+    with pytest.raises(CorruptFile, match="no readable train/anno.json"):
         check_path(tmp_path)
+
+
+def test_a_zipped_set_is_checked_like_a_folder(image_set, tmp_path):
+    path = zipped(image_set, tmp_path / "mine.zip")
+    assert check_path(path) == check_path(image_set)
+    draw_overlay(path, tmp_path / "overlay.png")
+    assert (tmp_path / "overlay.png").stat().st_size > 1000
+    (image_set / "train" / "r_3.png").write_bytes(b"no picture")
+    with pytest.raises(CorruptFile) as caught:
+        check_path(zipped(image_set, path))
+    message = f"{path} cannot be used: mine/train/r_3.png cannot be used: it is no readable PNG"
+    assert str(caught.value).startswith(message)
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(CorruptFile, match=r"mine.zip cannot be used: it is no zip archive or a damaged one.$"):
+        check_path(path)
+
+
+def test_an_unwritable_overlay_is_told(image_set, tmp_path):
     with pytest.raises(InvalidInput, match="overlay"):
         draw_overlay(image_set, tmp_path / "no" / "such" / "folder.png")
 

@@ -1,10 +1,12 @@
 import json
 
+import numpy as np
 import pytest
 
 from app.commands.check import Check
 from osfcore.errors import CorruptFile
 from osfcore.world.collect_images import CollectTable, collect_table
+from tests.core.fields.sets import turn_cameras, write_set
 
 
 def test_a_good_set_is_described_and_drawn(tmp_path, capsys):
@@ -14,6 +16,21 @@ def test_a_good_set_is_described_and_drawn(tmp_path, capsys):
     assert result == {"path": str(out), "kind": "image set", "train": 20, "test": 40}
     assert "good image set: 20 train and 40 test images" in capsys.readouterr().out
     assert (tmp_path / "overlay.png").stat().st_size > 1000
+
+
+def test_a_bad_set_is_drawn_before_it_is_refused(tmp_path, capsys):
+    folder, overlay = write_set(tmp_path / "set"), tmp_path / "overlay.png"
+    turn_cameras(folder, lambda RT: np.diag([1, -1, -1]) @ RT)
+    with pytest.raises(CorruptFile, match="share no volume"):
+        Check(folder, overlay=overlay).run()
+    assert overlay.stat().st_size > 1000
+    assert "overlay.png shows how cameras" in capsys.readouterr().out
+    overlay.unlink()
+    (folder / "train" / "r_0.png").unlink()
+    with pytest.raises(CorruptFile, match="r_0.png"):
+        Check(folder, overlay=overlay).run()
+    assert not overlay.exists()
+    assert capsys.readouterr().out == ""
 
 
 def test_with_json_nothing_else_is_printed(tmp_path, capsys):

@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from osfcore.check import read_annotations
 from osfcore.errors import CannotWrite, InvalidInput, MissingAssets, UnknownName
+from osfcore.fields.image_set import read_annotations
 from osfcore.world.collect_images import CollectObject, CollectTable, collect_object, collect_table
 from osfcore.world.optics import TABLE_ALBEDO
 
