@@ -1,0 +1,144 @@
+"""Walking along a ray through one field's density; compiled for the CPU.
+
+Samples lie at t = (k + 1/2) * step from the ray's origin, whatever the field's box, so that a ray meets the same samples
+however it is cut into pieces.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from osfcore.fields.kiloosf import DENSITY_FLOOR, FLOOR_G, KiloOSF, MACRO
+
+_FLOOR = np.float32(DENSITY_FLOOR)
+_FLOOR_G = np.float32(FLOOR_G)
+_ONE = np.float32(1)
+
+
+@numba.njit(fastmath=True, inline="always")
+def optical_density(g):  # noqa: ANN001, ANN201
+    """sigma * voxel of a density feature g."""
+    if g <= _FLOOR_G:
+        return np.float32(0)
+    if g > np.float32(15):
+        return g - _FLOOR
+    return np.log(_ONE + np.exp(g)) - _FLOOR
+
+
+@numba.njit(fastmath=True, inline="always")
+def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201
+    """Trilinear value at voxel coordinates of a grid that begins at `start` of a flat array."""
+    i, j, k = int(px), int(py), int(pz)
+    fx, fy, fz = px - i, py - j, pz - k
+    at = start + (i * ny + j) * nz + k
+    far = at + ny * nz
+    a = flat[at] + (flat[at + 1] - flat[at]) * fz
+    b = flat[at + nz] + (flat[at + nz + 1] - flat[at + nz]) * fz
+    c = flat[far] + (flat[far + 1] - flat[far]) * fz
+    d = flat[far + nz] + (flat[far + nz + 1] - flat[far + nz]) * fz
+    a += (b - a) * fy
+    c += (d - c) * fy
+    return a + (c - a) * fx
+
+
+@numba.njit(fastmath=True, inline="always")
+def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201
+    """The part of [t0, t1] in which origin + t * direction lies between low and high."""
+    if abs(direction) < np.float32(1e-9):
+        return (t0, t1) if low < origin < high else (_ONE, -_ONE)
+    a, b = (low - origin) / direction, (high - origin) / direction
+    return max(t0, min(a, b)), min(t1, max(a, b))
+
+
+@numba.njit(fastmath=True, inline="always")
+def leave_block(p, d, block):  # noqa: ANN001, ANN201
+    """Distance along a ray, in voxels per unit of d, to the end of a block on one axis."""
+    if d > np.float32(1e-9):
+        return ((block + 1) * MACRO - p) / d
+    if d < np.float32(-1e-9):
+        return (block * MACRO - p) / d
+    return np.float32(1e9)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True, nogil=True)
+def _march(origins, directions, density, macro, low, voxel, step, offsets, min_weight, min_transmittance, ts, counts):  # noqa: ANN001, ANN202, PLR0913
+    nx, ny, nz = density.shape
+    my, mz = macro.shape[1], macro.shape[2]
+    flat, blocks = density.ravel(), macro.ravel()
+    most = ts.shape[1]
+    for r in numba.prange(len(origins)):
+        # In voxel coordinates the box is [0, n - 1].
+        ox, oy, oz = (
+            (origins[r, 0] - low[0]) / voxel,
+            (origins[r, 1] - low[1]) / voxel,
+            (origins[r, 2] - low[2]) / voxel,
+        )
+        dx, dy, dz = directions[r, 0] / voxel, directions[r, 1] / voxel, directions[r, 2] / voxel
+        t0, t1 = clip_axis(ox, dx, np.float32(0), np.float32(nx - 1.001), np.float32(0), np.float32(1e9))
+        t0, t1 = clip_axis(oy, dy, np.float32(0), np.float32(ny - 1.001), t0, t1)
+        t0, t1 = clip_axis(oz, dz, np.float32(0), np.float32(nz - 1.001), t0, t1)
+        found, transmittance = 0, _ONE
+        k = int(np.ceil(t0 / step - offsets[r]))
+        while found < most and transmittance > min_transmittance:
+            t = (k + offsets[r]) * step
+            if t >= t1:
+                break
+            px, py, pz = (
+                max(ox + t * dx, np.float32(0)),
+                max(oy + t * dy, np.float32(0)),
+                max(oz + t * dz, np.float32(0)),
+            )
+            bx, by, bz = int(px) // MACRO, int(py) // MACRO, int(pz) // MACRO
+            if blocks[(bx * my + by) * mz + bz] == 0:
+                skip = min(leave_block(px, dx, bx), leave_block(py, dy, by), leave_block(pz, dz, bz))
+                k = max(k + 1, int(np.ceil((t + skip) / step - offsets[r])))
+                continue
+            depth = optical_density(interpolate(flat, 0, ny, nz, px, py, pz)) * (step / voxel)
+            if depth > 0:
+                alpha = _ONE - np.exp(-depth)
+                if alpha * transmittance > min_weight:
+                    ts[r, found] = t
+                    found += 1
+                transmittance *= _ONE - alpha
+            k += 1
+        counts[r] = found
+
+
+def march(
+    field: KiloOSF,
+    origins: Float32[np.ndarray, "R 3"],
+    directions: Float32[np.ndarray, "R 3"],
+    *,
+    step: float,
+    offsets: Float32[np.ndarray, "R"] | None = None,
+    min_weight: float = 1e-3,
+    min_transmittance: float = 1e-3,
+    most: int = 24,
+) -> tuple[Float32[np.ndarray, "R most"], Bool[np.ndarray, "R most"]]:
+    """Where rays meet a field: distances of the samples that matter, front to back, and which of the slots are used.
+
+    Args:
+        field: what is looked at.
+        origins: of the rays in the field's frame [m].
+        directions: unit vectors.
+        step: between samples [m].
+        offsets: of each ray's first sample, in steps; 1/2 by default, random in training.
+        min_weight: samples that would contribute less are left out.
+        min_transmittance: where less light passes, a ray ends.
+        most: samples a ray at most.
+    """
+    count = len(origins)
+    ts = np.zeros((count, most), np.float32)
+    counts: Int64[np.ndarray, "R"] = np.zeros(count, np.int64)
+    offsets = np.full(count, 0.5, np.float32) if offsets is None else offsets
+    numbers = (
+        np.float32(field.voxel),
+        np.float32(step),
+        offsets,
+        np.float32(min_weight),
+        np.float32(min_transmittance),
+    )
+    _march(origins, directions, field.density, field.macro, field.origin, *numbers, ts, counts)
+    return ts, np.arange(most) < counts[:, None]

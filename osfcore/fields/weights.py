@@ -1,0 +1,149 @@
+"""Files of trained fields: safetensors with 8-bit voxel features and half-precision networks, checked when read."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from osfcore.errors import CannotWrite, CorruptFile
+from osfcore.fields.kiloosf import EMPTY_G, FEATURES, KiloOSF, network_size
+
+FORMAT = "kiloosf-1"
+MAX_FILE_BYTES = 64_000_000
+_MAX_CORNERS = 20_000_000
+_LEVELS = 255
+
+
+def write_field(path: Path, field: KiloOSF) -> None:
+    """Write a field; the file appears only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_atomically(path, field_bytes(field))
+
+
+def field_bytes(field: KiloOSF) -> bytes:
+    """A field as the contents of a file. Features lose precision: 8 bits of each one's range."""
+    features = field.rows[1:]
+    low = features.min(axis=0, initial=0).astype(np.float32)
+    span = np.maximum(features.max(axis=0, initial=0) - low, 1e-6).astype(np.float32)
+    order = field.index[field.index > 0] - 1  # features are stored in the order of the grid
+    levels = np.round((features[order] - low) / span * _LEVELS).astype(np.uint8)
+    used = np.unique(field.cells)
+    tensors = {
+        "origin": field.origin,
+        "voxel": np.array([field.voxel], np.float32),
+        "shape": np.array(field.index.shape, np.int32),
+        "shell": np.packbits(field.index > 0),
+        "levels": levels,
+        "low": low,
+        "span": span,
+        "cells": np.searchsorted(used, field.cells).astype(np.int16),
+        "networks": field.networks[used].astype(np.float16),
+        "ambient": field.ambient,
+    }
+    return save(tensors, metadata={"format": FORMAT, "hidden": str(field.hidden)})
+
+
+def read_field(path: Path) -> KiloOSF:
+    """Read a field.
+
+    Raises:
+        CorruptFile: if the file is missing, cut short, of another version or not a field.
+    """
+    meta, tensors = read_tensors(path, FORMAT)
+    try:
+        return _field(int(meta["hidden"]), tensors)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise CorruptFile(path, f"it is not a sound field ({error})") from error
+
+
+def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
+    shape = tuple(int(n) for n in tensors["shape"])
+    if len(shape) != 3 or min(shape) < 2 or np.prod(shape) > _MAX_CORNERS:
+        raise ValueError(f"shape {shape}")
+    for name, tensor in tensors.items():
+        if tensor.dtype.kind == "f" and not np.all(np.isfinite(tensor)):
+            raise ValueError(f"{name} has values that are not finite")
+    shell = np.unpackbits(tensors["shell"], count=int(np.prod(shape))).astype(bool).reshape(shape)
+    levels = tensors["levels"]
+    if levels.shape != (shell.sum(), FEATURES):
+        raise ValueError(f"levels {levels.shape} for {shell.sum()} corners")
+    for axis in range(3):
+        if np.moveaxis(shell, axis, 0)[[0, -1]].any():
+            raise ValueError("the shell touches the grid's faces")
+    index = np.zeros(shape, np.int32)
+    index[shell] = 1 + np.arange(len(levels), dtype=np.int32)
+    empty = np.zeros((1, FEATURES), np.float32)
+    empty[0, 0] = EMPTY_G
+    rows = np.concatenate([empty, levels.astype(np.float32) / _LEVELS * tensors["span"] + tensors["low"]])
+    cells, networks = tensors["cells"].astype(np.int32), tensors["networks"].astype(np.float32)
+    if networks.shape[1] != network_size(hidden) or cells.ndim != 3 or cells.min() < 0 or cells.max() >= len(networks):
+        raise ValueError(f"networks {networks.shape} of width {hidden} for cells {cells.shape}")
+    voxel = float(tensors["voxel"][0])
+    if not voxel > 0 or tensors["origin"].shape != (3,) or tensors["ambient"].shape != (3,):
+        raise ValueError("voxel, origin or ambient")
+    return KiloOSF(tensors["origin"], voxel, index, rows.astype(np.float32), cells, networks, hidden, tensors["ambient"])
+
+
+def read_tensors(path: Path, expected: str) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
+    """Metadata and tensors of a safetensors file of the expected format.
+
+    Raises:
+        CorruptFile: if the file is missing, cut short or of another format or version.
+    """
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise CorruptFile(path, f"it is larger than {MAX_FILE_BYTES // 1_000_000} MB")
+        data = path.read_bytes()
+    except OSError as error:
+        raise CorruptFile(path, "it cannot be read") from error
+    try:
+        tensors = load(data)
+        (length,) = struct.unpack("<Q", data[:8])
+        meta = json.loads(data[8 : 8 + length]).get("__metadata__", {})
+    except (SafetensorError, ValueError, struct.error, KeyError) as error:
+        raise CorruptFile(path, "it is not a whole safetensors file") from error
+    found = meta.get("format", "no format at all")
+    if found != expected:
+        raise CorruptFile(path, f"its format is {found}; this version reads {expected}: train it again")
+    return meta, tensors
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write bytes to a file that takes its name only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    _replace(path, lambda partial: partial.write_bytes(data))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file in the same way.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _replace(path: Path, write: Callable[[Path], object]) -> None:
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(partial)
+        partial.replace(path)
+    except OSError as error:
+        raise CannotWrite(path, error.strerror or str(error)) from error
+    finally:
+        partial.unlink(missing_ok=True)
