@@ -19,6 +19,7 @@ TABLE_SIDE_M = 1.2
 WORKSPACE_HALF_M = 0.22
 PUSHER_RADIUS_M = 0.015
 PUSHER_HEIGHT_M = 0.12
+PUSHER_ALBEDO = (0.22, 0.42, 0.50)  # a robot knows its hand
 PUSHER_CLEARANCE_M = 0.002  # the pusher hovers, so that it never rubs on the table
 PUSHER_CENTRE_Z_M = PUSHER_CLEARANCE_M + PUSHER_HEIGHT_M / 2
 PUSHER_REACH_M = 0.35  # |x|, |y| of the pusher's centre; the robot stops there

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from osfcore.scene import AMBIENT, DIFFUSE
 
 TABLE_ALBEDO = (0.66, 0.62, 0.56)  # pale wood, uniform, so that only light and shadow change it
-PUSHER_ALBEDO = (0.22, 0.42, 0.50)
 BACKGROUND_RADIANCE = (0.10, 0.11, 0.12)  # beyond the table's edge; no lamp reaches it
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 
 from osfcore.objects.asset import TexturedMesh
-from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
-from osfcore.world.optics import PUSHER_ALBEDO
+from osfcore.scene import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 
 _SIDES = 96
 

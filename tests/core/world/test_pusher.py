@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
-from osfcore.world.optics import PUSHER_ALBEDO
+from osfcore.scene import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.world.pusher import pusher_mesh
 
 

@@ -1,0 +1,262 @@
+"""The plain renderer: every ray, every sample, in PyTorch, in any dtype, on any device.
+
+It says what the fast path must compute, and it is what a GPU runs. Along a ray, the samples of all objects are sorted by
+distance and composited (paper eq. 3, each radiance weighted by density); the light that reaches a point is what the other
+objects let through (transmittance along the way to the light), as a shadow map of unlimited resolution would say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.query import KiloQuery
+from osfcore.fields.table import TableField
+from osfcore.poses import quaternion_to_matrix
+from osfcore.render.scene_renderer import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
+from osfcore.render.solids import pusher_field
+from osfcore.scene import Camera, SceneState
+
+_RAYS_AT_ONCE = 4096
+_FAR = 1e9
+
+
+class _Placed(NamedTuple):
+    """An object where it stands."""
+
+    query: KiloQuery
+    extent: Float[Tensor, "2 3"]  # of what is occupied, in its own frame [m]
+    rotation: Float[Tensor, "3 3"]  # from the world into its frame
+    position: Float[Tensor, "3"]
+
+
+class _Samples(NamedTuple):
+    """Samples of one object along R rays; unused slots have no depth."""
+
+    distance: Float[Tensor, "R S"]
+    depth: Float[Tensor, "R S"]
+    radiance: Float[Tensor, "R S 3"]
+
+
+def render_reference(
+    fields: Mapping[str, KiloOSF],
+    table: TableField | None,
+    state: SceneState,
+    camera: Camera,
+    *,
+    dtype: torch.dtype = torch.float64,
+    quality: Quality = EXACT,
+    outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
+) -> Rendered:
+    """One scene from one camera.
+
+    Args:
+        fields: by name.
+        table: None for black surroundings.
+        state: the scene.
+        camera: the view.
+        dtype: to compute in.
+        quality: only its spacing of samples and rays per pixel count; nothing is skipped here.
+        outputs: as in `SceneRenderer.render`.
+
+    Raises:
+        UnknownName: if an object has no field.
+        InvalidInput: if an output is unknown.
+    """
+    batch = SceneBatch.of(state)
+    check_request(fields, batch, (camera,), outputs)
+    return _render(fields, table, batch, (camera,), torch.device("cpu"), dtype, quality, outputs)
+
+
+def render_on_device(
+    fields: Mapping[str, KiloOSF], table: TableField | None, batch: SceneBatch, cameras: Sequence[Camera], device: str,
+    quality: Quality, outputs: frozenset[str] | set[str],
+) -> Rendered:  # fmt: skip
+    """A batch in single precision on a PyTorch device."""
+    return _render(fields, table, batch, cameras, torch.device(device), torch.float32, quality, outputs)
+
+
+@torch.no_grad()
+def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001, PLR0913
+    queries = {name: KiloQuery(fields[name], dtype=dtype, device=device) for name in dict.fromkeys(batch.names)}
+    extents = {name: _extent(fields[name]) for name in queries}
+    if batch.pusher is not None:
+        pusher = pusher_field(next(iter(fields.values())).hidden if fields else 1)
+        queries["pusher"], extents["pusher"] = KiloQuery(pusher, dtype=dtype, device=device), _extent(pusher)
+    count = len(batch.names)
+    size = cameras[0].height, cameras[0].width
+    rgb = np.zeros((len(batch.lights), len(cameras), *size, 3), np.float32)
+    opacity = np.zeros((len(batch.lights), len(cameras), count, *size), np.float32)
+    depth = np.zeros(rgb.shape[:-1], np.float32)
+
+    def tensor(array: object) -> Tensor:
+        return torch.as_tensor(np.array(array), dtype=dtype, device=device)
+
+    for b, light in enumerate(batch.lights):
+        rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions[b]), -1, -2)
+        placed = [_Placed(queries[n], tensor(extents[n]), tensor(R), tensor(p))
+                  for n, R, p in zip(batch.names, rotations, batch.positions[b], strict=True)]  # fmt: skip
+        if batch.pusher is not None:
+            placed.append(_Placed(queries["pusher"], tensor(extents["pusher"]), tensor(np.eye(3)), tensor(batch.pusher[b])))
+        for v, camera in enumerate(cameras):
+            colours, shares, depths = _image(placed, table, tensor(light), camera, quality, tensor)
+            rgb[b, v], depth[b, v] = colours.cpu().numpy(), depths.cpu().numpy()
+            opacity[b, v] = shares[:count].cpu().numpy()
+    return Rendered(
+        rgb,
+        opacity if "opacity" in outputs else None,
+        opacity >= MASK_OPACITY if "masks" in outputs else None,
+        depth if "depth" in outputs else None,
+    )
+
+
+def _extent(field: KiloOSF) -> np.ndarray:
+    """The occupied part, one voxel wider: density is interpolated."""
+    low, high = field.extent
+    box = field.box
+    return np.stack([np.maximum(low - field.voxel, box[0]), np.minimum(high + field.voxel, box[1])])
+
+
+def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN202, PLR0913
+    """Colours (h, w, 3), shares of the objects (N, h, w) and z-depths (h, w) of one image."""
+    s = quality.samples_per_side
+    height, width = camera.height, camera.width
+    numbers = tensor(camera_numbers(camera))
+    axis = tensor(camera.T_world_camera.matrix()[:3, 2])
+    rows = torch.arange(height * s, device=light.device, dtype=light.dtype) + 0.5
+    columns = torch.arange(width * s, device=light.device, dtype=light.dtype) + 0.5
+    v, u = torch.meshgrid(rows / s, columns / s, indexing="ij")
+    places = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
+    directions = torch.nn.functional.normalize(places @ numbers[3:].view(3, 3).T, dim=-1)
+    parts = [_rays(placed, table, light, numbers[:3], d, quality, tensor) for d in directions.split(_RAYS_AT_ONCE)]
+    colour, shares, distance, weight = (torch.cat(part) for part in zip(*parts, strict=True))
+
+    def pixels(values: Tensor) -> Tensor:
+        """Means over the rays of each pixel."""
+        return values.view(height, s, width, s, -1).mean(dim=(1, 3))
+
+    whole = pixels(weight[:, None])[..., 0]
+    z = distance * (directions @ axis)
+    depth = torch.where(whole > 1e-3, pixels(z[:, None])[..., 0] / whole.clamp(min=1e-9), 0)
+    return pixels(colour), pixels(shares).permute(2, 0, 1), depth
+
+
+def _rays(placed, table, light, origin, directions, quality, tensor):  # noqa: ANN001, ANN202, PLR0913
+    """Radiance (R, 3), shares of the objects (R, N), weighted distance (R) and total weight (R) of rays from one point."""
+    count = len(directions)
+    table_t = _meet_table(table, origin, directions)
+    samples = [_object_samples(placed, n, light, origin, directions, table_t, quality) for n in range(len(placed))]
+    owner = torch.cat([torch.full((s.distance.shape[1],), n) for n, s in enumerate(samples)] or [torch.zeros(0)])
+    if samples:
+        distance, order = torch.cat([s.distance for s in samples], dim=1).sort(dim=1)
+        depth = torch.cat([s.depth for s in samples], dim=1).gather(1, order)
+        radiance = torch.cat([s.radiance for s in samples], dim=1).gather(1, order[..., None].expand(-1, -1, 3))
+    else:
+        distance, depth, order = (directions.new_zeros(count, 0) for _ in range(3))
+        radiance = directions.new_zeros(count, 0, 3)
+    before = torch.cumsum(depth, dim=1) - depth
+    weights = torch.exp(-before) * -torch.expm1(-depth)
+    left = torch.exp(-depth.sum(dim=1))
+    colour = (weights[..., None] * radiance).sum(dim=1)
+    owners = owner.to(directions.device)[order.long()] if samples else order
+    shares = torch.stack([(weights * (owners == n)).sum(dim=1) for n in range(len(placed))] or [left[:0]], dim=-1)
+    shares = shares if placed else directions.new_zeros(count, 0)
+    hit = table_t < _FAR
+    seen = (weights * distance.clamp(max=_FAR)).sum(dim=1) + torch.where(hit, left * table_t, 0)
+    weight = weights.sum(dim=1) + left * hit
+    if table is not None:
+        behind = tensor(table.background).expand(count, 3).clone()
+        points = origin + table_t[hit, None] * directions[hit]
+        visible = _visibility(placed, -1, points, light, quality)
+        direct = tensor(table.direct(light.cpu().double().numpy()[None])[0])
+        behind[hit] = _albedo(table, points, tensor) * (tensor(table.ambient) + visible[:, None] * direct)
+        colour = colour + left[:, None] * behind
+    return colour, shares, seen, weight
+
+
+def _meet_table(table: TableField | None, origin: Tensor, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
+    """Distance to the table [m]; very far for rays that miss it."""
+    far = torch.full_like(directions[:, 0], _FAR)
+    if table is None or origin[2] <= 0:
+        return far
+    down = directions[:, 2] < -1e-9
+    t = torch.where(down, -origin[2] / torch.where(down, directions[:, 2], -1), far)
+    places = origin[:2] + t[:, None] * directions[:, :2]
+    return torch.where(down & (places.abs() <= table.half_side).all(dim=-1), t, far)
+
+
+def _sample_places(
+    placed: _Placed, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], far: Float[Tensor, "R"], step: float
+) -> Iterator[tuple[Float[Tensor, "R"], Float[Tensor, "R"]]]:
+    """Distances of the samples within an object's extent, one after another, and which rays have one there."""
+    safe = torch.where(directions.abs() < 1e-9, 1e-9, directions)
+    a, b = (placed.extent[0] - origins) / safe, (placed.extent[1] - origins) / safe
+    near = torch.minimum(a, b).amax(dim=-1).clamp(min=0)
+    end = torch.minimum(torch.maximum(a, b).amin(dim=-1), far)
+    k = torch.ceil(near / step - 0.5)
+    longest = ((end - near).clamp(min=0).max() / step) if len(end) else torch.tensor(0.0)
+    for _ in range(int(longest) + 2):
+        t = (k + 0.5) * step
+        yield t, t <= end
+        k = k + 1
+
+
+def _into(placed: _Placed, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    return (points - placed.position) @ placed.rotation.T
+
+
+def _object_samples(placed, n, light, origin, directions, table_t, quality) -> _Samples:  # noqa: ANN001, PLR0913
+    """All samples of object n, lit by what the others let through."""
+    own = placed[n]
+    step = quality.step_voxels * own.query.voxel
+    local_origin = _into(own, origin[None]).expand_as(directions)
+    local_directions, local_light = directions @ own.rotation.T, own.rotation @ light
+    distances, depths, radiances = [], [], []
+    for t, used in _sample_places(own, local_origin, local_directions, table_t, step):
+        depth, radiance = torch.zeros_like(t), torch.zeros_like(directions)
+        x = (local_origin + t[:, None] * local_directions)[used]
+        if len(x):
+            sigma = own.query.density(x)
+            some = sigma > 0
+            inside = used.nonzero()[:, 0][some]
+            depth[inside] = sigma[some] * step
+            light_there = local_light.expand(len(inside), 3)
+            scatter = own.query(x[some], light_there, local_directions[inside])
+            points = origin + t[inside, None] * directions[inside]
+            visible = _visibility(placed, n, points, light, quality)
+            radiance[inside] = scatter.ambient + visible[:, None] * scatter.direct
+        distances.append(torch.where(used, t, _FAR))
+        depths.append(depth)
+        radiances.append(radiance)
+    if not distances:
+        nothing = directions.new_zeros(len(directions), 0)
+        return _Samples(nothing, nothing, directions.new_zeros(len(directions), 0, 3))
+    return _Samples(torch.stack(distances, 1), torch.stack(depths, 1), torch.stack(radiances, 1))
+
+
+def _visibility(placed, skip, points, light, quality) -> Float[Tensor, "R"]:  # noqa: ANN001
+    """Share of the light that reaches points in the world past all objects but one."""
+    total = points.new_zeros(len(points))
+    for n, other in enumerate(placed):
+        if n == skip or not len(points):
+            continue
+        origins = _into(other, points)
+        direction = (other.rotation @ light).expand_as(origins)
+        step = quality.shadow_voxels * other.query.voxel
+        for t, used in _sample_places(other, origins, direction, torch.full_like(total, _FAR), step):
+            if used.any():
+                x = (origins + t[:, None] * direction)[used]
+                total[used] += other.query.density(x) * step
+    return torch.exp(-total)
+
+
+def _albedo(table: TableField, points: Float[Tensor, "R 3"], tensor) -> Float[Tensor, "R 3"]:  # noqa: ANN001
+    grid = tensor(table.albedo).permute(2, 1, 0)[None]  # rows of an image run along y
+    places = points[None, None, :, :2] / table.half_side
+    return torch.nn.functional.grid_sample(grid, places, align_corners=True)[0, :, 0].T

@@ -1,0 +1,234 @@
+"""The fast path: whole batches of scenes from several cameras in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.table import TableField
+from osfcore.poses import Pose, quaternion_to_matrix
+from osfcore.render.packing import Packed, pack
+from osfcore.render.solids import pusher_field
+from osfcore.scene import Camera, SceneState
+
+OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
+MASK_OPACITY = 0.5
+MOST_OBJECTS = 23  # and the pusher
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """How carefully rays are followed.
+
+    Attributes:
+        step_voxels: distance between samples [voxels of the field].
+        min_weight: samples that show less are not coloured.
+        stop: a ray ends where less of what lies behind would show.
+        one_shadow: ask once per ray and object whether the light arrives, not at every sample.
+        shadow_voxels: distance between samples of shadow rays [voxels].
+        samples_per_side: rays per pixel, squared.
+    """
+
+    step_voxels: float = 0.5
+    min_weight: float = 1e-5
+    stop: float = 1e-4
+    one_shadow: bool = False
+    shadow_voxels: float = 0.5
+    samples_per_side: int = 1
+
+
+EXACT = Quality()
+PLANNING = Quality(step_voxels=1.0, min_weight=0.02, stop=0.03, one_shadow=True, shadow_voxels=1.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneBatch:
+    """B scenes with the same objects.
+
+    Attributes:
+        names: of the N objects; each one's field is looked up under this name.
+        positions: of the objects [m].
+        quaternions: (w, x, y, z), unit.
+        lights: unit vectors toward the light.
+        pusher: its centre [m]; None where there is none.
+    """
+
+    names: tuple[str, ...]
+    positions: Float[np.ndarray, "B N 3"]
+    quaternions: Float[np.ndarray, "B N 4"]
+    lights: Float[np.ndarray, "B 3"]
+    pusher: Float[np.ndarray, "B 3"] | None
+
+    def __post_init__(self) -> None:
+        """Check shapes and numbers."""
+        count, scenes = len(self.names), len(self.lights)
+        wanted = {"positions": (scenes, count, 3), "quaternions": (scenes, count, 4), "lights": (scenes, 3)}
+        if self.pusher is not None:
+            wanted["pusher"] = (scenes, 3)
+        for name, shape in wanted.items():
+            array = getattr(self, name)
+            if array.shape != shape or not np.all(np.isfinite(array)):
+                raise InvalidInput(f"{name} of a batch", f"shape {array.shape}", f"finite numbers of shape {shape}")
+        if count > MOST_OBJECTS:
+            raise InvalidInput("number of objects", count, f"at most {MOST_OBJECTS}")
+
+    @staticmethod
+    def of(state: SceneState) -> SceneBatch:
+        """One scene as a batch."""
+        pusher = None if state.pusher is None else state.pusher[None]
+        return SceneBatch(
+            state.names,
+            state.poses.position[None],
+            state.poses.quaternion[None],
+            state.light.direction[None],
+            pusher,
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rendered:
+    """Images of B scenes from V cameras; what was not asked for is None.
+
+    Attributes:
+        rgb: linear radiance in [0, 1].
+        opacity: how much of each pixel shows each object.
+        masks: pixels of which an object covers half or more.
+        depth: expected distance along the camera's z axis [m]; 0 where there is nothing.
+    """
+
+    rgb: Float32[np.ndarray, "B V h w 3"]
+    opacity: Float32[np.ndarray, "B V N h w"] | None = None
+    masks: Bool[np.ndarray, "B V N h w"] | None = None
+    depth: Float32[np.ndarray, "B V h w"] | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Objects:
+    """Fields of one list of names, ready for compiled code."""
+
+    pack: Packed
+    numbers: np.ndarray
+    corners: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        low, high = self.pack.extents[self.numbers, :3], self.pack.extents[self.numbers, 3:]
+        choice = np.array(list(np.ndindex(2, 2, 2)), bool)
+        object.__setattr__(self, "corners", np.where(choice, high[:, None], low[:, None]))
+
+
+class SceneRenderer:
+    """Renders scenes of known fields.
+
+    Volume rendering after paper eq. 3, weighted by density; shadows of objects and pusher fall on each other and on the
+    table with soft transmittance along the way to the light. An object does not shade itself here: its field already
+    holds that.
+    """
+
+    def __init__(self, fields: Mapping[str, KiloOSF], table: TableField | None, *, device: str = "cpu") -> None:
+        """Prepare fields.
+
+        Args:
+            fields: by name.
+            table: None for black surroundings.
+            device: "cpu" for compiled code on all cores; anything else for PyTorch on that device.
+        """
+        self._fields = dict(fields)
+        self._table = table
+        self._device = device
+        self._objects: dict[tuple[tuple[str, ...], bool], _Objects] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Objects that can be drawn."""
+        return tuple(self._fields)
+
+    def render(
+        self,
+        batch: SceneBatch,
+        cameras: Sequence[Camera],
+        *,
+        quality: Quality = EXACT,
+        outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
+    ) -> Rendered:
+        """Images of every scene of a batch from every camera.
+
+        Args:
+            batch: B scenes.
+            cameras: V cameras of one image size.
+            quality: `EXACT` or `PLANNING`, or anything between.
+            outputs: which of "rgb", "opacity", "masks", "depth"; colours always come.
+
+        Raises:
+            UnknownName: if an object has no field here.
+            InvalidInput: if cameras differ in size, or an output is unknown.
+        """
+        size = check_request(self._fields, batch, cameras, outputs)
+        if self._device != "cpu":
+            from osfcore.render.reference import render_on_device
+
+            return render_on_device(self._fields, self._table, batch, cameras, self._device, quality, outputs)
+        from osfcore.render.launch import launch
+
+        objects = self._prepared(batch)
+        return launch(objects.pack, objects.numbers, objects.corners, self._table, batch, cameras, size, quality, outputs)
+
+    def _prepared(self, batch: SceneBatch) -> _Objects:
+        """The batch's fields, each packed once."""
+        key = (batch.names, batch.pusher is not None)
+        if key not in self._objects:
+            if len(self._objects) > 8:  # a viewer that goes through many scenes must not keep them all
+                self._objects.clear()
+            names = list(dict.fromkeys(batch.names))
+            fields = [self._fields[name] for name in names]
+            numbers = [names.index(name) for name in batch.names]
+            if batch.pusher is not None or not fields:
+                hidden = fields[0].hidden if fields else 1
+                fields.append(pusher_field(hidden))
+            if batch.pusher is not None:
+                numbers.append(len(fields) - 1)
+            self._objects[key] = _Objects(pack(fields), np.array(numbers, np.int64))
+        return self._objects[key]
+
+
+def check_request(
+    fields: Mapping[str, KiloOSF], batch: SceneBatch, cameras: Sequence[Camera], outputs: frozenset[str] | set[str]
+) -> tuple[int, int]:
+    """Height and width of the images [px], after everything asked for was found possible.
+
+    Raises:
+        UnknownName: if an object has no field.
+        InvalidInput: if there is no camera, cameras differ in size, or an output is unknown.
+    """
+    for name in batch.names:
+        if name not in fields:
+            raise UnknownName("field", name, sorted(fields))
+    unknown = set(outputs) - OUTPUTS
+    if unknown:
+        raise InvalidInput("outputs", ", ".join(sorted(unknown)), ", ".join(sorted(OUTPUTS)))
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise InvalidInput("image sizes of the cameras", sorted(sizes), "one size for all cameras")
+    return sizes.pop()
+
+
+def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations from the world into each object's frame (B, N, 3, 3) and positions (B, N, 3), the pusher last."""
+    rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions), -1, -2)
+    positions = batch.positions
+    if batch.pusher is not None:
+        upright = np.broadcast_to(np.eye(3), (len(rotations), 1, 3, 3))
+        rotations = np.concatenate([rotations, upright], axis=1)
+        positions = np.concatenate([positions, batch.pusher[:, None]], axis=1)
+    return rotations, positions
+
+
+def camera_numbers(camera: Camera) -> Float[np.ndarray, "12"]:
+    """Position and the matrix from pixel coordinates to directions in the world."""
+    pose: Pose = camera.T_world_camera
+    matrix = pose.matrix()[:3, :3] @ np.linalg.inv(camera.intrinsics)
+    return np.concatenate([pose.position, matrix.reshape(-1)])
