@@ -53,11 +53,11 @@ class Recipe:
 
     coarse_across: int = 48
     fine_across: int = 96
-    coarse_share: float = 0.15
+    coarse_share: float = 0.3
     cells: int = 8
     hidden: int = 16
     rays: int = 4096
-    inside_g: float = 0.0
+    inside_g: float = -3.0
     coarse_rates: Rates = Rates(2e-2, 1e-2)
     fine_rates: Rates = Rates(2e-2, 1e-3)
 
