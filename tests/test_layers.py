@@ -32,7 +32,7 @@ OWNERS = {  # who alone may import a package
     "pybullet": ("osfcore/world/physics.py", "osfcore/world/tiny.py"),
     "embreex": ("osfcore/world/traced.py",),
     "coacd": ("osfcore/objects/collision.py",),
-    "viser": ("app/viewer.py", "app/viewer/", "app/relay.py"),
+    "viser": ("app/viewer/", "app/relay.py"),
     "websockets": ("app/relay.py",),
     "fastapi": ("app/",),
     "uvicorn": ("app/",),

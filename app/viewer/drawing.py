@@ -1,25 +1,16 @@
-"""The live 3D view: draws the current scene with viser and turns what people do there into runner commands.
-
-The only importer of viser. viser's loop never waits: drawing happens in the playback's thread, commands in another one.
-"""
+"""The nodes that show a scene in the 3D view."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import viser
 
-from app.job import JobChanged
-from app.messages import CurrentScene, SceneRecord
-from app.playback import Playback
-from app.runner import Runner
+from app.messages import SceneRecord
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose, quaternion_multiply, quaternion_to_matrix
@@ -27,6 +18,7 @@ from osfcore.scene import (
     AMBIENT,
     DIFFUSE,
     MIN_LIGHT_ELEVATION_DEG,
+    PUSHER_ALBEDO,
     PUSHER_HEIGHT_M,
     PUSHER_RADIUS_M,
     TABLE_SIDE_M,
@@ -35,10 +27,8 @@ from osfcore.scene import (
     SceneState,
     default_cameras,
 )
-from osfcore.world.optics import PUSHER_ALBEDO, TABLE_ALBEDO
+from osfcore.world.optics import TABLE_ALBEDO
 
-PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
-PUSH_STEPS = 2
 VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.95, -0.95, 0.9), (0.0, 0.0, 0.1), 0.8
 TABLE_THICKNESS_M = 0.04
 LIGHT_CUBE_M = 0.06
@@ -48,137 +38,6 @@ NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
-
-
-class LoopbackViser(viser.ViserServer):
-    """viser bound to loopback, unable to open a public tunnel."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse: any client could ask for this."""
-        del verbose
-        return None
-
-
-class Viewer:
-    """The view of the runner's current scene, the same for any number of browsers."""
-
-    def __init__(self, runner: Runner) -> None:
-        self._runner = runner
-        self._commands = ThreadPoolExecutor(1, thread_name_prefix="viewer-commands")
-        self._server: LoopbackViser | None = None
-        self._undo: list[Callable[[], None]] = []
-
-    @property
-    def client_page(self) -> Path:
-        """The client's one file."""
-        return Path(viser.__file__).parent / "client" / "build" / "index.html"
-
-    @property
-    def server(self) -> LoopbackViser:
-        """The loopback server; only while it runs."""
-        assert self._server is not None
-        return self._server
-
-    @property
-    def port(self) -> int:
-        """Of the loopback server."""
-        return self.server.get_port()
-
-    def start(self) -> None:
-        """Open the loopback server and draw what there is."""
-        with contextlib.redirect_stdout(io.StringIO()):  # the banner would tell the inner port
-            self._server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
-        self._drawing = SceneDrawing(self._server, self._runner.library, self._move_object, self._move_light)
-        self._playback = Playback(self._drawing)
-        self._add_panel(self._server)
-        self._server.on_client_connect(lambda _: self._runner.watch_frames(1))
-        self._server.on_client_disconnect(lambda _: self._runner.watch_frames(-1))
-        self._playback.start()
-        self._undo = [
-            self._runner.hub.subscribe(self._playback.note),
-            self._runner.hub.subscribe(self._on_job),
-        ]
-        self._show_current()
-
-    def stop(self) -> None:
-        """Close the server and end the threads. Calling it again does nothing."""
-        if self._server is None:
-            return
-        for undo in self._undo:
-            undo()
-        self._playback.stop()
-        self._commands.shutdown(wait=False, cancel_futures=True)
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
-        self._server = None
-
-    def _show_current(self) -> None:
-        current = self._runner.current
-        self._playback.note(CurrentScene(None if current is None else self._runner.scene(current)))
-
-    def _add_panel(self, server: LoopbackViser) -> None:
-        gui = server.gui
-        gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
-        gui.set_panel_label("Scene")
-        push = gui.add_button_group("Push", tuple(PUSHES), hint="Move the pusher along an axis of the table.")
-        reset = gui.add_button("Reset", hint="Back to how the scene was created.")
-        new = gui.add_button("New scene", hint="Other objects, other light.")
-        self._wants_gizmos = gui.add_checkbox("Move objects", False, hint="Show handles to drag and turn the objects.")
-        cameras = gui.add_checkbox("Cameras", True)
-        names = gui.add_checkbox("Names", True)
-        gui.main_panel.minimize()
-
-        push.on_click(lambda event: self._push(event.target.value, event.client))
-        reset.on_click(lambda event: self._on_current(self._runner.reset_scene, event.client))
-        new.on_click(lambda event: self._obey(self._runner.create_scene, event.client))
-        self._wants_gizmos.on_update(lambda _: self._update_gizmos())
-        cameras.on_update(lambda event: self._drawing.show_cameras(event.target.value))
-        names.on_update(lambda event: self._drawing.show_names(event.target.value))
-
-    def _push(self, direction: str, client: Client) -> None:
-        if direction in PUSHES:  # clients may send anything
-            self._on_current(lambda scene: self._runner.act(scene, [PUSHES[direction]] * PUSH_STEPS), client)
-
-    def _move_object(self, name: str, pose: Pose, client: Client) -> None:
-        """An object was let go; where it must not be, it goes back. Called on viser's loop."""
-
-        def move(scene: str) -> None:
-            try:
-                self._runner.edit_scene(scene, poses=((name, pose),), settle=True)
-            except OsfError:
-                self._show_current()
-                raise
-
-        self._commands.submit(self._on_current, move, client)
-
-    def _move_light(self, light: Light, client: Client) -> None:
-        """The light was let go. Called on viser's loop."""
-        self._commands.submit(self._on_current, lambda scene: self._runner.edit_scene(scene, light=light), client)
-
-    def _on_current(self, command: Callable[[str], object], client: Client) -> None:
-        scene = self._runner.current
-        if scene is not None:
-            self._obey(lambda: command(scene), client)
-
-    def _obey(self, command: Callable[[], object], client: Client) -> None:
-        """Carry out a command; tell the one who gave it if it is refused."""
-        try:
-            command()
-        except OsfError as error:
-            if client is not None:
-                client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
-        except Exception:
-            _log.exception("a command from the viewer failed")
-
-    def _on_job(self, event: object) -> None:
-        if isinstance(event, JobChanged):
-            self._update_gizmos()
-
-    def _update_gizmos(self) -> None:
-        """Hands may move objects only while no job does."""
-        current = self._runner.current
-        is_free = current is not None and self._runner.jobs.holder(current) is None
-        self._drawing.show_gizmos(self._wants_gizmos.value and is_free)
 
 
 class SceneDrawing:

@@ -4,39 +4,11 @@ import numpy as np
 import pytest
 import viser
 
-from app.viewer import VIEW_FROM, LoopbackViser, light_toward
-from osfcore.poses import Pose, quaternion_multiply
-from osfcore.scene import MIN_LIGHT_ELEVATION_DEG, PUSHER_HEIGHT_M
+from app.viewer.drawing import light_toward
+from osfcore.poses import quaternion_multiply
+from osfcore.scene import MIN_LIGHT_ELEVATION_DEG
 from tests.app.conftest import until
-
-BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
-
-
-@pytest.fixture
-def drawing(live):
-    return live.services.viewer._drawing
-
-
-@pytest.fixture
-def shown(live, drawing):
-    _, scene = live.request("POST", "/api/scenes", {"seed": 1, "objects": [BOX, BOTTLE]})
-    until(lambda: set(drawing._bodies) == {BOX, BOTTLE})
-    yield scene
-    live.request("DELETE", f"/api/scenes/{scene['id']}")
-
-
-def agrees(drawing, scene):
-    """Whether what is drawn is where the scene says."""
-    bodies = drawing._bodies
-    told = {o["name"]: o for o in scene["objects"]}
-    return (
-        set(told) == set(bodies)
-        and all(np.allclose(bodies[n].position, o["position"], atol=1e-5) for n, o in told.items())
-        and all(np.allclose(bodies[n].wxyz, o["quaternion"], atol=1e-5) for n, o in told.items())
-        and np.allclose(drawing._pusher.position, scene["pusher"]["position"], atol=1e-5)
-        and np.allclose(drawing._cube.position, scene["light"]["position"], atol=1e-5)
-        and np.allclose(drawing._lamp.position, scene["light"]["position"], atol=1e-5)
-    )
+from tests.app.viewer.conftest import BOTTLE, BOX, agrees
 
 
 def test_what_is_drawn_is_where_the_scene_says(live, drawing, shown):
@@ -63,53 +35,6 @@ def test_an_empty_table_shows_no_pusher(live, drawing, shown):
         live.request("DELETE", f"/api/scenes/{current}")
     until(lambda: not drawing._pusher.visible)
     assert drawing._bodies == {}
-
-
-def test_a_dropped_object_falls_and_one_in_another_goes_back(live, drawing, shown):
-    viewer = live.services.viewer
-    up = Pose(np.array([0.0, 0.0, 0.4]), np.array([1.0, 0, 0, 0]))
-    viewer._move_object(BOX, up, None)
-
-    def has_fallen():
-        scene = live.request("GET", f"/api/scenes/{shown['id']}")[1]
-        height = scene["objects"][0]["position"][2]
-        moved = scene["revision"] > shown["revision"] + 1  # the jump, and the way down
-        return scene if moved and height < 0.35 and agrees(drawing, scene) else None
-
-    fallen = until(has_fallen)
-    bottle = fallen["objects"][1]
-    into = Pose(np.array(bottle["position"]), np.array(bottle["quaternion"]))
-    drawing._follow(BOX, into)  # as the hand had moved it
-    viewer._move_object(BOX, into, None)
-    until(lambda: agrees(drawing, fallen))
-    assert live.request("GET", f"/api/scenes/{shown['id']}")[1]["objects"] == fallen["objects"]
-
-
-def test_handles_show_only_when_wanted(live, drawing, shown):
-    viewer = live.services.viewer
-    assert not any(gizmo.visible for gizmo in drawing._gizmos.values())
-    viewer._wants_gizmos.value = True
-    until(lambda: all(gizmo.visible for gizmo in drawing._gizmos.values()))
-    viewer._wants_gizmos.value = False
-    until(lambda: not any(gizmo.visible for gizmo in drawing._gizmos.values()))
-
-
-def test_pushes_from_the_panel_move_the_pusher(live, drawing, shown):
-    viewer = live.services.viewer
-    viewer._push("+x", None)
-    viewer._push("sideways", None)
-    after = live.request("GET", f"/api/scenes/{shown['id']}")[1]
-    assert after["time_s"] == pytest.approx(0.4)
-    assert after["pusher"]["position"][0] > shown["pusher"]["position"][0]
-    assert after["pusher"]["position"][2] > PUSHER_HEIGHT_M / 2
-
-
-def test_nobody_can_open_a_tunnel(live):
-    server = live.services.viewer.server
-    assert isinstance(server, LoopbackViser)
-    assert server.request_share_url() is None
-    assert server.get_host() == "127.0.0.1"
-    assert tuple(server.initial_camera.position) == VIEW_FROM
 
 
 @pytest.mark.parametrize("position", [[0.3, 0.4, 5.0], [1, 0, -3], [0, 2, 0], [1e-3, 0, 0]])

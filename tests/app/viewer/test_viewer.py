@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from app.viewer.drawing import VIEW_FROM
+from app.viewer.viewer import LoopbackViser
+from osfcore.poses import Pose
+from osfcore.scene import PUSHER_HEIGHT_M
+from tests.app.conftest import until
+from tests.app.viewer.conftest import BOX, agrees
+
+
+def test_a_dropped_object_falls_and_one_in_another_goes_back(live, drawing, shown):
+    viewer = live.services.viewer
+    up = Pose(np.array([0.0, 0.0, 0.4]), np.array([1.0, 0, 0, 0]))
+    viewer._move_object(BOX, up, None)
+
+    def has_fallen():
+        scene = live.request("GET", f"/api/scenes/{shown['id']}")[1]
+        height = scene["objects"][0]["position"][2]
+        moved = scene["revision"] > shown["revision"] + 1  # the jump, and the way down
+        return scene if moved and height < 0.35 and agrees(drawing, scene) else None
+
+    fallen = until(has_fallen)
+    bottle = fallen["objects"][1]
+    into = Pose(np.array(bottle["position"]), np.array(bottle["quaternion"]))
+    drawing._follow(BOX, into)  # as the hand had moved it
+    viewer._move_object(BOX, into, None)
+    until(lambda: agrees(drawing, fallen))
+    assert live.request("GET", f"/api/scenes/{shown['id']}")[1]["objects"] == fallen["objects"]
+
+
+def test_handles_show_only_when_wanted(live, drawing, shown):
+    viewer = live.services.viewer
+    assert not any(gizmo.visible for gizmo in drawing._gizmos.values())
+    viewer._wants_gizmos.value = True
+    until(lambda: all(gizmo.visible for gizmo in drawing._gizmos.values()))
+    viewer._wants_gizmos.value = False
+    until(lambda: not any(gizmo.visible for gizmo in drawing._gizmos.values()))
+
+
+def test_pushes_from_the_panel_move_the_pusher(live, drawing, shown):
+    viewer = live.services.viewer
+    viewer._push("+x", None)
+    viewer._push("sideways", None)
+    after = live.request("GET", f"/api/scenes/{shown['id']}")[1]
+    assert after["time_s"] == pytest.approx(0.4)
+    assert after["pusher"]["position"][0] > shown["pusher"]["position"][0]
+    assert after["pusher"]["position"][2] > PUSHER_HEIGHT_M / 2
+
+
+def test_nobody_can_open_a_tunnel(live):
+    server = live.services.viewer.server
+    assert isinstance(server, LoopbackViser)
+    assert server.request_share_url() is None
+    assert server.get_host() == "127.0.0.1"
+    assert tuple(server.initial_camera.position) == VIEW_FROM
