@@ -13,6 +13,7 @@ from app.commands.assets import Assets
 from app.commands.check import Check
 from app.commands.collect import Collect
 from app.commands.serve import Serve
+from app.commands.train import Train
 from osfcore.errors import OsfError
 
 
@@ -33,6 +34,7 @@ Commands = Annotated[
     Annotated[Serve, tyro.conf.subcommand("serve", description="Start the service and its page.")]
     | Annotated[Assets, tyro.conf.subcommand("assets", description="List, fetch and add objects.")]
     | Annotated[Collect, tyro.conf.subcommand("collect", description="Collect image sets and pushes.")]
+    | Annotated[Train, tyro.conf.subcommand("train", description="Train fields from image sets.")]
     | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

@@ -20,6 +20,20 @@ class WrongJobState(OsfError):
         super().__init__(f"Job {job.id} is {job.state}, so it cannot be {wanted}.")
 
 
+class TrainingAlready(OsfError):
+    """A second order for a field that is being trained."""
+
+    def __init__(self, name: str, job: str) -> None:
+        super().__init__(f"Job {job} trains a field named {name} already; wait for it, cancel it or take another name.")
+
+
+class SetInUse(OsfError):
+    """An image set that a job needs."""
+
+    def __init__(self, set_id: str, job: str) -> None:
+        super().__init__(f"Job {job} needs image set {set_id}; wait for it or cancel it first.")
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """A job as it is now.

@@ -71,12 +71,20 @@ def _fetch_assets(params: dict[str, Any], place: Place) -> Iterator[Any]:
     yield from fetch(tuple(params["names"]), source, place.library)
 
 
+def _train_field(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from app.field_job import train_field_job
+
+    yield from train_field_job(params, place)
+
+
 KINDS: dict[str, Callable[[dict[str, Any], Place], Iterator[Any]]] = {
     "collect_pushes": _collect_pushes,
     "collect_object": _collect_object,
     "collect_table": _collect_table,
     "fetch_assets": _fetch_assets,
+    "train_field": _train_field,
 }
+_WITHOUT_PHYSICS = ("fetch_assets", "train_field")
 
 
 def job_main(connection: Connection, kind: str, params: dict[str, Any], place: Place) -> None:
@@ -85,7 +93,7 @@ def job_main(connection: Connection, kind: str, params: dict[str, Any], place: P
     own_group()
     silence_stdout()
     orders = Orders(connection, on_lost=end_own_group)
-    if kind != "fetch_assets":
+    if kind not in _WITHOUT_PHYSICS:
         import_quietly("osfcore.world.tabletop")
     with contextlib.suppress(OSError):  # the web process has gone
         connection.send(_run(connection, orders, kind, params, place))

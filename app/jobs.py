@@ -18,6 +18,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
+from app.field_files import clear_workshop
 from app.job import Job, JobChanged, State, WrongJobState, ended, job_fields, job_from_fields
 from app.job_process import Place, job_main
 from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
@@ -26,6 +27,8 @@ from app.store import Store, now_utc
 from osfcore.errors import OsfError, UnknownName
 
 STOPPED_NOTE = "The service stopped while this job was running; start it again."
+DIED_NOTE = "The job's process ended unexpectedly; it may have run out of memory."
+RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."
 _LOOK_INTERVAL_S = 0.2
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
 _log = logging.getLogger(__name__)
@@ -119,6 +122,10 @@ class Jobs:
                 raise UnknownName("job", job, list(self._jobs)[-5:])
             return self._with_position(self._jobs[job])
 
+    def live(self, kind: str) -> tuple[Job, ...]:
+        """Jobs of a kind that wait, run or pause."""
+        return tuple(job for job in self.all() if job.kind == kind and not job.is_finished)
+
     def folder(self, job: str) -> Path:
         """Where a job's outputs are."""
         return self._data_dir / "collections" / job
@@ -156,6 +163,7 @@ class Jobs:
             if found.is_finished:
                 raise WrongJobState(found, "cancelled")
             if found.state == "queued":
+                self._forget_work(found)
                 self._set(ended(self._jobs[job], "cancelled", note="Cancelled"))
                 self._tell_queue()
                 return self.get(job)
@@ -228,7 +236,7 @@ class Jobs:
                 try:
                     message = run.connection.recv()
                 except (EOFError, OSError):
-                    outcome = Failure(0, "Died", "The job's process ended unexpectedly; it may have run out of memory.")
+                    outcome = Failure(0, "Died", DIED_NOTE)
                     break
                 if isinstance(message, JobStep):
                     self._progress(message)
@@ -256,12 +264,15 @@ class Jobs:
                 after = ended(job, "done", note="Done", result=result, files=files)
             case JobCancelled():
                 after = ended(job, "cancelled", note="Cancelled")
-            case Failure(_, _, text):
+            case Failure(_, kind, text):
+                text = _with_advice(job, text) if kind in ("Died", "Stopped") else text
                 after = ended(job, "failed", note="Failed", error=text)
             case _:
                 after = ended(job, "failed", note="Failed", error="The job's process told nonsense.")
         if after.state != "done":
             shutil.rmtree(folder, ignore_errors=True)
+        if after.state == "cancelled":
+            self._forget_work(job)
         with self._changed:
             self._run = None
             self._set(after)
@@ -321,7 +332,16 @@ class Jobs:
 
     def _fail_stopped(self, job: Job) -> None:
         shutil.rmtree(self.folder(job.id), ignore_errors=True)
-        self._set(ended(job, "failed", note="Failed", error=STOPPED_NOTE))
+        self._set(ended(job, "failed", note="Failed", error=_with_advice(job, STOPPED_NOTE)))
+
+    def _forget_work(self, job: Job) -> None:
+        """Remove what a failed job would leave for its next try."""
+        if job.kind == "train_field":
+            clear_workshop(self._data_dir, job.params["name"])
+
+
+def _with_advice(job: Job, text: str) -> str:
+    return f"{text} {RESUMES_NOTE}" if job.kind == "train_field" else text
 
 
 class _Clock:

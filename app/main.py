@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,13 @@ from fastapi.responses import HTMLResponse
 from fastapi.routing import APIRoute
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
-from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 
 from app import problems, relay
-from app.routes import events, health, jobs, objects, scenes
+from app.field_shelf import FieldShelf
+from app.routes import events, fields, health, jobs, objects, scenes
 from app.runner import Runner
 from app.schemas import FrameEvent, NoticeEvent, Problem
-from app.security import SecurityMiddleware
+from app.security import BodyLimitMiddleware, SecurityMiddleware
 from app.services import Services, Shelf
 from app.settings import Settings
 from app.store import Store
@@ -49,15 +50,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         generate_unique_id_function=_operation_id,
     )
     app.state.settings = settings
-    app.add_middleware(RequestBodyLimitMiddleware, max_body_size=settings.max_body_bytes)
+    limit_of = partial(_body_limit, settings)
+    app.add_middleware(BodyLimitMiddleware, limit_of=limit_of)
     app.add_middleware(  # outermost: also the limit's answer gets its headers and becomes a problem
         SecurityMiddleware,
         allowed_hosts=settings.allowed_hosts,
         allowed_origins=settings.allowed_origins,
-        max_body_bytes=settings.max_body_bytes,
+        limit_of=limit_of,
     )
     problems.install(app)
-    for module in (health, objects, scenes, jobs, events):
+    for module in (health, objects, fields, scenes, jobs, events):
         app.include_router(module.router)
     app.include_router(relay.router)
     _add_docs(app)
@@ -85,10 +87,16 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         viewer = Viewer(runner)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
-        services = Services(settings, store, runner, viewer, Shelf(runner.library))
+        shelf = Shelf(runner.library)
+        services = Services(settings, store, runner, viewer, shelf, FieldShelf(settings.data_dir, shelf.names))
         app.state.services = services
         stack.callback(services.closing.set)
         yield
+
+
+def _body_limit(settings: Settings, path: str) -> int:
+    """How large a request to a path may be [bytes]: only uploads are large."""
+    return settings.max_upload_bytes if path.rstrip("/") == fields.UPLOAD_PATH else settings.max_body_bytes
 
 
 def _operation_id(route: APIRoute) -> str:

@@ -8,14 +8,15 @@ import secrets
 import threading
 import time
 import uuid
-from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from app.hub import Hub
-from app.job import Job, JobChanged, check_params
+from app.image_cache import ImageCache
+from app.image_sets import ImageSets
+from app.job import Job, JobChanged, SetInUse, TrainingAlready, check_params
 from app.jobs import Jobs
 from app.messages import (
     Act,
@@ -39,12 +40,13 @@ from app.settings import Settings
 from app.stage_link import StageLink, Status
 from app.store import Store, now_utc
 from osfcore.errors import InvalidInput, MissingAssets, OsfError, UnknownName
-from osfcore.objects.library import AssetLibrary
+from osfcore.objects.library import AssetLibrary, check_name
 from osfcore.poses import Pose, unit_quaternion
 from osfcore.scene import DEFAULT_IMAGE_SIDE, MAX_OBJECTS, Light, check_action, image_side
 
 DEMO_OBJECTS = 3
 MAX_SEED = 2**31 - 1
+_RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
 
 
@@ -77,6 +79,7 @@ class Runner:
         self.library = library
         self.hub = Hub()
         self.jobs = Jobs(store, settings.data_dir, self._on_job, settings.max_queued_jobs, settings.cancel_grace_s)
+        self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets)
         self._stage = StageLink(
             library.root,
             settings.max_live_worlds,
@@ -89,7 +92,7 @@ class Runner:
         self._records: dict[str, SceneRecord] = {}
         self._current: str | None = None
         self._watchers = 0
-        self._images = _ImageCache(settings.image_cache_bytes)
+        self._images = ImageCache(settings.image_cache_bytes)
         self._images_in_the_making: dict[ImageKey, asyncio.Future[bytes]] = {}
         self._scenes_in_the_making = 0
         self._demo_due = settings.demo_scene
@@ -101,12 +104,14 @@ class Runner:
         self._records = {record.id: record for record in records}
         if self._current is None and records:
             self._current = records[-1].id
+        self.sets.start()
         self._stage.start()
         self.jobs.start()
         self.ensure_demo_scene()
 
     def stop(self) -> None:
-        """End both processes. Calling it again does nothing."""
+        """End all processes. Calling it again does nothing."""
+        self.sets.stop()
         self.jobs.stop()
         self._stage.stop()
 
@@ -309,9 +314,24 @@ class Runner:
         Raises:
             OsfError: if it could not succeed, or too many wait.
         """
+        if kind == "train_field":
+            self._check_training(params)
         fetches = kind == "fetch_assets"
         check_params(kind, params, self.library.info if fetches else self._check_object, len(self.library.names()))
         return self.jobs.submit(kind, params)
+
+    def remove_set(self, set_id: str) -> None:
+        """Delete an uploaded image set.
+
+        Raises:
+            UnknownName: if there is none.
+            SetInUse: if a job needs it.
+        """
+        self.sets.get(set_id)
+        for job in self.jobs.live("train_field"):
+            if job.params["source"]["set"] == set_id:
+                raise SetInUse(set_id, job.id)
+        self.sets.remove(set_id)
 
     def ensure_demo_scene(self) -> None:
         """Make the first scene as soon as there are objects, in the background; does nothing if there is a scene."""
@@ -360,6 +380,18 @@ class Runner:
             self.library.info(name)  # raises UnknownName for what nobody knows
             raise MissingAssets([name])
 
+    def _check_training(self, params: dict[str, Any]) -> None:
+        name, source = check_name(params["name"]), params["source"]
+        if name in _RESERVED:
+            raise InvalidInput("object name", repr(name), "another one; this one is taken")
+        if source["mesh"] is not None:
+            self._check_object(source["mesh"])
+        else:
+            self.sets.get(source["set"])
+        for job in self.jobs.live("train_field"):
+            if job.params["name"] == name:
+                raise TrainingAlready(name, job.id)
+
     def _check_free(self, scene: str) -> None:
         job = self.jobs.holder(scene)
         if job is not None:
@@ -392,27 +424,3 @@ def _stacked(poses: list[Pose]) -> Pose:
     return Pose(
         np.array([pose.position for pose in poses], float).reshape(-1, 3), unit_quaternion(quaternions, "quaternions")
     )
-
-
-class _ImageCache:
-    """The latest images, up to a number of bytes."""
-
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._bytes = 0
-        self._images: OrderedDict[object, bytes] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: object) -> bytes | None:
-        with self._lock:
-            if key in self._images:
-                self._images.move_to_end(key)
-            return self._images.get(key)
-
-    def put(self, key: object, image: bytes) -> None:
-        with self._lock:
-            self._bytes += len(image) - len(self._images.get(key, b""))
-            self._images[key] = image
-            while self._bytes > self._max_bytes:
-                _, dropped = self._images.popitem(last=False)
-                self._bytes -= len(dropped)

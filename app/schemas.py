@@ -5,12 +5,11 @@ Lengths in metres, time in seconds, quaternions (w, x, y, z), world z up with th
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.job import Job, State
 from app.messages import SceneRecord
 from app.runner import MAX_SEED
 from osfcore.objects.asset import ObjectInfo
@@ -261,101 +260,6 @@ class SceneList(BaseModel):
 
     scenes: list[SceneOut]
     current: str | None = Field(description="Identifier of the scene that is shown.")
-
-
-class CollectPushesParams(Input):
-    """Episodes of random pushes for learning dynamics, as one HDF5 file."""
-
-    episodes: int = Field(1000, ge=1, le=100_000)
-    steps: int = Field(50, ge=1, le=1000, description="Actions of 0.2 s an episode.")
-    objects: int = Field(3, ge=1, le=MAX_OBJECTS, description="Objects a scene, drawn at random.")
-    policy: Literal["paper", "directed"] = Field(
-        "paper", description="Uniform random velocities, or a pusher that seeks sustained contact."
-    )
-    seed: Seed = 0
-    images: bool = Field(False, description="Keep frames of camera 0 as well.")
-
-
-class CollectTableParams(Input):
-    """Images of the bare table under many lights."""
-
-    images: int = Field(300, ge=60, le=5000)
-    size: ImageSize = DEFAULT_IMAGE_SIDE
-    seed: Seed = 0
-
-
-class CollectObjectParams(CollectTableParams):
-    """Images of one object from all sides under many lights."""
-
-    name: ObjectName
-
-
-class FetchAssetsParams(Input):
-    """Objects to fetch from the package index."""
-
-    names: list[ObjectName] = Field(default=[], max_length=64, description="Empty for all that it has.")
-
-
-class CollectPushesJob(Input):
-    """Collect pushes."""
-
-    kind: Literal["collect_pushes"]
-    params: CollectPushesParams = CollectPushesParams()  # pyright: ignore[reportCallIssue]
-
-
-class CollectObjectJob(Input):
-    """Collect images of an object."""
-
-    kind: Literal["collect_object"]
-    params: CollectObjectParams
-
-
-class CollectTableJob(Input):
-    """Collect images of the table."""
-
-    kind: Literal["collect_table"]
-    params: CollectTableParams = CollectTableParams()  # pyright: ignore[reportCallIssue]
-
-
-class FetchAssetsJob(Input):
-    """Fetch objects."""
-
-    kind: Literal["fetch_assets"]
-    params: FetchAssetsParams = FetchAssetsParams()
-
-
-JobIn = Annotated[CollectPushesJob | CollectObjectJob | CollectTableJob | FetchAssetsJob, Field(discriminator="kind")]
-
-
-class JobOut(BaseModel):
-    """A job as it is now."""
-
-    id: str
-    kind: Literal["collect_pushes", "collect_object", "collect_table", "fetch_assets"]
-    params: dict[str, Any]
-    state: State
-    position: int | None = Field(description="Place in the queue, 1 is next; null when not queued.")
-    done: int = Field(description="Units finished.")
-    total: int = Field(description="Units in all; 0 before it is known.")
-    note: str
-    eta_s: float | None = Field(description="Estimated time left [s].")
-    created_at: str
-    started_at: str | None
-    finished_at: str | None
-    error: str | None
-    result: dict[str, Any] | None
-    files: list[str] = Field(description="Names to download from /api/jobs/{id}/files/{name}.")
-
-    @staticmethod
-    def of(job: Job) -> JobOut:
-        """From the registry's job."""
-        return JobOut.model_validate(job, from_attributes=True)
-
-
-class JobList(BaseModel):
-    """Jobs, newest first."""
-
-    jobs: list[JobOut]
 
 
 class FrameEvent(BaseModel):

@@ -6,10 +6,11 @@ A page of another site may send requests here, or rebind its own name to this ad
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -64,13 +65,31 @@ def is_same_origin(connection: HTTPConnection, allowed: Iterable[str] = ()) -> b
         return False
 
 
+class BodyLimitMiddleware:
+    """Refuses requests larger than what `limit_of` tells for their path [bytes]."""
+
+    def __init__(self, app: ASGIApp, *, limit_of: Callable[[str], int]) -> None:
+        self._app = app
+        self._limit_of = limit_of
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on one request, counting what comes in."""
+        limit = self._limit_of(scope.get("path", ""))
+        await RequestBodyLimitMiddleware(self._app, max_body_size=limit)(scope, receive, send)
+
+
 class SecurityMiddleware:
     """Refuses unknown hosts and foreign origins, and adds headers to every response."""
 
     def __init__(
-        self, app: ASGIApp, *, allowed_hosts: Iterable[str], allowed_origins: Iterable[str], max_body_bytes: int
+        self,
+        app: ASGIApp,
+        *,
+        allowed_hosts: Iterable[str],
+        allowed_origins: Iterable[str],
+        limit_of: Callable[[str], int],
     ) -> None:
-        self._max_body_bytes = max_body_bytes
+        self._limit_of = limit_of
         self._app = app
         self._allowed_hosts = frozenset(allowed_hosts)
         self._allowed_origins = frozenset(allowed_origins)
@@ -102,7 +121,7 @@ class SecurityMiddleware:
                 return
             if message["type"] == "http.response.start" and message["status"] == 413:
                 is_too_large = True
-                detail = f"The request is larger than {self._max_body_bytes} bytes."
+                detail = f"The request is larger than {self._limit_of(path)} bytes."
                 await problem(413, detail)(scope, receive, send_with_headers)
                 return
             await send_with_headers(message)

@@ -10,6 +10,7 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from app.field_shelf import FieldShelf
 from app.messages import SceneRecord
 from app.runner import Runner
 from app.schemas import SceneOut
@@ -65,6 +66,7 @@ class Services:
     runner: Runner
     viewer: Viewer
     shelf: Shelf
+    fields: FieldShelf
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
     def scene_out(self, record: SceneRecord) -> SceneOut:

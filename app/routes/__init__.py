@@ -3,6 +3,9 @@
 from typing import Any
 
 PROBLEM_REF = {"$ref": "#/components/schemas/Problem"}
+PNG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}, "description": "The image."}
+}
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:

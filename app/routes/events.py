@@ -16,7 +16,8 @@ from starlette.concurrency import run_in_threadpool
 from app.job import Job, JobChanged, job_from_fields
 from app.messages import CurrentScene, FramesTaken, Notice, SceneChanged
 from app.routes import problems
-from app.schemas import FrameEvent, JobOut, NoticeEvent
+from app.schemas import FrameEvent, NoticeEvent
+from app.schemas_jobs import JobOut
 from app.services import Services, ServicesDep
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())

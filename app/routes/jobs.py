@@ -5,10 +5,11 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path, Response, status
 from fastapi.responses import FileResponse
 
+from app.field_job import PREVIEW
 from app.job import Job, check_file_name
 from app.problems import NotFound
-from app.routes import problems
-from app.schemas import JobIn, JobList, JobOut
+from app.routes import PNG, problems
+from app.schemas_jobs import JobIn, JobList, JobOut
 from app.services import Services, ServicesDep
 from osfcore.errors import UnknownName
 
@@ -23,7 +24,7 @@ _FILE = {
 }
 
 
-@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(429))
+@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429))
 def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Response) -> JobOut:
     """Queue a job; one runs at a time. Outputs go to the data directory's collections/ID."""
     job = services.runner.submit_job(body.kind, body.params.model_dump())
@@ -75,6 +76,16 @@ def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
     if not path.is_file():
         raise NotFound(f"{name} of job {job} has been removed from the data directory.")
     return FileResponse(path, filename=name, media_type="application/octet-stream")
+
+
+@router.get("/{job}/preview.png", response_class=FileResponse, responses={**problems(404), **PNG})
+def preview(services: ServicesDep, job: JobId) -> FileResponse:
+    """Show one unseen image of a field in training: the truth, the field's, and their difference times four."""
+    _found(services, job)
+    path = services.runner.jobs.folder(job) / PREVIEW
+    if not path.is_file():
+        raise NotFound(f"Job {job} has no preview; training a field makes one, some seconds after it has begun.")
+    return FileResponse(path, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
 def _found(services: Services, job: str) -> Job:

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Path, Query, Response, status
 
 from app.messages import SceneRecord, TakeImage, TakeMask
 from app.problems import NotFound
-from app.routes import problems
+from app.routes import PNG, problems
 from app.schemas import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
 from app.services import Services, ServicesDep
 from osfcore.errors import OsfError, UnknownName
@@ -17,9 +17,6 @@ _CAMERAS = (*(str(number) for number in range(len(CAMERA_POSITIONS))), "goal")
 SceneId = Annotated[str, Path(description="Identifier of a scene.")]
 CameraName = Annotated[str, Path(description='"0" to "3" or "goal".', examples=["0"])]
 SizeQuery = Annotated[ImageSize | None, Query(description="Side of the image [px]; the scene's own if left out.")]
-_PNG = {
-    200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}, "description": "The image."}
-}
 
 
 @router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409))
@@ -90,7 +87,7 @@ def act(services: ServicesDep, scene: SceneId, body: ActionsIn) -> SceneOut:
     return services.scene_out(services.runner.act(scene, body.actions))
 
 
-@router.get("/{scene}/images/{camera}.png", response_class=Response, responses={**problems(404), **_PNG})
+@router.get("/{scene}/images/{camera}.png", response_class=Response, responses={**problems(404), **PNG})
 async def image(
     services: ServicesDep,
     scene: SceneId,
@@ -104,7 +101,7 @@ async def image(
     return await _png(services, TakeImage(scene, camera, size or record.image_size, masks, pusher))
 
 
-@router.get("/{scene}/masks/{camera}/{name}.png", response_class=Response, responses={**problems(404), **_PNG})
+@router.get("/{scene}/masks/{camera}/{name}.png", response_class=Response, responses={**problems(404), **PNG})
 async def mask(
     services: ServicesDep,
     scene: SceneId,

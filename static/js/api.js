@@ -29,6 +29,23 @@ async function call(method, path, body) {
   return answer.status === 204 ? null : answer.json();
 }
 
+/** Sends a file; `onProgress` is told the share that has been sent. */
+export function upload(path, file, onProgress) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest(); // fetch tells no progress of what it sends
+    request.open("POST", `api/${path}`);
+    request.setRequestHeader("Content-Type", "application/zip");
+    request.upload.addEventListener("progress", (event) => event.lengthComputable && onProgress(event.loaded / event.total));
+    request.addEventListener("error", () => reject(new ApiError("The service cannot be reached, or refused a file of this size.", 0)));
+    request.addEventListener("load", async () => {
+      const answer = new Response(request.responseText, { status: request.status });
+      if (answer.ok) resolve(await answer.json());
+      else reject(new ApiError(await problemOf(answer), answer.status));
+    });
+    request.send(file);
+  });
+}
+
 export const get = (path) => call("GET", path);
 export const post = (path, body) => call("POST", path, body);
 export const patch = (path, body) => call("PATCH", path, body);

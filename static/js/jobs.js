@@ -2,13 +2,14 @@
 import { get, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { refreshObjects } from "./objects.js";
-import { objects, watch } from "./state.js";
+import { objects, set, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
+  train_field: "Field",
 };
-const LIVE = new Set(["queued", "running", "paused"]);
+export const LIVE = new Set(["queued", "running", "paused"]);
 const number = (name, label, value, min, max) => ({ name, label, value, min, max, type: "number" });
 const FIELDS = {
   collect_pushes: () => [
@@ -62,14 +63,22 @@ function timeLeft(seconds) {
   return seconds < 5400 ? `, about ${Math.round(seconds / 60)} min left` : `, about ${(seconds / 3600).toFixed(1)} h left`;
 }
 
-function stateText(job) {
+export function stateText(job) {
   if (job.state === "queued") return `waiting, number ${job.position ?? "?"} in line`;
-  if (job.state === "running") return `${job.note || "running"}${timeLeft(job.eta_s)}`;
+  // Training tells the time left itself.
+  if (job.state === "running") return `${job.note || "running"}${/ left$/.test(job.note) ? "" : timeLeft(job.eta_s)}`;
   if (job.state === "paused") return "paused";
+  if (job.kind === "train_field") return `${job.state}${outcome(job)}`;
   return `${job.state}${job.total ? `, ${job.done} of ${job.total}` : ""}${outcome(job)}`;
 }
 
+/** A field's PSNR on images that it was not trained on. */
+export function psnrText({ psnr_full: full, psnr_mask: mask }) {
+  return `${full.toFixed(1)} dB, ${mask.toFixed(1)} dB in the mask`;
+}
+
 function outcome({ result }) {
+  if (Number.isFinite(result?.psnr_mask)) return `, ${psnrText(result)}`;
   if (result?.contact_share === undefined || !result.episodes_per_s) return "";
   const percent = (share) => `${(100 * share).toFixed(0)} %`;
   return `, contact in ${percent(result.contact_share)} of the steps, motion in ${percent(result.motion_share)}`;
@@ -79,10 +88,11 @@ function outcome({ result }) {
 function orderText({ kind, params: p }) {
   if (kind === "collect_pushes") return `${p.episodes} × ${p.steps} steps, ${p.objects} objects, ${p.policy} policy, seed ${p.seed}`;
   if (kind === "fetch_assets") return p.names?.length ? p.names.join(", ") : "all from the package index";
+  if (kind === "train_field") return `${p.minutes} min from ${p.source.mesh ? `${p.images} images of its mesh` : "an uploaded set"}, seed ${p.seed}`;
   return `${p.images} images of ${p.size} px, seed ${p.seed}`;
 }
 
-function titleText({ kind, params }) {
+export function titleText({ kind, params }) {
   const label = objects().find((object) => object.name === params.name)?.label ?? params.name;
   return label ? `${KINDS[kind]}: ${label}` : KINDS[kind];
 }
@@ -93,11 +103,14 @@ function command(text, className, action) {
   return button;
 }
 
-function controls(job) {
+export function controls(job) {
   const buttons = [];
   if (job.state === "running") buttons.push(command("Pause", "plain", () => post(`jobs/${job.id}/pause`)));
   if (job.state === "paused") buttons.push(command("Resume", "plain", () => post(`jobs/${job.id}/resume`)));
   if (LIVE.has(job.state)) buttons.push(command("Cancel", "plain danger", () => remove(`jobs/${job.id}`)));
+  if (job.kind === "train_field" && job.state === "failed") {
+    buttons.push(command("Start again", "plain", () => post("jobs", { kind: job.kind, params: job.params })));
+  }
   for (const name of job.files) {
     buttons.push(el("a", { href: `api/jobs/${job.id}/files/${encodeURIComponent(name)}`, textContent: name, download: name }));
   }
@@ -135,6 +148,12 @@ function draw(job) {
   node.key = controlsKey(job);
 }
 
+/** The training that runs, else the one that was asked for last. */
+function latestTraining() {
+  const all = [...jobs.values()].filter((job) => job.kind === "train_field");
+  return all.find((job) => job.state === "running" || job.state === "paused") ?? all.at(-1);
+}
+
 export function showJob(job) {
   const before = jobs.get(job.id);
   jobs.set(job.id, job);
@@ -143,6 +162,7 @@ export function showJob(job) {
   const live = [...jobs.values()].filter((other) => LIVE.has(other.state)).length;
   byId("jobs-count").textContent = live;
   byId("jobs-count").hidden = live === 0;
+  if (job.kind === "train_field") set("training", latestTraining());
   if (job.kind === "fetch_assets" && job.state === "done" && before && before.state !== "done") refreshObjects();
 }
 

@@ -3,6 +3,7 @@ import { get } from "./api.js";
 import { setUpCameras, showFrames } from "./cameras.js";
 import { byId } from "./dom.js";
 import { listen } from "./events.js";
+import { refreshSets, setUpFields } from "./fields.js";
 import { refreshJobs, setUpJobs, showJob } from "./jobs.js";
 import { setUpKeyboard } from "./keyboard.js";
 import { setUpLight } from "./light.js";
@@ -58,9 +59,11 @@ setUpNumbers();
 setUpScenes();
 setUpObjects();
 setUpJobs();
+setUpFields();
 setUpWelcome();
 setUpKeyboard();
 refreshObjects();
+refreshSets();
 
 listen({
   open(again) {
@@ -70,6 +73,7 @@ listen({
       expectOlder();
       refreshScenes();
       refreshObjects();
+      refreshSets();
     }
   },
   lost: () => status("Reconnecting", "lost"),

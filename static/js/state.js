@@ -1,8 +1,9 @@
 // What the page knows of the service; modules subscribe to what they show.
 
 // The scene is undefined until the service has told, and null when there is none.
-const state = { scene: undefined, objects: [] };
-const listeners = { scene: [], objects: [] };
+// `training` is the job that trains a field now, or the latest one that did.
+const state = { scene: undefined, objects: [], training: undefined };
+const listeners = { scene: [], objects: [], training: [] };
 
 export const current = () => state.scene;
 export const objects = () => state.objects;

@@ -102,5 +102,5 @@ def test_pausing_holds_and_cancelling_frees():
 
 
 def test_every_kind_that_rest_offers_exists():
-    assert set(KINDS) == {"collect_pushes", "collect_object", "collect_table", "fetch_assets"}
+    assert set(KINDS) == {"collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field"}
     assert Place(Path("d"), Path("f")).library.root == Path("d/objects")

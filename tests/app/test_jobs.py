@@ -4,7 +4,8 @@ import time
 
 import pytest
 
-from app.jobs import STOPPED_NOTE, Jobs, QueueFull, WrongJobState
+from app.field_files import workshop
+from app.jobs import RESUMES_NOTE, STOPPED_NOTE, Jobs, QueueFull, WrongJobState
 from app.store import Store
 from osfcore.errors import UnknownName
 from tests.app.conftest import until
@@ -156,3 +157,23 @@ def test_a_scene_is_held_only_by_the_running_job_that_names_it(open_jobs):
     assert jobs.holder("s") == job.id
     jobs.pause(job.id)
     assert jobs.holder("s") is None
+
+
+def test_a_training_that_was_killed_says_that_it_can_go_on_and_a_cancelled_one_leaves_nothing(open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    source = {"mesh": "009_gelatin_box", "set": None}
+    params = {"name": "box", "source": source, "minutes": 10, "seed": 0, "images": 5000}
+    shop = workshop(data_dir, "box")
+    job = jobs.submit("train_field", params)
+    until(lambda: "Image" in jobs.get(job.id).note)
+    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    assert RESUMES_NOTE in until_state(jobs, job, "failed").error
+    assert shop.is_dir()
+    again = jobs.submit("train_field", params)
+    assert [live.id for live in jobs.live("train_field")] == [again.id]
+    until(lambda: "Image" in jobs.get(again.id).note)
+    start = time.monotonic()
+    assert jobs.cancel(again.id).state == "cancelled"
+    assert time.monotonic() - start < 2.5
+    assert not shop.exists()
+    assert jobs.live("train_field") == ()

@@ -29,6 +29,7 @@ CHECKS = (
 STREAMS = "/api/events"  # never ends
 EXAMPLES = 12
 LOCAL = {"Host": "localhost"}
+schemathesis.serializer.alias("application/zip", "application/octet-stream")
 
 
 class Stand:

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
-from app.job import Job
-from app.schemas import CameraOut, JobIn, JobOut, LightIn, SceneIn, SceneOut
+from app.schemas import CameraOut, LightIn, SceneIn, SceneOut
 from osfcore.errors import InvalidInput
 from osfcore.scene import goal_camera
 from tests.app.test_store import record
@@ -36,18 +35,3 @@ def test_unknown_fields_are_mistakes():
 def test_a_light_below_the_table_is_refused():
     with pytest.raises(InvalidInput, match="elevation"):
         LightIn(position=[1, 0, -0.1]).light()
-
-
-def test_jobs_are_told_apart_by_kind():
-    adapter = TypeAdapter(JobIn)
-    job = adapter.validate_python({"kind": "collect_pushes", "params": {"episodes": 2}})
-    assert job.params.model_dump()["steps"] == 50
-    with pytest.raises(ValidationError):
-        adapter.validate_python({"kind": "collect_object"})
-    with pytest.raises(ValidationError):
-        adapter.validate_python({"kind": "collect_pushes", "params": {"out": "/etc/passwd"}})
-
-
-def test_a_job_says_what_the_registry_says():
-    out = JobOut.of(Job("a", "collect_table", {"images": 60}, files=("table.zip",), position=2))
-    assert (out.files, out.position, out.state) == (["table.zip"], 2, "queued")

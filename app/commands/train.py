@@ -1,0 +1,90 @@
+"""`osf train`: fields from image sets."""
+
+from __future__ import annotations
+
+import json as json_text
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from app.commands.progress_bar import follow
+
+if TYPE_CHECKING:
+    from osfcore.fields.training import FieldStep
+    from osfcore.progress import Progress
+
+
+@dataclass(frozen=True)
+class TrainFieldCommand:
+    """An object's field from an image set in the OSF format. A killed training goes on when started again."""
+
+    data: Path
+    """Folder with train/anno.json and test/anno.json."""
+    out: Path
+    """File to write, such as 006_mustard_bottle.safetensors; its metrics go beside it as .json."""
+    minutes: float = 30.0
+    """How long to train [min]."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
+        from osfcore.fields.training import TrainField, train_field
+
+        config = TrainField(self.data, self.out, self.minutes, self.device, self.seed)
+        follow(_progress(train_field(config)))
+        metrics = _metrics(self.out)
+        if not self.json:
+            full, mask = metrics["psnr_full"], metrics["psnr_mask"]
+            quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
+            print(f"Wrote {self.out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
+        return {"out": str(self.out), **metrics}
+
+
+@dataclass(frozen=True)
+class TrainTableCommand:
+    """The table's field from an image set of the bare table."""
+
+    data: Path
+    """Folder with train/anno.json and test/anno.json, such as 'osf collect table' writes."""
+    out: Path
+    """File to write, such as table.safetensors; its metrics go beside it as .json."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        from osfcore.fields.training_table import TrainTable, train_table
+
+        follow(train_table(TrainTable(self.data, self.out, self.device, self.seed)))
+        metrics = _metrics(self.out)
+        if not self.json:
+            print(f"Wrote {self.out}: {metrics['psnr']:.1f} dB on unseen views and lights.")
+        return {"out": str(self.out), **metrics}
+
+
+def _progress(steps: Iterator[FieldStep]) -> Iterator[Progress]:
+    for step in steps:
+        yield step.progress
+
+
+def _metrics(out: Path) -> dict[str, Any]:
+    return json_text.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+
+
+Train = Annotated[
+    Annotated[TrainFieldCommand, tyro.conf.subcommand("field")]
+    | Annotated[TrainTableCommand, tyro.conf.subcommand("table")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

@@ -1,0 +1,212 @@
+// Fields: what there is and how good it is, training new ones from a mesh or an uploaded image set, watching it.
+import { get, post, remove, upload } from "./api.js";
+import { byId, el, whileDisabled } from "./dom.js";
+import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
+import { objects, watch } from "./state.js";
+import { tellFailure, toast } from "./toasts.js";
+
+const DOUBT_MS = 4000;
+let sets = [];
+let shown = { id: "", state: "", controls: "", preview: "" };
+
+const form = () => byId("new-field");
+const source = () => form().elements.from.value;
+
+function options(select, entries, empty) {
+  const before = select.value;
+  select.replaceChildren(...entries.map(([value, text]) => el("option", { value, textContent: text })));
+  if (!entries.length) select.append(el("option", { value: "", textContent: empty }));
+  if (entries.some(([value]) => value === before)) select.value = before;
+}
+
+/** A button that asks once more before it does what cannot be undone. */
+function doubted(button, text, action) {
+  const sure = button.textContent;
+  button.addEventListener("click", () => {
+    if (button.textContent === sure) {
+      button.textContent = text;
+      setTimeout(() => { button.textContent = sure; }, DOUBT_MS);
+    } else {
+      whileDisabled(button, () => tellFailure(action));
+    }
+  });
+  return button;
+}
+
+function entry(field) {
+  const { psnr_full: full, psnr_mask: mask, minutes } = field.metrics;
+  const quality = Number.isFinite(full) && Number.isFinite(mask) ? psnrText(field.metrics) : "not measured";
+  const origin = field.source === "trained" ? "trained here" : "shipped";
+  const effort = Number.isFinite(minutes) ? ` in ${Number(minutes.toPrecision(2))} min` : "";
+  const item = el(
+    "li", {},
+    el("div", { className: "row" },
+      el("span", { className: "title", textContent: field.label, title: field.name }),
+      field.source === "trained" ? deleteButton(field.name) : null),
+    el("span", { className: "state", textContent: quality }),
+    el("span", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}` }),
+    field.has_mesh ? null : el("span", { className: "missing", textContent: "needs a mesh for scenes", title: field.note }),
+  );
+  item.dataset.field = field.name;
+  return item;
+}
+
+function deleteButton(name) {
+  return doubted(el("button", { type: "button", className: "plain danger", textContent: "Delete" }), "Really delete", async () => {
+    await remove(`fields/${encodeURIComponent(name)}`);
+    await refreshFields();
+  });
+}
+
+export async function refreshFields() {
+  const answer = await tellFailure(() => get("fields"));
+  if (!answer) return;
+  byId("field-list").replaceChildren(...answer.fields.map(entry));
+  byId("no-fields").hidden = answer.fields.length > 0;
+  byId("fields-hint").hidden = answer.fields.length === 0;
+}
+
+// Image sets
+
+export async function refreshSets() {
+  const answer = await tellFailure(() => get("fields/sets"));
+  if (answer) drawSets(answer.sets);
+}
+
+function drawSets(now) {
+  sets = now;
+  options(form().elements.set, sets.map((set) => [set.id, set.file_name]), "none uploaded yet");
+  drawSet();
+}
+
+function drawSet() {
+  const chosen = sets.find((set) => set.id === form().elements.set.value);
+  const format = "A zip with train/anno.json, test/anno.json and RGBA images beside them, in the OSF format.";
+  byId("set-facts").textContent = chosen ? `${chosen.summary}. The pictures show how it was understood.` : format;
+  byId("delete-set").hidden = !chosen;
+  const overlay = byId("set-overlay");
+  overlay.hidden = !chosen;
+  if (chosen) overlay.src = `api/fields/sets/${chosen.id}/overlay.png`;
+  else overlay.removeAttribute("src");
+}
+
+async function uploadSet(file) {
+  const bar = byId("upload-bar");
+  const told = byId("set-facts");
+  bar.hidden = false;
+  bar.value = 0;
+  told.textContent = `Uploading ${file.name}`;
+  const progress = (share) => {
+    bar.value = share;
+    if (share === 1) told.textContent = `Checking ${file.name}: unpacking it and looking at every image`;
+  };
+  try {
+    const set = await upload(`fields/sets?file_name=${encodeURIComponent(file.name.slice(-200))}`, file, progress);
+    drawSets([...sets, set]);
+    form().elements.set.value = set.id;
+    if (!form().elements.name.value) form().elements.name.value = nameFrom(file.name);
+  } finally {
+    bar.hidden = true;
+    drawSet();
+  }
+}
+
+/** A name that the service takes, made from a file's. */
+function nameFrom(file) {
+  const plain = file.toLowerCase().replace(/\.zip$/, "").replace(/[^a-z0-9_-]+/g, "_");
+  return plain.replace(/^[^a-z0-9]+/, "").slice(0, 64);
+}
+
+async function deleteSet() {
+  await remove(`fields/sets/${form().elements.set.value}`);
+  await refreshSets();
+}
+
+// Training
+
+async function train() {
+  const { mesh, set, name, images, minutes, seed } = form().elements;
+  const isMesh = source() === "mesh";
+  if (isMesh && !mesh.value) throw new Error("No meshes are on this machine yet; fetch objects first.");
+  if (!isMesh && !set.value) throw new Error("Upload a zip with an image set first.");
+  if (!isMesh && !name.value.trim()) throw new Error("Give the object a name.");
+  const params = {
+    name: isMesh ? mesh.value : name.value.trim(),
+    source: isMesh ? { mesh: mesh.value } : { set: set.value },
+    minutes: Number(minutes.value),
+    seed: Number(seed.value),
+    ...(isMesh ? { images: Number(images.value) } : {}),
+  };
+  showJob(await post("jobs", { kind: "train_field", params }));
+}
+
+function drawTraining(job) {
+  byId("training").hidden = !job;
+  if (!job) return;
+  const before = shown;
+  const result = job.result ?? {};
+  const label = objects().find((object) => object.name === job.params.name)?.label ?? job.params.name;
+  byId("training").dataset.state = job.state;
+  byId("training-title").textContent = label;
+  byId("training-title").title = titleText(job);
+  byId("training-psnr").textContent = Number.isFinite(result.psnr_mask) ? psnrText(result) : "";
+  byId("training-bar").hidden = !LIVE.has(job.state);
+  byId("training-bar").value = job.total ? job.done / job.total : 0;
+  // PSNR stands in the head already.
+  byId("training-state").textContent = job.state === "done" ? "done" : stateText(job).replace(/^.*dB.*, (?=.* left$)/, "");
+  byId("training-error").textContent = job.error ?? "";
+  byId("training-error").hidden = !job.error;
+  const preview = result.previews && job.state !== "failed" && job.state !== "cancelled"
+    ? `api/jobs/${job.id}/preview.png?v=${result.previews}` : "";
+  const key = `${job.state} ${job.files.join()}`;
+  shown = { id: job.id, state: job.state, controls: key, preview };
+  if (before.id !== job.id || before.controls !== key) byId("training-actions").replaceChildren(...controls(job));
+  if (before.preview !== preview) drawPreview(preview);
+  if (before.id === job.id && before.state !== job.state) tellEnd(job, label);
+}
+
+function drawPreview(address) {
+  byId("training-preview").hidden = !address;
+  if (address) byId("training-image").src = address;
+  else byId("training-image").removeAttribute("src");
+}
+
+function tellEnd(job, label) {
+  if (job.state === "done") {
+    toast(`The field of ${label} is ready.`);
+    refreshFields();
+  } else if (job.state === "failed") {
+    toast(job.error, "error");
+  }
+}
+
+function drawSource() {
+  byId("from-mesh").hidden = source() !== "mesh";
+  byId("from-set").hidden = source() !== "set";
+  form().elements.images.disabled = source() !== "mesh"; // what is hidden must not hold the form up
+}
+
+export function setUpFields() {
+  const file = byId("set-file");
+  const button = byId("upload-set");
+  form().addEventListener("submit", (event) => {
+    event.preventDefault();
+    whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(train));
+  });
+  form().addEventListener("change", drawSource);
+  form().elements.set.addEventListener("change", drawSet);
+  button.addEventListener("click", () => file.click());
+  file.addEventListener("change", () => {
+    const [chosen] = file.files;
+    if (chosen) whileDisabled(button, () => tellFailure(() => uploadSet(chosen)));
+    file.value = "";
+  });
+  doubted(byId("delete-set"), "Really delete set", deleteSet);
+  byId("training-image").addEventListener("error", () => drawPreview(""));
+  watch("objects", () => {
+    const there = objects().filter((object) => object.available);
+    options(form().elements.mesh, there.map((object) => [object.name, object.label]), "none fetched yet");
+    refreshFields();
+  });
+  watch("training", drawTraining);
+}

@@ -1,0 +1,165 @@
+import asyncio
+import shutil
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+from starlette.requests import ClientDisconnect
+
+import app.image_sets
+from app.image_sets import ImageSets, SetRefused, TooManySets, examine
+from osfcore.errors import CorruptFile, UnknownName
+from tests.app.conftest import until
+from tests.core.fields.sets import write_set
+
+
+def zipped(folder: Path) -> bytes:
+    return Path(shutil.make_archive(str(folder), "zip", folder)).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory) -> bytes:
+    """A sound set, zipped."""
+    return zipped(write_set(tmp_path_factory.mktemp("set") / "mug"))
+
+
+@pytest.fixture
+def sets(tmp_path):
+    sets = ImageSets(tmp_path / "sets", max_sets=2)
+    sets.start()
+    yield sets
+    sets.stop()
+
+
+def receive(sets, data: bytes, name: str = "mug.zip"):
+    async def chunks():
+        for start in range(0, len(data), 1000):
+            yield data[start : start + 1000]
+
+    return asyncio.run(sets.receive(chunks(), name))
+
+
+def test_a_sound_set_is_kept_with_a_picture_of_how_it_was_understood(sets, archive, tmp_path):
+    record = receive(sets, archive)
+    assert (record.train, record.test, record.file_name) == (12, 4, "mug.zip")
+    assert "12 train and 4 test images" in record.summary
+    assert sets.all() == (record,) == (sets.get(record.id),)
+    assert (sets.folder(record.id) / "train" / "anno.json").is_file()
+    assert sets.overlay(record.id).read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in (tmp_path / "sets").iterdir()] == [record.id]
+    sets.remove(record.id)
+    assert list((tmp_path / "sets").iterdir()) == []
+    with pytest.raises(UnknownName):
+        sets.remove(record.id)
+
+
+def broken(tmp_path: Path, damage) -> bytes:
+    folder = write_set(tmp_path / "broken")
+    damage(folder)
+    return zipped(folder)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda folder: (folder / "train" / "r_3.png").unlink(), "r_3.png"),
+        (lambda folder: (folder / "train" / "r_3.png").write_bytes(b"\x89PNG"), "r_3.png"),
+        (lambda folder: (folder / "test" / "anno.json").write_text("[]"), "test/anno.json"),
+        (lambda folder: (folder / "train" / "anno.json").unlink(), "no train/anno.json"),
+    ],
+)
+def test_an_unsound_set_is_refused_in_words_that_know_only_the_uploaders_names(sets, tmp_path, damage, words):
+    with pytest.raises(SetRefused) as refusal:
+        receive(sets, broken(tmp_path, damage))
+    assert words in str(refusal.value)
+    assert str(tmp_path) not in str(refusal.value)
+    assert list((tmp_path / "sets").iterdir()) == []
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04 no zip", b"x" * 3_000_000])
+def test_what_is_no_zip_is_refused(sets, tmp_path, data):
+    with pytest.raises(SetRefused, match=r"The uploaded file cannot be used: it is no zip"):
+        receive(sets, data)
+    assert list((tmp_path / "sets").iterdir()) == []
+
+
+def test_a_zip_that_leads_elsewhere_writes_nothing_there(sets, tmp_path):
+    with zipfile.ZipFile(tmp_path / "evil.zip", "w") as file:
+        file.writestr("train/anno.json", "[]")
+        file.writestr("../../evil.txt", "x")
+    with pytest.raises(SetRefused, match="leads out"):
+        receive(sets, (tmp_path / "evil.zip").read_bytes())
+    assert not any(tmp_path.rglob("evil.txt"))
+
+
+def test_a_zip_bomb_is_refused(sets, tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("train/anno.json", b"0" * 50_000_000)
+    with pytest.raises(SetRefused, match="which no image set does"):
+        receive(sets, (tmp_path / "bomb.zip").read_bytes())
+
+
+def test_images_of_the_table_are_told_apart(tmp_path):
+    from osfcore.world.collect_images import CollectTable, collect_table
+
+    for _ in collect_table(CollectTable(tmp_path / "table", images=60, size=16)):
+        pass
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "set.zip").write_bytes(zipped(tmp_path / "table"))
+    with pytest.raises(CorruptFile, match="transparent background is expected"):
+        examine(tmp_path / "new")
+
+
+def test_there_is_an_end_to_what_is_kept(sets, archive):
+    receive(sets, archive)
+    receive(sets, archive)
+    with pytest.raises(TooManySets, match="2 image sets"):
+        receive(sets, archive)
+
+
+def test_an_upload_that_breaks_off_leaves_nothing(sets, archive, tmp_path):
+    async def broken_off():
+        yield archive[:1000]
+        raise ClientDisconnect
+
+    with pytest.raises(ClientDisconnect):
+        asyncio.run(sets.receive(broken_off(), "mug.zip"))
+    assert list((tmp_path / "sets").iterdir()) == []
+
+
+def test_what_a_killed_service_left_half_done_goes_at_the_next_start(tmp_path, archive):
+    sets = ImageSets(tmp_path / "sets")
+    record = receive(sets, archive)
+    (tmp_path / "sets" / ".new-abc").mkdir()
+    (tmp_path / "sets" / "damaged").mkdir()
+    (tmp_path / "sets" / "damaged" / "set.json").write_text("{")
+    again = ImageSets(tmp_path / "sets")
+    again.start()
+    assert not (tmp_path / "sets" / ".new-abc").exists()
+    assert again.all() == (record,)
+
+
+def test_stopping_ends_the_look_at_a_set(sets, archive, monkeypatch, tmp_path):
+    monkeypatch.setattr(app.image_sets, "examine_main", _sleep)
+    outcome = []
+
+    def upload():
+        try:
+            receive(sets, archive)
+        except SetRefused as error:
+            outcome.append(error)
+
+    thread = threading.Thread(target=upload)
+    thread.start()
+    until(lambda: sets._worker is not None and sets._worker.is_alive())
+    sets.stop()
+    thread.join(10)
+    assert "ended unexpectedly" in str(outcome[0])
+    with pytest.raises(SetRefused, match="stopping"):
+        receive(sets, archive)
+
+
+def _sleep(connection, folder):
+    time.sleep(60)
