@@ -21,22 +21,56 @@ from osfcore.render.scene_renderer import (
 )
 from osfcore.scene import Camera
 
+_LAST_CORNER = 1.001  # interpolation needs the corner after
+_TINY = 1e-9
 _NEAREST_M = 1e-3  # corners of boxes closer than that make a box fill the screen
 
 
-class _Table(NamedTuple):
-    """What compiled code needs of a table."""
+class Table(NamedTuple):
+    """What compiled code needs of a table; background is black where there is none."""
 
+    exists: bool
     half_side: np.float32
     albedo: np.ndarray
     ambient: np.ndarray
     background: np.ndarray
 
 
+class Scene(NamedTuple):
+    """Where everything is, in the voxel coordinates of each object.
+
+    Attributes:
+        eye: B x V x N x 3, the cameras.
+        ray: B x V x N x 9, from pixel coordinates (u, v, 1) to directions, of the length that they have in pixels.
+        lit: B x N x 3, toward the light, per metre.
+        lit_inverse: the same, each number inverted.
+        between: B x (N + 1) x N x 12, from the voxel coordinates of one object to those of another; the last is the world.
+        reach: N x 6, lowest and highest corner of what is occupied.
+    """
+
+    eye: np.ndarray
+    ray: np.ndarray
+    lit: np.ndarray
+    lit_inverse: np.ndarray
+    between: np.ndarray
+    reach: np.ndarray
+
+
+class Rules(NamedTuple):
+    """`Quality` for compiled code; `enough` is the optical depth past which no light counts."""
+
+    step_voxels: np.float32
+    min_weight: np.float32
+    stop: np.float32
+    enough: np.float32
+    one_colour: bool
+    shadow_voxels: np.float32
+    samples: int
+
+
 def launch(
     pack: Packed,
     numbers: Int[np.ndarray, "N"],
-    corners: Float[np.ndarray, "N 8 3"],
     table: TableField | None,
     batch: SceneBatch,
     cameras: Sequence[Camera],
@@ -44,38 +78,84 @@ def launch(
     quality: Quality,
     outputs: frozenset[str] | set[str],
 ) -> Rendered:
-    """Render a batch; `numbers` are the objects' fields in the pack, `corners` the corners of their boxes."""
+    """Render a batch; `numbers` are the objects' fields in the pack, the pusher's last."""
     rotations, positions = poses_of(batch)
     scenes, views, count = len(batch.lights), len(cameras), len(batch.names)
-    lights = batch.lights.astype(np.float32)
-    directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(lights)
+    lenses = np.array([camera_numbers(camera) for camera in cameras])
+    corners = _corners_world(pack.extents[numbers], rotations, positions)
+    boxes = np.stack([screen_boxes(corners, camera) for camera in cameras], axis=1)
+    shadows = np.zeros_like(boxes)
+    if table is not None:
+        dropped = _on_table(corners, batch.lights)
+        shadows = np.stack([screen_boxes(dropped, camera) for camera in cameras], axis=1)
     shape = (scenes, views, *size)
     rgb = np.empty((*shape, 3), np.float32)
     wants_opacity = bool({"opacity", "masks"} & set(outputs))
     opacity = np.zeros((scenes, views, count, *size) if wants_opacity else (0,) * 5, np.float32)
     distance = np.empty(shape if "depth" in outputs else (0,) * 4, np.float32)
-    corners_world = np.einsum("bnji,ncj->bnci", rotations, corners) + positions[:, :, None]
-    boxes = np.stack([screen_boxes(corners_world, camera) for camera in cameras], axis=1)
-    dropped = _on_table(corners_world, batch.lights) if table is not None else corners_world
-    shadows = np.stack([screen_boxes(dropped, camera) for camera in cameras], axis=1)
-    if table is None:
-        shadows[...] = 0
-    # A shadow lies on the table between the foot of its object and the far end: both boxes together hold it.
-    numbers_f32 = np.array([camera_numbers(camera) for camera in cameras], np.float32)
-    plain = _plain_table(table)
-    bases, base_of = _bases(plain, table is not None, numbers_f32, directs, size, quality.samples_per_side)
-    f = np.float32
-    rules = (f(quality.step_voxels), f(quality.min_weight), f(quality.stop), quality.one_shadow, f(quality.shadow_voxels))
-    render_batch(
-        pack, plain, table is not None, numbers, rotations.astype(f), positions.astype(f), lights, directs, numbers_f32,
-        bases, base_of, boxes, shadows, rules, quality.samples_per_side, rgb, opacity, distance,
-    )  # fmt: skip
+    plain, rules = _plain_table(table), _rules(quality)
+    lenses_f32 = lenses.astype(np.float32)
+    different, base_of = np.unique(batch.lights.astype(np.float32), axis=0, return_inverse=True)
+    directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
+    base = np.zeros((len(different), *shape[1:], 3), np.float32), np.zeros((len(different), *shape[1:]), np.float32)
+    if table is not None:  # the empty table, once per light
+        render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
+    scene = _scene(pack, numbers, rotations, positions, batch.lights, lenses)
+    render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows, rules,
+                 rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,
         opacity >= MASK_OPACITY if "masks" in outputs else None,
         _z_depth(distance, cameras) if "depth" in outputs else None,
     )
+
+
+def _scene(
+    pack: Packed,
+    numbers: Int[np.ndarray, "N"],
+    rotations: Float[np.ndarray, "B N 3 3"],
+    positions: Float[np.ndarray, "B N 3"],
+    lights: Float[np.ndarray, "B 3"],
+    lenses: Float[np.ndarray, "V 12"],
+) -> Scene:
+    """Everything in voxel coordinates, worked out in double precision."""
+    scales = pack.scales[numbers].astype(float)
+    origin, voxel = scales[:, :3], scales[:, 3:]
+    into = rotations / voxel[..., None]  # from the world
+    offset = -np.einsum("bnij,bnj->bni", into, positions) - origin / voxel
+    eye = np.einsum("bnij,vj->bvni", into, lenses[:, :3]) + offset[:, None]
+    ray = np.einsum("bnij,vjk->bvnik", into, lenses[:, 3:].reshape(-1, 3, 3))
+    lit = np.einsum("bnij,bj->bni", into, lights)
+    # From object n: x_world = R_n^T (voxel_n * x + origin_n) + position_n; the world comes as it is.
+    scenes, count = positions.shape[:2]
+    linear = np.concatenate([np.swapaxes(rotations, -1, -2) * voxel[..., None], np.tile(np.eye(3), (scenes, 1, 1, 1))], 1)
+    shift = np.einsum("bnji,nj->bni", rotations, origin) + positions
+    shift = np.concatenate([shift, np.zeros((scenes, 1, 3))], axis=1)
+    between = np.empty((scenes, count + 1, count, 3, 4))
+    between[..., :3] = np.einsum("bmij,bnjk->bnmik", into, linear)
+    between[..., 3] = np.einsum("bmij,bnj->bnmi", into, shift) + offset[:, None]
+    reach = (pack.extents[numbers].reshape(-1, 2, 3) - origin[:, None]) / voxel[:, None]
+    most = pack.shapes[numbers, :3] - _LAST_CORNER
+    reach = np.stack([np.maximum(reach[:, 0], 0), np.minimum(reach[:, 1], most)], axis=1)
+    inverse = 1 / np.where(np.abs(lit) > _TINY, lit, _TINY)
+    arrays = (eye, ray.reshape(*ray.shape[:3], 9), lit, inverse, between.reshape(scenes, count + 1, count, 12))
+    return Scene(*(array.astype(np.float32) for array in arrays), reach.reshape(-1, 6).astype(np.float32))
+
+
+def _rules(quality: Quality) -> Rules:
+    f = np.float32
+    return Rules(f(quality.step_voxels), f(quality.min_weight), f(quality.stop), f(-np.log(quality.stop)),
+                 quality.one_colour, f(quality.shadow_voxels), quality.samples_per_side)  # fmt: skip
+
+
+def _corners_world(
+    extents: Float[np.ndarray, "N 6"], rotations: Float[np.ndarray, "B N 3 3"], positions: Float[np.ndarray, "B N 3"]
+) -> Float[np.ndarray, "B N 8 3"]:
+    """The corners of the objects' boxes [m]."""
+    choice = np.array(list(np.ndindex(2, 2, 2)), bool)
+    corners = np.where(choice, extents[:, None, 3:], extents[:, None, :3])
+    return np.einsum("bnji,ncj->bnci", rotations, corners) + positions[:, :, None]
 
 
 def screen_boxes(points: Float[np.ndarray, "B N 8 3"], camera: Camera) -> Int[np.ndarray, "B N 4"]:
@@ -104,26 +184,11 @@ def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B
     return dropped
 
 
-def _plain_table(table: TableField | None) -> _Table:
+def _plain_table(table: TableField | None) -> Table:
     if table is None:
         nothing = np.zeros(3, np.float32)
-        return _Table(np.float32(1), np.zeros((2, 2, 3), np.float32), nothing, nothing)
-    return _Table(np.float32(table.half_side), table.albedo, table.ambient, table.background)
-
-
-def _bases(
-    table: _Table, has_table: bool, cameras: np.ndarray, directs: np.ndarray, size: tuple[int, int], samples: int
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """The empty table once per different light and camera, and which of them each image begins with."""
-    different, which = np.unique(directs, axis=0, return_inverse=True)
-    views = len(cameras)
-    if not has_table:
-        return (np.zeros((1, *size, 3), np.float32), np.zeros((1, *size), np.float32)), np.zeros(
-            (len(directs), views), np.int64
-        )
-    drawn = [render_base(table, has_table, camera, direct, size, samples) for direct in different for camera in cameras]
-    base_of = which.reshape(-1, 1) * views + np.arange(views)
-    return (np.stack([rgb for rgb, _ in drawn]), np.stack([distance for _, distance in drawn])), base_of
+        return Table(False, np.float32(1), np.zeros((2, 2, 3), np.float32), nothing, nothing)
+    return Table(True, np.float32(table.half_side), table.albedo, table.ambient, table.background)
 
 
 def _z_depth(distance: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -17,16 +17,17 @@ class Packed(NamedTuple):
     Attributes:
         density: g on all corners.
         index: rows of all corners.
-        rows: features.
+        rows: features, one after another.
         macro: occupied blocks.
         cells: numbers of networks.
-        networks: parameters.
+        networks: parameters, one network after another.
         starts: N x 5: offsets into density and index, rows, macro, cells, networks.
         shapes: N x 9: grid, blocks, cells.
         scales: N x 4: origin [m], voxel [m].
         extents: N x 6: lowest and highest corner of the occupied part [m].
         ambient: N x 3.
         hidden: width of the networks, the same for all.
+        parameters: of one network.
     """
 
     density: np.ndarray
@@ -41,6 +42,7 @@ class Packed(NamedTuple):
     extents: np.ndarray
     ambient: np.ndarray
     hidden: int
+    parameters: int
 
 
 def pack(fields: Sequence[KiloOSF]) -> Packed:
@@ -61,14 +63,15 @@ def pack(fields: Sequence[KiloOSF]) -> Packed:
     starts[1:] = np.cumsum(counts, axis=0)[:-1]
     return Packed(
         **{name: np.concatenate(parts) for name, parts in flat.items()},
-        rows=np.concatenate(rows),
-        networks=np.concatenate(networks),
+        rows=np.concatenate(rows).reshape(-1),
+        networks=np.concatenate(networks).reshape(-1),
         starts=starts,
         shapes=np.array([[*f.index.shape, *f.macro.shape, *f.cells.shape] for f in fields], np.int64),
         scales=np.array([[*f.origin, f.voxel] for f in fields], np.float32),
         extents=np.array([_reach(f).reshape(-1) for f in fields], np.float32),
         ambient=np.array([f.ambient for f in fields], np.float32),
-        hidden=widths.pop(),
+        hidden=fields[0].hidden,
+        parameters=fields[0].networks.shape[1],
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -19,6 +19,7 @@ from osfcore.scene import Camera, SceneState
 OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
 MASK_OPACITY = 0.5
 MOST_OBJECTS = 23  # and the pusher
+_MOST_PACKS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class Quality:
         step_voxels: distance between samples [voxels of the field].
         min_weight: samples that show less are not coloured.
         stop: a ray ends where less of what lies behind would show.
-        one_shadow: ask once per ray and object whether the light arrives, not at every sample.
+        one_colour: ask for colour and light once per ray and object, where most of it is seen, not at every sample.
         shadow_voxels: distance between samples of shadow rays [voxels].
         samples_per_side: rays per pixel, squared.
     """
@@ -37,13 +38,13 @@ class Quality:
     step_voxels: float = 0.5
     min_weight: float = 1e-5
     stop: float = 1e-4
-    one_shadow: bool = False
+    one_colour: bool = False
     shadow_voxels: float = 0.5
     samples_per_side: int = 1
 
 
 EXACT = Quality()
-PLANNING = Quality(step_voxels=1.0, min_weight=0.02, stop=0.03, one_shadow=True, shadow_voxels=1.0)
+PLANNING = Quality(step_voxels=1.0, min_weight=0.02, stop=0.03, one_colour=True, shadow_voxels=1.0)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,20 +108,6 @@ class Rendered:
     depth: Float32[np.ndarray, "B V h w"] | None = None
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Objects:
-    """Fields of one list of names, ready for compiled code."""
-
-    pack: Packed
-    numbers: np.ndarray
-    corners: np.ndarray = field(init=False)
-
-    def __post_init__(self) -> None:
-        low, high = self.pack.extents[self.numbers, :3], self.pack.extents[self.numbers, 3:]
-        choice = np.array(list(np.ndindex(2, 2, 2)), bool)
-        object.__setattr__(self, "corners", np.where(choice, high[:, None], low[:, None]))
-
-
 class SceneRenderer:
     """Renders scenes of known fields.
 
@@ -140,7 +127,7 @@ class SceneRenderer:
         self._fields = dict(fields)
         self._table = table
         self._device = device
-        self._objects: dict[tuple[tuple[str, ...], bool], _Objects] = {}
+        self._packs: dict[tuple[tuple[str, ...], bool], tuple[Packed, np.ndarray]] = {}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -174,15 +161,15 @@ class SceneRenderer:
             return render_on_device(self._fields, self._table, batch, cameras, self._device, quality, outputs)
         from osfcore.render.launch import launch
 
-        objects = self._prepared(batch)
-        return launch(objects.pack, objects.numbers, objects.corners, self._table, batch, cameras, size, quality, outputs)
+        pack, numbers = self._packed(batch)
+        return launch(pack, numbers, self._table, batch, cameras, size, quality, outputs)
 
-    def _prepared(self, batch: SceneBatch) -> _Objects:
-        """The batch's fields, each packed once."""
+    def _packed(self, batch: SceneBatch) -> tuple[Packed, np.ndarray]:
+        """The batch's fields, each packed once, and which of them each object has."""
         key = (batch.names, batch.pusher is not None)
-        if key not in self._objects:
-            if len(self._objects) > 8:  # a viewer that goes through many scenes must not keep them all
-                self._objects.clear()
+        if key not in self._packs:
+            if len(self._packs) > _MOST_PACKS:  # a viewer that goes through many scenes must not keep them all
+                self._packs.clear()
             names = list(dict.fromkeys(batch.names))
             fields = [self._fields[name] for name in names]
             numbers = [names.index(name) for name in batch.names]
@@ -191,8 +178,8 @@ class SceneRenderer:
                 fields.append(pusher_field(hidden))
             if batch.pusher is not None:
                 numbers.append(len(fields) - 1)
-            self._objects[key] = _Objects(pack(fields), np.array(numbers, np.int64))
-        return self._objects[key]
+            self._packs[key] = pack(fields), np.array(numbers, np.int64)
+        return self._packs[key]
 
 
 def check_request(
