@@ -24,6 +24,7 @@ EMPTY_G = -10.0  # of row 0, which every corner outside the shell shares
 FLOOR_G = -6.0  # at and below it the density is exactly 0
 DENSITY_FLOOR = float(np.log1p(np.exp(FLOOR_G)))
 STEP_VOXELS = 0.5  # distance between samples along a ray, in training and in exact rendering
+MOST_HIDDEN = 64  # width of the tiny networks
 MACRO = 4  # side of the blocks that tell occupied from empty space [voxels]
 
 

@@ -6,15 +6,20 @@ however it is cut into pieces.
 
 from __future__ import annotations
 
+import threading
+
 import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from osfcore.fields.kiloosf import DENSITY_FLOOR, FLOOR_G, KiloOSF, MACRO
+from osfcore.fields.kiloosf import DENSITY_FLOOR, FLOOR_G, MACRO, KiloOSF
 
+# Where neither OpenMP nor TBB is there, numba's threads end the process when two calls into parallel code overlap.
+ONE_AT_A_TIME = threading.Lock()
 _FLOOR = np.float32(DENSITY_FLOOR)
 _FLOOR_G = np.float32(FLOOR_G)
 _ONE = np.float32(1)
+_EDGE = np.float32(1.001)  # before the last corner, so that there is always a next one
 
 
 @numba.njit(fastmath=True, inline="always")
@@ -44,6 +49,12 @@ def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201
 
 
 @numba.njit(fastmath=True, inline="always")
+def within(p, count):  # noqa: ANN001, ANN201
+    """A voxel coordinate moved between the first and the last of `count` corners."""
+    return min(max(p, np.float32(0)), np.float32(count) - _EDGE)
+
+
+@numba.njit(fastmath=True, inline="always")
 def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201
     """The part of [t0, t1] in which origin + t * direction lies between low and high."""
     if abs(direction) < np.float32(1e-9):
@@ -63,7 +74,7 @@ def leave_block(p, d, block):  # noqa: ANN001, ANN201
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True, nogil=True)
-def _march(origins, directions, density, macro, low, voxel, step, offsets, min_weight, min_transmittance, ts, counts):  # noqa: ANN001, ANN202, PLR0913
+def _march(origins, directions, density, macro, low, voxel, step, offsets, min_weight, min_transmittance, ts, counts):  # noqa: ANN001, ANN202
     nx, ny, nz = density.shape
     my, mz = macro.shape[1], macro.shape[2]
     flat, blocks = density.ravel(), macro.ravel()
@@ -76,20 +87,17 @@ def _march(origins, directions, density, macro, low, voxel, step, offsets, min_w
             (origins[r, 2] - low[2]) / voxel,
         )
         dx, dy, dz = directions[r, 0] / voxel, directions[r, 1] / voxel, directions[r, 2] / voxel
-        t0, t1 = clip_axis(ox, dx, np.float32(0), np.float32(nx - 1.001), np.float32(0), np.float32(1e9))
-        t0, t1 = clip_axis(oy, dy, np.float32(0), np.float32(ny - 1.001), t0, t1)
-        t0, t1 = clip_axis(oz, dz, np.float32(0), np.float32(nz - 1.001), t0, t1)
+        t0, t1 = clip_axis(ox, dx, np.float32(0), np.float32(nx) - _EDGE, np.float32(0), np.float32(1e9))
+        t0, t1 = clip_axis(oy, dy, np.float32(0), np.float32(ny) - _EDGE, t0, t1)
+        t0, t1 = clip_axis(oz, dz, np.float32(0), np.float32(nz) - _EDGE, t0, t1)
         found, transmittance = 0, _ONE
         k = int(np.ceil(t0 / step - offsets[r]))
         while found < most and transmittance > min_transmittance:
             t = (k + offsets[r]) * step
             if t >= t1:
                 break
-            px, py, pz = (
-                max(ox + t * dx, np.float32(0)),
-                max(oy + t * dy, np.float32(0)),
-                max(oz + t * dz, np.float32(0)),
-            )
+            # Rounding must not lead out of the grid, however far away the ray began.
+            px, py, pz = within(ox + t * dx, nx), within(oy + t * dy, ny), within(oz + t * dz, nz)
             bx, by, bz = int(px) // MACRO, int(py) // MACRO, int(pz) // MACRO
             if blocks[(bx * my + by) * mz + bz] == 0:
                 skip = min(leave_block(px, dx, bx), leave_block(py, dy, by), leave_block(pz, dz, bz))
@@ -133,6 +141,8 @@ def march(
     ts = np.zeros((count, most), np.float32)
     counts: Int64[np.ndarray, "R"] = np.zeros(count, np.int64)
     offsets = np.full(count, 0.5, np.float32) if offsets is None else offsets
+    # Other memory layouts and types would be compiled anew, which takes half a minute.
+    origins, directions, offsets = (np.array(a, np.float32, order="C") for a in (origins, directions, offsets))
     numbers = (
         np.float32(field.voxel),
         np.float32(step),
@@ -140,5 +150,6 @@ def march(
         np.float32(min_weight),
         np.float32(min_transmittance),
     )
-    _march(origins, directions, field.density, field.macro, field.origin, *numbers, ts, counts)
+    with ONE_AT_A_TIME:
+        _march(origins, directions, field.density, field.macro, field.origin, *numbers, ts, counts)
     return ts, np.arange(most) < counts[:, None]

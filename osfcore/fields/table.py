@@ -70,12 +70,11 @@ def read_table(path: Path) -> TableField:
     _, tensors = read_tensors(path, TABLE_FORMAT)
     try:
         arrays = {name: tensors[name].astype(np.float32) for name in _ARRAYS}
-        half_side = float(tensors["half_side"][0])
-    except (KeyError, IndexError) as error:
+        half_side = float(tensors["half_side"].reshape(-1)[0])
+        hidden, side = arrays["b1"].size, len(arrays["albedo"])
+    except (KeyError, IndexError, TypeError) as error:
         raise CorruptFile(path, f"it is not a sound table ({error})") from error
-    hidden = len(arrays["b1"]) if arrays["b1"].ndim == 1 else 0
-    shapes = {"ambient": (3,), "background": (3,), "w1": (3, hidden), "w2": (hidden, 3), "b2": (3,)}
-    side = arrays["albedo"].shape[0]
+    shapes = {"ambient": (3,), "background": (3,), "w1": (3, hidden), "b1": (hidden,), "w2": (hidden, 3), "b2": (3,)}
     shapes["albedo"] = (max(side, 2), max(side, 2), 3)
     for name, shape in shapes.items():
         if arrays[name].shape != shape or not np.all(np.isfinite(arrays[name])):

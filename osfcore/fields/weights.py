@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
@@ -10,16 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from osfcore.errors import CannotWrite, CorruptFile
-from osfcore.fields.kiloosf import EMPTY_G, FEATURES, KiloOSF, network_size
+from osfcore.fields.kiloosf import EMPTY_G, FEATURES, MOST_HIDDEN, KiloOSF, network_size
 
 FORMAT = "kiloosf-1"
 MAX_FILE_BYTES = 64_000_000
 _MAX_CORNERS = 20_000_000
 _LEVELS = 255
+_LARGEST = 1e9  # number in a file, in whatever unit of length
+_VECTORS = {"origin": 3, "ambient": 3, "low": FEATURES, "span": FEATURES}
 
 
 def write_field(path: Path, field: KiloOSF) -> None:
@@ -85,14 +89,25 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
     index[shell] = 1 + np.arange(len(levels), dtype=np.int32)
     empty = np.zeros((1, FEATURES), np.float32)
     empty[0, 0] = EMPTY_G
-    rows = np.concatenate([empty, levels.astype(np.float32) / _LEVELS * tensors["span"] + tensors["low"]])
+    vectors = {name: _vector(tensors, name, size) for name, size in _VECTORS.items()}
+    rows = np.concatenate([empty, levels.astype(np.float32) / _LEVELS * vectors["span"] + vectors["low"]])
     cells, networks = tensors["cells"].astype(np.int32), tensors["networks"].astype(np.float32)
-    if networks.shape[1] != network_size(hidden) or cells.ndim != 3 or cells.min() < 0 or cells.max() >= len(networks):
+    if not 1 <= hidden <= MOST_HIDDEN or networks.shape != (len(networks), network_size(hidden)):
+        raise ValueError(f"networks {networks.shape} of width {hidden}, at most {MOST_HIDDEN}")
+    if cells.ndim != 3 or cells.min() < 0 or cells.max() >= len(networks):
         raise ValueError(f"networks {networks.shape} of width {hidden} for cells {cells.shape}")
     voxel = float(tensors["voxel"][0])
-    if not voxel > 0 or tensors["origin"].shape != (3,) or tensors["ambient"].shape != (3,):
-        raise ValueError("voxel, origin or ambient")
-    return KiloOSF(tensors["origin"], voxel, index, rows.astype(np.float32), cells, networks, hidden, tensors["ambient"])
+    if not 1 / _LARGEST < voxel < _LARGEST:
+        raise ValueError(f"a voxel of {voxel:g}")
+    origin, ambient = vectors["origin"], vectors["ambient"]
+    return KiloOSF(origin, voxel, index, rows.astype(np.float32), cells, networks, hidden, ambient)
+
+
+def _vector(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float32[np.ndarray, "size"]:
+    vector = tensors[name].astype(np.float32)
+    if vector.shape != (size,) or np.abs(vector).max() > _LARGEST:
+        raise ValueError(f"{name} {vector}")
+    return vector
 
 
 def read_tensors(path: Path, expected: str) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
@@ -146,4 +161,5 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
     except OSError as error:
         raise CannotWrite(path, error.strerror or str(error)) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where nothing could be written, there may be no folder either
+            partial.unlink(missing_ok=True)
