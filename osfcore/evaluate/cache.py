@@ -50,7 +50,8 @@ class TaskCache:
             content = json.loads((self._folder / f"{name}.json").read_text())
             if content["circumstances"] != json.loads(json.dumps(circumstances)):
                 return None
-            with np.load(self._folder / f"{name}.npz", allow_pickle=False) as stored:
+            arrays = io.BytesIO((self._folder / f"{name}.npz").read_bytes())
+            with np.load(arrays, allow_pickle=False) as stored:
                 labels, truth, ours = (stored[key] for key in ("labels", "truth", "ours"))
             shown = tuple(Comparison(str(a), b, c) for a, b, c in zip(labels, truth, ours, strict=True))
             return TaskResult(dict(content["figures"]), shown)

@@ -1,0 +1,50 @@
+import json
+
+import pytest
+
+import osfcore.evaluate.bench_render as bench
+from app.cli import main
+from osfcore.evaluate.bench_render import BenchRender
+from tests.core.evaluate.solids import write_fields
+
+
+@pytest.fixture
+def fields_dir(data_dir, library, monkeypatch):
+    """Solids for fields, and few and small images."""
+    write_fields(data_dir, library)
+    monkeypatch.setattr(bench, "CANDIDATES", 2)
+
+    def small(**settings):
+        return BenchRender(**settings, counts=(1, 2), sides=(16, 32), batches=(1, 2), side=32)
+
+    monkeypatch.setattr(bench, "BenchRender", small)
+    return data_dir
+
+
+def test_figures_are_the_last_line_as_json_and_a_file(fields_dir, tmp_path, capsys):
+    arguments = ["bench", "render", "--data-dir", str(fields_dir), "--scenes", "2", "--repeats", "1"]
+    assert main([*arguments, "--out", str(tmp_path / "out"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    keys = {"tinyrenderer_ms", "scene_ms", "ratio", "planning_renders_per_s", "reference_ms"}
+    assert keys <= set(result)
+    assert json.loads((tmp_path / "out" / "render.json").read_text()) == result
+    assert (tmp_path / "out" / "render.png").stat().st_size > 1000
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "TinyRenderer" in shown
+    assert "renders a second" in shown
+    assert "Growth" in shown
+
+
+def test_mistakes_are_one_sentence(fields_dir, tmp_path, capsys):
+    assert main(["bench", "render", "--data-dir", str(fields_dir), "--repeats", "0"]) == 1
+    assert "repeats" in capsys.readouterr().err
+    assert main(["bench", "render", "--data-dir", str(tmp_path / "nowhere")]) == 1
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("osf: ")
+
+
+def test_the_command_explains_itself(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", "--help"])
+    assert stop.value.code == 0
+    assert "render" in capsys.readouterr().out

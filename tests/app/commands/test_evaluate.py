@@ -1,0 +1,72 @@
+import json
+from functools import partial
+
+import pytest
+
+import osfcore.evaluate.fields
+from app.cli import main
+from app.commands.evaluate import Evaluate
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.evaluate.fields import EvaluateFields
+from osfcore.world.collect_images import CollectObject, collect_object
+from tests.core.evaluate.solids import SOLIDS, write_fields
+
+
+@pytest.fixture
+def fields_dir(data_dir, library, monkeypatch):
+    """Solids for fields, and small images."""
+    write_fields(data_dir, library)
+    monkeypatch.setattr(osfcore.evaluate.fields, "EvaluateFields", partial(EvaluateFields, size=32))
+    return data_dir
+
+
+def test_figures_are_the_last_line_as_json(fields_dir, tmp_path, capsys):
+    arguments = ["--out", str(tmp_path / "out"), "--data-dir", str(fields_dir), "--names", *SOLIDS[:2], "--tasks", "1"]
+    assert main(["eval", "fields", *arguments, "--objects", "2", "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert set(result["objects"]) == set(SOLIDS[:2])
+    assert result["scene_psnr_mean"] > 10
+    assert SOLIDS[1] in told.err  # progress
+    assert main(["eval", "fields", *arguments, "--objects", "2"]) == 0  # taken over
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in SOLIDS[:2])
+    assert f"{result['psnr_mask_mean']:.2f}" in shown
+    assert "1 scenes" in shown
+
+
+def test_any_set_and_weights(fields_dir, library, tmp_path):
+    name = SOLIDS[2]
+    for _ in collect_object(CollectObject(name, tmp_path / "set", 60, 32, seed=9), library):
+        pass
+    weights = fields_dir / "fields" / name / "field.safetensors"
+    result = Evaluate("fields", tmp_path / "out", data=tmp_path / "set", weights=weights).run()
+    assert set(result["objects"]) == {"set"}
+    assert result["scene_psnr_mean"] is None
+    with pytest.raises(InvalidInput, match="both or none"):
+        Evaluate("fields", tmp_path / "out", data=tmp_path / "set").run()
+    table = fields_dir / "fields" / "table" / "field.safetensors"
+    with pytest.raises(CorruptFile, match="format"):
+        Evaluate("fields", tmp_path / "out", data=tmp_path / "set", weights=table).run()
+    with pytest.raises(CorruptFile, match="anno.json"):
+        Evaluate("fields", tmp_path / "out", data=tmp_path, weights=weights).run()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["--names", "teapot"], "teapot"), (["--tasks", "-1"], "scenes"), (["--objects", "9"], "between 1 and 8")],
+)
+def test_a_mistake_is_one_sentence(fields_dir, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert main(["eval", "fields", "--out", str(out), "--data-dir", str(fields_dir), *arguments]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("osf: ")
+    assert words in line
+    assert not out.exists()
+
+
+def test_the_command_explains_itself(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["eval", "--help"])
+    assert stop.value.code == 0
+    assert "--weights" in capsys.readouterr().out
