@@ -31,6 +31,16 @@ class TrainFieldCommand:
     """What computes; auto takes a GPU where there is one."""
     seed: int = 0
     """Of everything random."""
+    hollow: bool = False
+    """The object has hollows that no silhouette shows, such as a bowl's."""
+    iterations: int | None = None
+    """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    recipe: Literal["direct", "distil"] = "direct"
+    """direct learns from the images at once; distil, the paper's way, goes over a teacher and is slower."""
+    teacher_width: int = 64
+    """Units of each layer of the teacher."""
+    teacher_depth: int = 4
+    """Layers of the teacher."""
     json: bool = False
     """Print the result as one JSON object in the last line."""
 
@@ -38,7 +48,18 @@ class TrainFieldCommand:
         """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
         from osfcore.fields.training import TrainField, train_field
 
-        config = TrainField(self.data, self.out, self.minutes, self.device, self.seed)
+        config = TrainField(
+            self.data,
+            self.out,
+            minutes=self.minutes,
+            device=self.device,
+            seed=self.seed,
+            iterations=self.iterations,
+            hollow=self.hollow,
+            recipe=self.recipe,
+            teacher_width=self.teacher_width,
+            teacher_depth=self.teacher_depth,
+        )
         follow(_progress(train_field(config)))
         metrics = _metrics(self.out)
         if not self.json:

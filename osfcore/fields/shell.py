@@ -21,6 +21,7 @@ _INSIDE_G = 6.0
 _BLUR_PX = 1.0
 _MISSED_SHARE = 0.01  # of the views may contradict a voxel
 _VISIBLE_WEIGHT = 5e-3
+_NEEDED_WEIGHT = 2e-3
 _PIXELS_LOOKED_AT = 400_000
 
 
@@ -111,6 +112,25 @@ def seen_corners(field: KiloOSF, images: ImageSet, rng: np.random.Generator) -> 
         corners = np.round((points - field.origin) / field.voxel).astype(int)
         seen[tuple(corners.T)] = True
     return seen
+
+
+def trim(field: KiloOSF, images: ImageSet) -> KiloOSF:
+    """The same field without the corners that no view of its training set needs: it renders the same and is smaller."""
+    source = RaySource(images)
+    used = np.zeros(field.index.shape, bool)
+    pixels = source.silhouette_pixels()
+    for part in np.array_split(pixels, max(1, len(pixels) // 50_000)):
+        rays = source.batch(part)
+        ts, found = march(field, rays.origins, rays.directions, step=field.voxel / 2, min_weight=_NEEDED_WEIGHT)
+        points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[found]
+        used[tuple(np.floor((points - field.origin) / field.voxel).astype(int).T)] = True
+    corners = used.copy()
+    for i, j, k in np.ndindex(2, 2, 2):  # a voxel needs its eight corners
+        nx, ny, nz = used.shape
+        corners[i:, j:, k:] |= used[: nx - i, : ny - j, : nz - k]
+    keep = ndimage.binary_dilation(corners) & (field.index > 0)
+    features = field.rows[field.index]
+    return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
 
 
 def _moved_cells(field: KiloOSF, origin: np.ndarray, voxel: float, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
