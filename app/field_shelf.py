@@ -38,6 +38,10 @@ class FieldShelf:
                 found.append(self._library.info(name))
         return tuple(found)
 
+    def names(self) -> tuple[str, ...]:
+        """Objects with a field."""
+        return self._library.names()
+
     def get(self, name: str) -> FieldInfo:
         """One field.
 

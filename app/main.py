@@ -19,7 +19,8 @@ from starlette.concurrency import run_in_threadpool
 
 from app import problems, relay
 from app.field_shelf import FieldShelf
-from app.routes import events, fields, health, jobs, objects, scenes
+from app.neural.link import NeuralLink
+from app.routes import events, fields, health, jobs, neural, objects, scenes
 from app.runner import Runner
 from app.schemas import FrameEvent, NoticeEvent, Problem
 from app.security import BodyLimitMiddleware, SecurityMiddleware
@@ -59,7 +60,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         limit_of=limit_of,
     )
     problems.install(app)
-    for module in (health, objects, fields, scenes, jobs, events):
+    for module in (health, objects, fields, scenes, neural, jobs, events):
         app.include_router(module.router)
     app.include_router(relay.router)
     _add_docs(app)
@@ -84,11 +85,14 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         runner = Runner(settings, store, AssetLibrary(settings.data_dir / "objects"))
         stack.push_async_callback(run_in_threadpool, runner.stop)
         await run_in_threadpool(runner.start)
-        viewer = Viewer(runner)
+        neural = NeuralLink(settings.data_dir)
+        stack.push_async_callback(run_in_threadpool, neural.stop)
+        shelf = Shelf(runner.library)
+        fields = FieldShelf(settings.data_dir, shelf.names)
+        viewer = Viewer(runner, neural, fields.names)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
-        shelf = Shelf(runner.library)
-        services = Services(settings, store, runner, viewer, shelf, FieldShelf(settings.data_dir, shelf.names))
+        services = Services(settings, store, runner, viewer, shelf, fields, neural)
         app.state.services = services
         stack.callback(services.closing.set)
         yield

@@ -12,6 +12,7 @@ from starlette.requests import HTTPConnection
 
 from app.field_shelf import FieldShelf
 from app.messages import SceneRecord
+from app.neural.link import NeuralLink
 from app.runner import Runner
 from app.schemas import SceneOut
 from app.settings import Settings
@@ -67,6 +68,7 @@ class Services:
     viewer: Viewer
     shelf: Shelf
     fields: FieldShelf
+    neural: NeuralLink
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
     def scene_out(self, record: SceneRecord) -> SceneOut:

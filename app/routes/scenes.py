@@ -44,34 +44,34 @@ async def list_all(services: ServicesDep) -> SceneList:
 @router.get("/{scene}", responses=problems(404))
 async def get(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Tell how a scene is now."""
-    return services.scene_out(_found(services, scene))
+    return services.scene_out(found(services, scene))
 
 
 @router.delete("/{scene}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409))
 def delete(services: ServicesDep, scene: SceneId) -> None:
     """Forget a scene."""
-    _found(services, scene)
+    found(services, scene)
     services.runner.delete_scene(scene)
 
 
 @router.post("/{scene}/activate", responses=problems(404))
 def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Show a scene in viewer and page."""
-    _found(services, scene)
+    found(services, scene)
     return services.scene_out(services.runner.activate(scene))
 
 
 @router.post("/{scene}/reset", responses=problems(404, 409))
 def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Put a scene back to how it was created."""
-    _found(services, scene)
+    found(services, scene)
     return services.scene_out(services.runner.reset_scene(scene))
 
 
 @router.patch("/{scene}", responses=problems(404, 409))
 def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
     """Move light and objects by hand, all or nothing."""
-    _found(services, scene)
+    found(services, scene)
     record = services.runner.edit_scene(
         scene,
         light=None if body.light is None else body.light.light(),
@@ -83,7 +83,7 @@ def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
 @router.post("/{scene}/actions", responses=problems(404, 409))
 def act(services: ServicesDep, scene: SceneId, body: ActionsIn) -> SceneOut:
     """Push: hold each velocity for 0.2 s of simulated time."""
-    _found(services, scene)
+    found(services, scene)
     return services.scene_out(services.runner.act(scene, body.actions))
 
 
@@ -97,7 +97,7 @@ async def image(
     pusher: Annotated[bool, Query(description="Whether the pusher and its shadow are in the image.")] = True,
 ) -> Response:
     """Take an image with one camera."""
-    record = _view(services, scene, camera)
+    record = view_of(services, scene, camera)
     return await _png(services, TakeImage(scene, camera, size or record.image_size, masks, pusher))
 
 
@@ -110,7 +110,7 @@ async def mask(
     size: SizeQuery = None,
 ) -> Response:
     """Take the visible pixels of one object: 255 where it is seen, else 0."""
-    record = _view(services, scene, camera)
+    record = view_of(services, scene, camera)
     if name not in record.state.names:
         raise NotFound(str(UnknownName("object on the table", name, record.state.names)))
     return await _png(services, TakeMask(scene, camera, name, size or record.image_size))
@@ -120,20 +120,30 @@ async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
     try:
         png = await services.runner.image(command)
     except OsfError:
-        _found(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the stage says of it
+        found(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the stage says of it
         raise
     return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
 
 
-def _found(services: Services, scene: str) -> SceneRecord:
+def found(services: Services, scene: str) -> SceneRecord:
+    """A scene that a path names.
+
+    Raises:
+        NotFound: if there is none.
+    """
     try:
         return services.runner.scene(scene)
     except UnknownName as error:
         raise NotFound(str(error)) from None
 
 
-def _view(services: Services, scene: str, camera: str) -> SceneRecord:
-    record = _found(services, scene)
+def view_of(services: Services, scene: str, camera: str) -> SceneRecord:
+    """The scene of a path that names a camera, too.
+
+    Raises:
+        NotFound: if there is no such scene or camera.
+    """
+    record = found(services, scene)
     if camera not in _CAMERAS:
         raise NotFound(str(UnknownName("camera", camera, _CAMERAS)))
     return record

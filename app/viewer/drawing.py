@@ -55,6 +55,7 @@ class SceneDrawing:
         self._library = library
         self._on_move = on_move
         self._on_light = on_light
+        self._on_change: Callable[[], None] = _nothing
         self._lock = threading.RLock()
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._labels: dict[str, viser.SceneNodeHandle] = {}
@@ -86,6 +87,20 @@ class SceneDrawing:
                 frustum.image = None
             if record is not None:
                 self.place(record.state)
+        self._on_change()
+
+    def watch(self, on_change: Callable[[], None]) -> None:
+        """Call a function, which must be quick, whenever something has moved."""
+        self._on_change = on_change
+
+    def state(self) -> SceneState:
+        """What is on view, hands and all."""
+        with self._lock:
+            names = tuple(self._bodies)
+            positions = np.array([self._bodies[name].position for name in names], float).reshape(-1, 3)
+            quaternions = np.array([self._bodies[name].wxyz for name in names], float).reshape(-1, 4)
+            pusher = np.array(self._pusher.position, float) if self._pusher.visible else None
+            return SceneState(names, Pose(positions, quaternions), Light(np.array(self._lamp.position)), pusher)
 
     def place(self, state: SceneState) -> None:
         """Move everything to where it is in a state."""
@@ -98,6 +113,7 @@ class SceneDrawing:
             if not self._is_light_held:
                 self._place_light(state.light.position)
                 _put(self._light_gizmo, state.light.position)
+        self._on_change()
 
     def show_frames(self, names: tuple[str, ...], images: np.ndarray) -> None:
         """Put live images into the cameras' frustums."""
@@ -180,6 +196,7 @@ class SceneDrawing:
                 self._is_light_held = True
                 if light is not None:
                     self._place_light(light.position)
+                    self._on_change()
                 return
             self._is_light_held = False
             if light is not None:
@@ -229,6 +246,7 @@ class SceneDrawing:
             turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
             pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
             self._follow(name, pose)
+            self._on_change()
             if event.phase == "end":
                 self._grabbed.pop(name, None)
                 self._on_move(name, pose, event.client)
@@ -251,6 +269,10 @@ class SceneDrawing:
         _put(self._cube, position)
         _put(self._lamp, position)
         self._ray.points = _ray_from(position)
+
+
+def _nothing() -> None:
+    """For as long as nobody watches."""
 
 
 def _ray_from(position: np.ndarray) -> np.ndarray:

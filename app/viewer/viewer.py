@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,9 +16,11 @@ import viser
 
 from app.job import JobChanged
 from app.messages import CurrentScene
+from app.neural.link import NeuralLink
 from app.playback import Playback
 from app.runner import Runner
 from app.viewer.drawing import Client, SceneDrawing
+from app.viewer.neural_view import NeuralViews
 from osfcore.errors import OsfError
 from osfcore.poses import Pose
 from osfcore.scene import Light
@@ -40,8 +42,17 @@ class LoopbackViser(viser.ViserServer):
 class Viewer:
     """The view of the runner's current scene, the same for any number of browsers."""
 
-    def __init__(self, runner: Runner) -> None:
+    def __init__(self, runner: Runner, neural: NeuralLink, fields: Callable[[], Collection[str]]) -> None:
+        """Prepare the view.
+
+        Args:
+            runner: carries out what people do.
+            neural: renders what they see.
+            fields: names of the objects that have one.
+        """
         self._runner = runner
+        self._neural = neural
+        self._fields = fields
         self._commands = ThreadPoolExecutor(1, thread_name_prefix="viewer-commands")
         self._server: LoopbackViser | None = None
         self._undo: list[Callable[[], None]] = []
@@ -67,10 +78,13 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # the banner would tell the inner port
             self._server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
         self._drawing = SceneDrawing(self._server, self._runner.library, self._move_object, self._move_light)
+        self._neural_views = NeuralViews(self._neural, self._drawing.state, self._fields)
+        self._drawing.watch(self._neural_views.scene_moved)
         self._playback = Playback(self._drawing)
         self._add_panel(self._server)
-        self._server.on_client_connect(lambda _: self._runner.watch_frames(1))
-        self._server.on_client_disconnect(lambda _: self._runner.watch_frames(-1))
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._part)
+        self._neural_views.start()
         self._playback.start()
         self._undo = [
             self._runner.hub.subscribe(self._playback.note),
@@ -85,10 +99,19 @@ class Viewer:
         for undo in self._undo:
             undo()
         self._playback.stop()
+        self._neural_views.stop()
         self._commands.shutdown(wait=False, cancel_futures=True)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
         self._server = None
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        self._runner.watch_frames(1)
+        self._neural_views.add(client)
+
+    def _part(self, client: viser.ClientHandle) -> None:
+        self._runner.watch_frames(-1)
+        self._neural_views.remove(client)
 
     def _show_current(self) -> None:
         current = self._runner.current

@@ -1,0 +1,81 @@
+"""What the fields say the cameras see, beside what they saw."""
+
+import asyncio
+import uuid
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Query, Response
+
+from app.messages import SceneRecord, TakeImage
+from app.neural.cameras import scene_camera
+from app.neural.messages import CompareView, Comparison
+from app.routes import PNG, problems
+from app.routes.scenes import CameraName, SceneId, SizeQuery, view_of
+from app.services import Services, ServicesDep
+from osfcore.errors import OsfError
+from osfcore.scene import SceneState
+
+PSNR_HEADER = "X-PSNR-dB"
+_PSNR: dict[str, object] = {
+    "description": "Peak signal-to-noise ratio of the rendering against the camera's image [dB].",
+    "schema": {"type": "number"},
+}
+_ANSWER = {200: {**PNG[200], "headers": {PSNR_HEADER: _PSNR}}}
+router = APIRouter(prefix="/api/scenes", tags=["neural"], responses=problems(503))
+
+
+class MissingFields(OsfError):
+    """Objects of a scene that cannot be rendered."""
+
+    def __init__(self, names: list[str]) -> None:
+        super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
+
+
+@router.get("/{scene}/neural/{camera}.png", response_class=Response, responses={**problems(404, 409), **_ANSWER})
+async def image(
+    services: ServicesDep,
+    scene: SceneId,
+    camera: CameraName,
+    kind: Annotated[
+        Literal["rendered", "difference", "comparison"],
+        Query(description="The difference is absolute, times 4; a comparison is camera image, rendering, difference."),
+    ] = "rendered",
+    size: SizeQuery = None,
+    pusher: Annotated[bool, Query(description="Whether the pusher and its shadow are in the image.")] = True,
+) -> Response:
+    """Render what one camera sees from the objects' fields, where everything is now, and compare.
+
+    The first time, this waits for the renderer to load.
+    """
+    side = size or view_of(services, scene, camera).image_size
+    compared = await _compare(services, TakeImage(scene, camera, side, pusher=pusher))
+    headers = {"Cache-Control": "no-cache", PSNR_HEADER: f"{compared.psnr_db:.2f}"}
+    return Response(getattr(compared, kind), media_type="image/png", headers=headers)
+
+
+async def _compare(services: Services, command: TakeImage) -> Comparison:
+    record, observed = await _observe(services, command)
+    state = record.state
+    known = services.fields.names()
+    missing = [name for name in state.names if name not in known]
+    if missing:
+        raise MissingFields(missing)
+    if not command.pusher:
+        state = SceneState(state.names, state.poses, state.light, None)
+    order = CompareView(uuid.uuid4().hex, state, scene_camera(command.camera, command.size), observed)
+    answer = await asyncio.wrap_future(await asyncio.to_thread(services.neural.submit, order))
+    assert isinstance(answer, Comparison)
+    return answer
+
+
+async def _observe(services: Services, command: TakeImage, tries: int = 3) -> tuple[SceneRecord, bytes]:
+    """A camera's image, and the scene as it was then; while things keep moving, one that is close."""
+    record = view_of(services, command.id, command.camera)
+    try:
+        observed = await services.runner.image(command)
+    except OsfError:
+        view_of(services, command.id, command.camera)  # a scene that was deleted meanwhile is not found
+        raise
+    if tries > 1 and record.revision != view_of(services, command.id, command.camera).revision:
+        return await _observe(services, command, tries - 1)
+    return record, observed
