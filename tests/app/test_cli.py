@@ -12,7 +12,9 @@ def osf(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
 
 
-@pytest.mark.parametrize("command", [(), ("assets",), ("collect",), ("collect", "pushes"), ("check",), ("serve",)])
+@pytest.mark.parametrize(
+    "command", [(), ("assets",), ("collect",), ("collect", "pushes"), ("check",), ("serve",), ("train", "field")]
+)
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([*command, "--help"])
@@ -37,6 +39,7 @@ def test_json_is_the_last_line_and_keys_are_stable(data_dir):
         (("collect", "object", "006_mustard_bottle", "--out", "{tmp}/a", "--size", "2000"), "between 16 and 1024"),
         (("collect", "pushes", "--out", "{tmp}/a", "--objects", "9"), "between 1 and 8"),
         (("collect", "pushes", "--out", "/proc/pushes.h5", "--episodes", "1"), "/proc"),
+        (("train", "field", "--data", "{tmp}", "--out", "{tmp}/a.safetensors"), "anno.json"),
         (("check", "{tmp}/nothing"), "no such file"),
         (("assets", "fetch", "teapot"), "teapot"),
         (("assets", "fetch", "--source", "{tmp}/nowhere"), "nowhere"),
@@ -45,7 +48,7 @@ def test_json_is_the_last_line_and_keys_are_stable(data_dir):
 )
 def test_a_mistake_is_one_sentence_and_exit_code_1(data_dir, tmp_path, arguments, words):
     filled = [argument.format(tmp=tmp_path) for argument in arguments]
-    data = [] if filled[0] == "check" else ["--data-dir", str(data_dir)]
+    data = [] if filled[0] in ("check", "train") else ["--data-dir", str(data_dir)]
     done = osf(*filled, *data)
     assert done.returncode == 1
     last = done.stderr.strip().splitlines()[-1]
