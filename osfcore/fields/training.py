@@ -1,8 +1,9 @@
-"""Training a KiloOSF straight from images, cameras, lights and silhouettes: coarse fog first, then a fine shell.
+"""Training a KiloOSF straight from images, cameras, lights and silhouettes: a coarse solid first, then a fine shell.
 
-Three phases share the time budget: the visual hull of the silhouettes becomes a coarse field, which learns until it knows
-where surfaces are (also those that no silhouette shows); the corners that some pixel sees are kept on a fine grid, which
-learns the rest. A checkpoint beside the output lets the same command go on after it was killed.
+Phases share the time budget. Recipe "direct": the visual hull of the silhouettes becomes a coarse field, which learns
+until it knows where surfaces are (also those that no silhouette shows); the corners that some pixel sees are kept on a
+fine grid, which learns the rest. Recipe "distil", the paper's: an OSF learns from the images, a fine field learns from
+it, and then from the images. A checkpoint beside the output lets the same command go on after it was killed.
 """
 
 from __future__ import annotations
@@ -19,13 +20,16 @@ from jaxtyping import UInt8
 
 from osfcore.errors import InvalidInput
 from osfcore.fields.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from osfcore.fields.distill import Distillation, first_student
 from osfcore.fields.holdout import Holdout
 from osfcore.fields.hull import silhouette_box
 from osfcore.fields.image_set import ImageSet, read_splits
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.optimise import Rates, Stage
+from osfcore.fields.osf import OSFSize
 from osfcore.fields.rays import RaySource
-from osfcore.fields.shell import first_shell, refine
+from osfcore.fields.shell import first_shell, refine, trim
+from osfcore.fields.teacher import Teacher, TeacherHoldout, TeacherRecipe
 from osfcore.fields.weights import field_bytes, read_field, write_atomically, write_json
 from osfcore.progress import Progress
 
@@ -33,6 +37,8 @@ _REPORT_S = 1.0
 _CHECKPOINT_S = 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MIN_LOOK_S = 5.0
+_TRANSITIONS = {"distil": "Baking the teacher into a shell", "fine": "Refining the shell"}
+_Learner = Stage | Teacher  # a phase between its steps: step, snapshot, state
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,20 +52,28 @@ class Recipe:
         cells: tiny networks along the longest side.
         hidden: their width.
         rays: pixels per step of descent.
-        inside_g: density feature inside the visual hull at first.
+        solid_g: density feature inside the visual hull at first.
+        hollow_g: the same for hollow objects: fog so thin that light reaches what silhouettes cannot carve.
+        hollow_share: instead of coarse_share for hollow objects: opening a hollow takes time.
         coarse_rates: learning rates of the first phase.
         fine_rates: of the second.
+        teacher_share: of the time budget, in recipe "distil".
+        distil_share: likewise.
     """
 
     coarse_across: int = 48
     fine_across: int = 96
-    coarse_share: float = 0.3
+    coarse_share: float = 0.15
     cells: int = 8
     hidden: int = 16
     rays: int = 4096
-    inside_g: float = -3.0
+    solid_g: float = 6.0
+    hollow_g: float = -3.0
+    hollow_share: float = 0.3
     coarse_rates: Rates = Rates(2e-2, 1e-2)
     fine_rates: Rates = Rates(2e-2, 1e-3)
+    teacher_share: float = 0.45
+    distil_share: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +87,10 @@ class TrainField:
         device: "auto", "cpu" or "cuda".
         seed: of everything random.
         iterations: instead of the time budget, that many steps: repeatable on one machine.
+        hollow: the object has hollows that no silhouette shows, such as a bowl's; "direct" only.
+        recipe: "direct", or "distil" for the paper's way over a teacher.
+        teacher_width: units of each layer of the teacher.
+        teacher_depth: its layers.
     """
 
     data: Path
@@ -81,6 +99,10 @@ class TrainField:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
     iterations: int | None = None
+    hollow: bool = False
+    recipe: Literal["direct", "distil"] = "direct"
+    teacher_width: int = 64
+    teacher_depth: int = 4
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -132,6 +154,9 @@ def pick_device(name: str) -> torch.device:
 def _check(config: TrainField) -> None:
     if not 0.05 <= config.minutes <= 24 * 60:
         raise InvalidInput("minutes", config.minutes, "between 0.05 and 1440")
+    if config.recipe not in ("direct", "distil"):
+        raise InvalidInput("recipe", config.recipe, "direct or distil")
+    OSFSize(config.teacher_depth, config.teacher_width)  # refuses what cannot be built
     if config.seed < 0:
         raise InvalidInput("seed", config.seed, "0 or more")
     if config.iterations is not None and not 10 <= config.iterations <= 10_000_000:
@@ -153,7 +178,7 @@ class _Run:
         self._config, self._recipe, self._device = config, recipe, device
         self._images, self._source = train, RaySource(train)
         self._pixels = self._source.silhouette_pixels()
-        self._holdout = Holdout(test)
+        self._test, self._holdout = test, Holdout(test)
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator(device).manual_seed(config.seed)
         self._done_s, self._done_steps = 0.0, 0
@@ -162,31 +187,55 @@ class _Run:
 
     def steps(self) -> Iterator[FieldStep]:
         saved = read_checkpoint(self._checkpoint_path, self._fingerprint())
+        phases = self._phases()
         if saved is not None:
-            stage_name, stage = saved.stage, self._resumed(saved)
+            name, learner = saved.stage, self._resumed(saved)
             yield self._report("Going on from a checkpoint")
         else:
             yield self._report("Carving the silhouettes")
-            stage_name, stage = "coarse", self._first_stage()
-        if stage_name == "coarse":
-            yield from self._descend("coarse", stage, 0.0, self._recipe.coarse_share)
-            yield self._report("Refining the shell")
-            across = self._recipe.fine_across
-            stage = self._stage(refine(stage.snapshot(), self._images, across=across, rng=self._rng), "fine")
-        yield from self._descend("fine", stage, self._recipe.coarse_share, 1.0)
+            name, learner = next(iter(phases)), self._first()
+        names = list(phases)
+        for number in range(names.index(name), len(names)):
+            if number > names.index(name):
+                yield self._report(_TRANSITIONS[names[number]])
+                learner = self._next(names[number], learner)
+                self._save(names[number], learner)
+            start = phases[names[number - 1]] if number else 0.0
+            yield from self._descend(names[number], learner, start, phases[names[number]])
         yield self._report("Measuring on all held-out images")
-        yield self._finish(stage.snapshot())
+        yield self._finish(learner.snapshot())
 
-    def _first_stage(self) -> Stage:
+    def _phases(self) -> dict[str, float]:
+        """Names of the phases, in order, and the share of the budget at which each ends."""
+        r = self._recipe
+        if self._config.recipe == "direct":
+            return {"coarse": r.hollow_share if self._config.hollow else r.coarse_share, "fine": 1.0}
+        return {"teacher": r.teacher_share, "distil": r.teacher_share + r.distil_share, "fine": 1.0}
+
+    def _first(self) -> _Learner:
         box = silhouette_box(self._images, where=self._config.data)
         r = self._recipe
+        if self._config.recipe == "distil":
+            return Teacher.first(self._images, box, self._teacher_recipe(), self._rng, self._device)
         field = first_shell(self._images, box, across=r.coarse_across, cells=r.cells, hidden=r.hidden,
-                            inside_g=r.inside_g, rng=self._rng)  # fmt: skip
-        return self._stage(field, "coarse")
+                            inside_g=r.hollow_g if self._config.hollow else r.solid_g, rng=self._rng)  # fmt: skip
+        return Stage(field, r.coarse_rates, self._device)
 
-    def _stage(self, field: KiloOSF, name: str) -> Stage:
-        rates = self._recipe.coarse_rates if name == "coarse" else self._recipe.fine_rates
-        return Stage(field, rates, self._device)
+    def _next(self, name: str, before: _Learner) -> _Learner:
+        """The learner of a phase, from that of the phase before."""
+        r = self._recipe
+        if name == "distil":
+            assert isinstance(before, Teacher)
+            student = first_student(before.osf, before.snapshot(), self._images, across=r.fine_across, cells=r.cells,
+                                    hidden=r.hidden, rng=self._rng)  # fmt: skip
+            return Distillation(student, before.osf, self._device)
+        field = before.snapshot()
+        if not isinstance(before, Distillation):
+            field = refine(field, self._images, across=r.fine_across, rng=self._rng)
+        return Stage(field, r.fine_rates, self._device)
+
+    def _teacher_recipe(self) -> TeacherRecipe:
+        return TeacherRecipe(OSFSize(self._config.teacher_depth, self._config.teacher_width))
 
     def _share(self) -> float:
         """Of the whole budget that is used up."""
@@ -194,7 +243,7 @@ class _Run:
             return min(1.0, self._done_steps / self._config.iterations)
         return min(1.0, self._done_s / (60 * self._config.minutes))
 
-    def _descend(self, name: str, stage: Stage, start: float, end: float) -> Iterator[FieldStep]:
+    def _descend(self, name: str, stage: _Learner, start: float, end: float) -> Iterator[FieldStep]:
         began = reported = saved = time.monotonic()
         already = self._done_s
         while (share := self._share()) < end:
@@ -212,12 +261,13 @@ class _Run:
                 self._save(name, stage)
                 began += time.monotonic() - now
 
-    def _look(self, stage: Stage) -> FieldStep:
+    def _look(self, stage: _Learner) -> FieldStep:
         budget_s = 60 * self._config.minutes
         preview = None
         if self._done_s - self._looked_at > max(_MIN_LOOK_S, _LOOK_SHARE * budget_s):
             self._looked_at = self._done_s
-            look = self._holdout.glance(stage.snapshot())
+            holdout = TeacherHoldout(self._test, stage) if isinstance(stage, Teacher) else self._holdout
+            look = holdout.glance(stage.snapshot())
             self._psnr, preview = (look.psnr_full, look.psnr_mask), look.preview
         return replace(self._report(""), preview=preview)
 
@@ -234,7 +284,7 @@ class _Run:
     def _finish(self, field: KiloOSF) -> FieldStep:
         """Write the file, read it back, and measure what was read: that is what users get."""
         out = self._config.out
-        data = field_bytes(field)
+        data = field_bytes(trim(field, self._images))
         write_atomically(out, data)
         look = self._holdout.everything(read_field(out))
         metrics = {
@@ -250,8 +300,11 @@ class _Run:
             "data": self._config.data.name,
             "train_images": len(self._images.cameras),
             "image_size": list(self._source.image_shape),
-            "recipe": asdict(self._recipe),
+            "hollow": self._config.hollow,
+            "recipe": {"name": self._config.recipe, **asdict(self._recipe)},
         }
+        if self._config.recipe == "distil":
+            metrics["teacher"] = asdict(self._teacher_recipe())
         write_json(out.with_suffix(".json"), metrics)
         self._checkpoint_path.unlink(missing_ok=True)
         self._psnr = look.psnr_full, look.psnr_mask
@@ -268,20 +321,26 @@ class _Run:
         settings = {**asdict(self._config), "data": str(self._config.data.resolve()), "out": str(self._config.out)}
         return {"settings": settings, "recipe": asdict(self._recipe), "images": len(self._images.cameras)}
 
-    def _save(self, name: str, stage: Stage) -> None:
+    def _save(self, name: str, stage: _Learner) -> None:
         clock = {"seconds": self._done_s, "steps": self._done_steps, "looked_at": self._looked_at, "psnr": self._psnr}
         random = {"numpy": self._rng.bit_generator.state, "torch": self._generator.get_state()}
         checkpoint = Checkpoint(name, stage.snapshot(), stage.state(), clock, random)
         write_checkpoint(self._checkpoint_path, checkpoint, self._fingerprint())
 
-    def _resumed(self, saved: Checkpoint) -> Stage:
-        stage = self._stage(saved.field, saved.stage)
-        stage.restore(saved.optimiser)
+    def _resumed(self, saved: Checkpoint) -> _Learner:
+        r = self._recipe
+        if saved.stage == "teacher":
+            learner = Teacher.restored(saved.field, saved.optimiser, self._teacher_recipe(), self._device)
+        elif saved.stage == "distil":
+            learner = Distillation.restored(saved.field, saved.optimiser, self._teacher_recipe().size, self._device)
+        else:
+            learner = Stage(saved.field, r.coarse_rates if saved.stage == "coarse" else r.fine_rates, self._device)
+            learner.restore(saved.optimiser)
         self._done_s, self._done_steps = saved.clock["seconds"], saved.clock["steps"]
         self._looked_at, self._psnr = saved.clock["looked_at"], saved.clock["psnr"]
         self._rng.bit_generator.state = saved.random["numpy"]
         self._generator.set_state(saved.random["torch"])
-        return stage
+        return learner
 
 
 def _duration(seconds: float) -> str:
