@@ -14,6 +14,7 @@ from app.commands.bench import Bench
 from app.commands.check import Check
 from app.commands.collect import Collect
 from app.commands.evaluate import Evaluate
+from app.commands.render import Render
 from app.commands.serve import Serve
 from app.commands.train import Train
 from osfcore.errors import OsfError
@@ -37,6 +38,7 @@ Commands = Annotated[
     | Annotated[Assets, tyro.conf.subcommand("assets", description="List, fetch and add objects.")]
     | Annotated[Collect, tyro.conf.subcommand("collect", description="Collect image sets and pushes.")]
     | Annotated[Train, tyro.conf.subcommand("train", description="Train fields from image sets.")]
+    | Annotated[Render, tyro.conf.subcommand("render", description="Render a scene through its fields.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
     | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],

@@ -17,6 +17,8 @@ from osfcore.fields.hull import carve, silhouette_box
 from osfcore.fields.image_set import read_image_set, read_splits
 from osfcore.fields.overlay import overlay_sheet
 from osfcore.fields.set_archive import unpack_set
+from osfcore.fields.table import TABLE_FORMAT, read_table
+from osfcore.fields.weights import read_field, tensor_format
 from osfcore.scenefile import read_scene
 
 
@@ -25,7 +27,7 @@ class Report:
     """What a file turned out to be.
 
     Attributes:
-        kind: "scene", "image set" or "push file".
+        kind: "scene", "image set", "push file" or "field".
         summary: its contents in words.
         facts: its contents in numbers.
     """
@@ -50,7 +52,20 @@ def check_path(path: Path) -> Report:
         return Report("scene", f"{counts['objects']} objects, {counts['cameras']} cameras", counts)
     if path.suffix.lower() in (".h5", ".hdf5"):
         return _check_pushes(path)
-    raise CorruptFile(path, "it is neither a .json scene, a .h5 push file nor the folder or .zip of an image set")
+    if path.suffix.lower() == ".safetensors":
+        return _check_field(path)
+    kinds = "a .json scene, a .h5 push file, a .safetensors field nor the folder or .zip of an image set"
+    raise CorruptFile(path, f"it is neither {kinds}")
+
+
+def _check_field(path: Path) -> Report:
+    if tensor_format(path) == TABLE_FORMAT:
+        table = read_table(path)
+        return Report("field", "the table", {"half_side": table.half_side})
+    field = read_field(path)
+    size = " x ".join(f"{side:.3g}" for side in field.extent[1] - field.extent[0])
+    facts = {"corners": len(field.rows) - 1, "networks": len(field.networks)}
+    return Report("field", f"an object of {size}, {facts['corners']} voxel corners, {facts['networks']} networks", facts)
 
 
 def _check_pushes(path: Path) -> Report:

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.fields.devices import pick_device
 from osfcore.fields.image_set import ImageSet, read_splits
 from osfcore.fields.rays import RayBatch, RaySource
 from osfcore.fields.table import TableField, read_table, write_table
-from osfcore.fields.training import pick_device
 from osfcore.fields.weights import write_json
 from osfcore.progress import Progress
 from osfcore.scene import TABLE_SIDE_M

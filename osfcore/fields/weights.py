@@ -116,6 +116,23 @@ def read_tensors(path: Path, expected: str) -> tuple[Mapping[str, str], Mapping[
     Raises:
         CorruptFile: if the file is missing, cut short or of another format or version.
     """
+    meta, tensors = _load(path)
+    found = meta.get("format", "no format at all")
+    if found != expected:
+        raise CorruptFile(path, f"its format is {found}; this version reads {expected}: train it again")
+    return meta, tensors
+
+
+def tensor_format(path: Path) -> str | None:
+    """What kind of weights a safetensors file says it holds.
+
+    Raises:
+        CorruptFile: if the file is missing or cut short.
+    """
+    return _load(path)[0].get("format")
+
+
+def _load(path: Path) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise CorruptFile(path, f"it is larger than {MAX_FILE_BYTES // 1_000_000} MB")
@@ -128,9 +145,6 @@ def read_tensors(path: Path, expected: str) -> tuple[Mapping[str, str], Mapping[
         meta = json.loads(data[8 : 8 + length]).get("__metadata__", {})
     except (SafetensorError, ValueError, struct.error, KeyError) as error:
         raise CorruptFile(path, "it is not a whole safetensors file") from error
-    found = meta.get("format", "no format at all")
-    if found != expected:
-        raise CorruptFile(path, f"its format is {found}; this version reads {expected}: train it again")
     return meta, tensors
 
 

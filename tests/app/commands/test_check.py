@@ -1,4 +1,6 @@
 import json
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,3 +45,18 @@ def test_with_json_nothing_else_is_printed(tmp_path, capsys):
 def test_what_is_not_there_is_told(tmp_path):
     with pytest.raises(CorruptFile, match="no such file"):
         Check(tmp_path / "nothing").run()
+
+
+def test_weights_are_described_and_broken_ones_refused(tmp_path):
+    shipped = Path(str(files("osfcore.fields") / "shipped"))
+    assert Check(shipped / "table.safetensors").run()["kind"] == "field"
+    good = (shipped / "006_mustard_bottle.safetensors").read_bytes()
+    whole, short, other = (tmp_path / f"{name}.safetensors" for name in ("whole", "short", "other"))
+    whole.write_bytes(good)
+    assert Check(whole).run()["kind"] == "field"
+    short.write_bytes(good[: len(good) // 2])
+    with pytest.raises(CorruptFile, match="not a whole safetensors file"):
+        Check(short).run()
+    other.write_bytes(good.replace(b"kiloosf-1", b"kiloosf-0"))
+    with pytest.raises(CorruptFile, match="kiloosf-0; this version reads kiloosf-1"):
+        Check(other).run()
