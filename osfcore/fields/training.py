@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 
 from osfcore.errors import InvalidInput
 from osfcore.fields.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from osfcore.fields.devices import pick_device
 from osfcore.fields.distill import Distillation, first_student
 from osfcore.fields.holdout import Holdout
 from osfcore.fields.hull import silhouette_box
@@ -136,19 +137,6 @@ def train_field(config: TrainField, recipe: Recipe | None = None) -> Iterator[Fi
     yield FieldStep(Progress(0, _total(config), "Reading the images"), None, None, None)
     train, test = read_splits(config.data)
     yield from _Run(config, recipe, device, train, test).steps()
-
-
-def pick_device(name: str) -> torch.device:
-    """The device to compute on; "auto" takes a GPU where there is one.
-
-    Raises:
-        InvalidInput: if the name is unknown or there is no such device.
-    """
-    if name not in ("auto", "cpu", "cuda"):
-        raise InvalidInput("device", name, "auto, cpu or cuda")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InvalidInput("device", name, "auto or cpu on this machine: PyTorch finds no GPU")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def _check(config: TrainField) -> None:
