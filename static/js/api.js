@@ -7,7 +7,8 @@ export class ApiError extends Error {
   }
 }
 
-async function problemOf(answer) {
+/** The sentence of an answer that is an error. */
+export async function problemOf(answer) {
   try {
     const problem = await answer.json();
     const details = (problem.errors ?? []).map((e) => `${e.pointer ?? e.parameter ?? ""} ${e.detail}`.trim());

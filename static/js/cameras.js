@@ -1,5 +1,6 @@
 // The camera strip: live images from the event stream, masks and the goal view by request, a large view on click.
 import { byId, el } from "./dom.js";
+import { enlargeComparison, isComparing } from "./neural.js";
 import { current, watch } from "./state.js";
 import { toast } from "./toasts.js";
 
@@ -57,6 +58,10 @@ const large = new LatestImage(byId("camera-large"));
 function enlarge(name) {
   const scene = current();
   if (!scene) return;
+  if (isComparing()) {
+    enlargeComparison(name);
+    return;
+  }
   largeCamera = name;
   byId("camera-dialog-title").textContent = name === "goal" ? "Goal camera, without the pusher" : `Camera ${name}`;
   byId("camera-large").alt = byId("camera-dialog-title").textContent;
@@ -71,6 +76,7 @@ export function showFrames({ scene, cameras }) {
 }
 
 export function toggleMasks(on = !showsMasks) {
+  if (isComparing()) return;
   showsMasks = on;
   byId("masks").checked = on;
   const scene = current();

@@ -7,6 +7,7 @@ import { refreshSets, setUpFields } from "./fields.js";
 import { refreshJobs, setUpJobs, showJob } from "./jobs.js";
 import { setUpKeyboard } from "./keyboard.js";
 import { setUpLight } from "./light.js";
+import { setUpNeural } from "./neural.js";
 import { setUpNumbers } from "./numbers.js";
 import { refreshObjects, setUpObjects } from "./objects.js";
 import { setUpPush } from "./push.js";
@@ -53,6 +54,7 @@ async function followHealth(again) {
 setUpTheme(() => { if (isViewerShown()) showViewer(); });
 setUpTabs();
 setUpCameras();
+setUpNeural();
 setUpPush();
 setUpLight();
 setUpNumbers();
