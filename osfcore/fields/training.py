@@ -235,7 +235,8 @@ class _Run:
         began = reported = saved = time.monotonic()
         already = self._done_s
         while (share := self._share()) < end:
-            rays = self._source.batch(self._rng.choice(self._pixels, self._recipe.rays))
+            count = stage.recipe.rays if isinstance(stage, Teacher) else self._recipe.rays
+            rays = self._source.batch(self._rng.choice(self._pixels, count))
             stage.step(rays, (share - start) / (end - start), self._rng, self._generator)
             self._done_steps += 1
             now = time.monotonic()
