@@ -49,26 +49,26 @@ def rotate(q: Float[np.ndarray, "*batch 4"], v: Float[np.ndarray, "*batch 3"]) -
 
 def quaternion_to_matrix(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices of unit quaternions."""
-    q = np.asarray(q, float)
+    q = np.array(q, float)  # a copy: SciPy refuses arrays that must not be written, such as broadcast ones
     return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 
 def quaternion_from_matrix(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:
     """Unit quaternions with w >= 0 of rotation matrices."""
-    m = np.asarray(matrix, float)
+    m = np.array(matrix, float)
     q = Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(canonical=True, scalar_first=True)
     return q.reshape(*m.shape[:-2], 4)
 
 
 def quaternion_exp(rotation_vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 4"]:
     """Unit quaternions of rotation vectors (axis times angle) [rad]."""
-    r = np.asarray(rotation_vector, float)
+    r = np.array(rotation_vector, float)
     return Rotation.from_rotvec(r.reshape(-1, 3)).as_quat(scalar_first=True).reshape(*r.shape[:-1], 4)
 
 
 def quaternion_log(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3"]:
     """Rotation vectors [rad] with an angle of at most pi; the inverse of `quaternion_exp`."""
-    q = np.asarray(q, float)
+    q = np.array(q, float)
     return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_rotvec().reshape(*q.shape[:-1], 3)
 
 

@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from osfcore.fields.kiloosf import FEATURES, MACRO, NETWORK_INPUTS
-from osfcore.fields.marching import interpolate, optical_density
+from osfcore.fields.kiloosf import FEATURES, MACRO, MOST_HIDDEN, NETWORK_INPUTS
+from osfcore.fields.marching import interpolate, optical_density, within
 
 MOST_OBJECTS = 24
-MOST_HIDDEN = 64
 BAND_ROWS = 8  # rows of an image that one thread draws at a time
 _FAR = np.float32(1e9)
 _TINY = np.float32(1e-9)
@@ -89,12 +88,13 @@ def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
 def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels):
     """The next sample k <= last of field a with any density: its number and optical depth; k > last if there is none."""
     corners, blocks = pack.starts[a, 0], pack.starts[a, 2]
-    ny, nz = pack.shapes[a, 1], pack.shapes[a, 2]
+    nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
     my, mz = pack.shapes[a, 4], pack.shapes[a, 5]
     depth = _ZERO
     while k <= last:
         t = (k + _HALF) * step
-        px, py, pz = max(ox + t * dx, _ZERO), max(oy + t * dy, _ZERO), max(oz + t * dz, _ZERO)
+        # Rounding must not lead out of the grid, however far away the ray began.
+        px, py, pz = within(ox + t * dx, nx), within(oy + t * dy, ny), within(oz + t * dz, nz)
         bx, by, bz = int(px) // MACRO, int(py) // MACRO, int(pz) // MACRO
         if pack.macro[blocks + (bx * my + by) * mz + bz] == 0:
             skip = min(_leave_block(px, dx, ix, bx), _leave_block(py, dy, iy, by), _leave_block(pz, dz, iz, bz))
@@ -255,9 +255,9 @@ def _colour_at(pack, fields, scene, b, n, t, rules, work):
     """rho of object n where the ray of `work` is at t, in out[0:6], and the light that reaches it."""
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
     a, view = fields[n], work.where[0]
-    x = max(scene.eye[b, view, n, 0] + t * d[n, 0], _ZERO)
-    y = max(scene.eye[b, view, n, 1] + t * d[n, 1], _ZERO)
-    z = max(scene.eye[b, view, n, 2] + t * d[n, 2], _ZERO)
+    x = within(scene.eye[b, view, n, 0] + t * d[n, 0], pack.shapes[a, 0])
+    y = within(scene.eye[b, view, n, 1] + t * d[n, 1], pack.shapes[a, 1])
+    z = within(scene.eye[b, view, n, 2] + t * d[n, 2], pack.shapes[a, 2])
     s = pack.scales[a, 3]
     _scatter(pack, a, x, y, z, scene.lit[b, n, 0] * s, scene.lit[b, n, 1] * s, scene.lit[b, n, 2] * s,
              d[n, 0] * s, d[n, 1] * s, d[n, 2] * s, inputs, h1, h2, out)  # fmt: skip
@@ -365,7 +365,8 @@ def render_base(table, cameras, directs, samples, rgb, distance):
                 hits += _meet_table(table, cameras, view, dx, dy, dz) < _FAR
             count = samples if 0 < hits < 4 else 1
             share = _ONE / np.float32(count * count)
-            red = green = blue = _ZERO
+            red = green = blue = reach = _ZERO
+            hits = 0
             for s in range(count * count):
                 u = np.float32(column + (s % count + 0.5) / count)
                 v = np.float32(row + (s // count + 0.5) / count)
@@ -374,10 +375,11 @@ def render_base(table, cameras, directs, samples, rgb, distance):
                 if t < _FAR:
                     x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
                     r, g, bl = _table_colour(table, directs, b, x, y, _ONE)
+                    hits, reach = hits + 1, reach + t
                 else:
                     r, g, bl = table.background[0], table.background[1], table.background[2]
                 red, green, blue = red + share * r, green + share * g, blue + share * bl
-                distance[b, view, row, column] = t if t < _FAR else _ZERO
+            distance[b, view, row, column] = reach / max(hits, 1)
             rgb[b, view, row, column, 0] = red
             rgb[b, view, row, column, 1] = green
             rgb[b, view, row, column, 2] = blue
@@ -436,7 +438,7 @@ def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_di
                 for c in range(3):
                     rgb[b, view, row, column, c] = total[c] * share
                 if wants_distance:
-                    distance[b, view, row, column] = total[3] / total[4] if total[4] > 1e-3 else _ZERO
+                    distance[b, view, row, column] = total[3] / total[4] if total[4] * share > 1e-3 else _ZERO
                 if wants_opacity:
                     for n in range(opacity.shape[2]):
                         opacity[b, view, n, row, column] = total[5 + n] * share

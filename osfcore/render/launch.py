@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from osfcore.fields.marching import ONE_AT_A_TIME
 from osfcore.fields.table import TableField
 from osfcore.render.kernels import render_base, render_batch
 from osfcore.render.packing import Packed
@@ -94,15 +95,16 @@ def launch(
     opacity = np.zeros((scenes, views, count, *size) if wants_opacity else (0,) * 5, np.float32)
     distance = np.empty(shape if "depth" in outputs else (0,) * 4, np.float32)
     plain, rules = _plain_table(table), _rules(quality)
-    lenses_f32 = lenses.astype(np.float32)
+    lenses_f32 = np.array(lenses, np.float32, order="C")
     different, base_of = np.unique(batch.lights.astype(np.float32), axis=0, return_inverse=True)
     directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
     base = np.zeros((len(different), *shape[1:], 3), np.float32), np.zeros((len(different), *shape[1:]), np.float32)
-    if table is not None:  # the empty table, once per light
-        render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
     scene = _scene(pack, numbers, rotations, positions, batch.lights, lenses)
-    render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows, rules,
-                 rgb, opacity, distance)  # fmt: skip
+    with ONE_AT_A_TIME:
+        if table is not None:  # the empty table, once per light
+            render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
+        render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows, rules,
+                     rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,
@@ -140,7 +142,8 @@ def _scene(
     reach = np.stack([np.maximum(reach[:, 0], 0), np.minimum(reach[:, 1], most)], axis=1)
     inverse = 1 / np.where(np.abs(lit) > _TINY, lit, _TINY)
     arrays = (eye, ray.reshape(*ray.shape[:3], 9), lit, inverse, between.reshape(scenes, count + 1, count, 12))
-    return Scene(*(array.astype(np.float32) for array in arrays), reach.reshape(-1, 6).astype(np.float32))
+    # One memory layout for all batches: any other would be compiled anew, which takes half a minute.
+    return Scene(*(np.array(array, np.float32, order="C") for array in (*arrays, reach.reshape(-1, 6))))
 
 
 def _rules(quality: Quality) -> Rules:
@@ -169,7 +172,8 @@ def screen_boxes(points: Float[np.ndarray, "B N 8 3"], camera: Camera) -> Int[np
     low = np.clip(np.floor(pixels.min(axis=2)), 0, limits)
     high = np.clip(np.ceil(pixels.max(axis=2)), 0, limits)
     behind = np.all(depth <= 0, axis=2)[..., None]
-    cut = np.any(depth < _NEAREST_M, axis=2)[..., None] & ~behind
+    is_sane = np.all(np.isfinite(pixels), axis=(2, 3))
+    cut = (np.any(depth < _NEAREST_M, axis=2) | ~is_sane)[..., None] & ~behind
     low, high = np.where(cut, 0, low), np.where(cut, limits, high)
     high = np.where(behind, low, high)
     return np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1).astype(np.int64)
@@ -177,9 +181,8 @@ def screen_boxes(points: Float[np.ndarray, "B N 8 3"], camera: Camera) -> Int[np
 
 def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B N 8 3"]:
     """Where the light drops points onto the plane z = 0. Lights below it drop nothing."""
-    height = np.maximum(points[..., 2:], 0)
     elevation = np.maximum(lights[:, 2], 1e-3)[:, None, None, None]
-    dropped = points - lights[:, None, None] * height / elevation
+    dropped = points - lights[:, None, None] * points[..., 2:] / elevation  # points below it rise: none is left out
     dropped[..., 2] = 0
     return dropped
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.kiloosf import MOST_HIDDEN, KiloOSF
 
 
 class Packed(NamedTuple):
@@ -49,11 +49,13 @@ def pack(fields: Sequence[KiloOSF]) -> Packed:
     """Lay fields end to end.
 
     Raises:
-        InvalidInput: if their networks differ in width.
+        InvalidInput: if their networks differ in width, or are too wide.
     """
     widths = {field.hidden for field in fields}
     if len(widths) > 1:
         raise InvalidInput("widths of the fields' networks", sorted(widths), "the same for all fields of a scene")
+    if max(widths) > MOST_HIDDEN:
+        raise InvalidInput("width of the fields' networks", max(widths), f"at most {MOST_HIDDEN}")
     flat = {name: [getattr(f, name).reshape(-1) for f in fields] for name in ("density", "index", "macro", "cells")}
     rows = [f.rows for f in fields]
     networks = [f.networks for f in fields]

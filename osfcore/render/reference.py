@@ -86,9 +86,10 @@ def render_on_device(
 def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001, PLR0913
     queries = {name: KiloQuery(fields[name], dtype=dtype, device=device) for name in dict.fromkeys(batch.names)}
     extents = {name: _extent(fields[name]) for name in queries}
+    pusher = None  # not among the named ones: an object may have any name
     if batch.pusher is not None:
-        pusher = pusher_field(next(iter(fields.values())).hidden if fields else 1)
-        queries["pusher"], extents["pusher"] = KiloQuery(pusher, dtype=dtype, device=device), _extent(pusher)
+        solid = pusher_field(next(iter(fields.values())).hidden if fields else 1)
+        pusher = KiloQuery(solid, dtype=dtype, device=device), _extent(solid), batch.pusher
     count = len(batch.names)
     size = cameras[0].height, cameras[0].width
     rgb = np.zeros((len(batch.lights), len(cameras), *size, 3), np.float32)
@@ -102,8 +103,9 @@ def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> R
         rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions[b]), -1, -2)
         placed = [_Placed(queries[n], tensor(extents[n]), tensor(R), tensor(p))
                   for n, R, p in zip(batch.names, rotations, batch.positions[b], strict=True)]  # fmt: skip
-        if batch.pusher is not None:
-            placed.append(_Placed(queries["pusher"], tensor(extents["pusher"]), tensor(np.eye(3)), tensor(batch.pusher[b])))
+        if pusher is not None:
+            query, extent, centres = pusher
+            placed.append(_Placed(query, tensor(extent), tensor(np.eye(3)), tensor(centres[b])))
         for v, camera in enumerate(cameras):
             colours, shares, depths = _image(placed, table, tensor(light), camera, quality, tensor)
             rgb[b, v], depth[b, v] = colours.cpu().numpy(), depths.cpu().numpy()

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
-from osfcore.poses import Pose, quaternion_to_matrix
+from osfcore.poses import QUATERNION_NORM_TOLERANCE, Pose, quaternion_to_matrix
 from osfcore.render.packing import Packed, pack
 from osfcore.render.solids import pusher_field
 from osfcore.scene import Camera, SceneState
@@ -20,6 +20,7 @@ OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
 MASK_OPACITY = 0.5
 MOST_OBJECTS = 23  # and the pusher
 _MOST_PACKS = 8
+_FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +74,12 @@ class SceneBatch:
             wanted["pusher"] = (scenes, 3)
         for name, shape in wanted.items():
             array = getattr(self, name)
-            if array.shape != shape or not np.all(np.isfinite(array)):
+            if array.shape != shape or not np.all(np.abs(array) < _FARTHEST_M):  # also false for NaN
                 raise InvalidInput(f"{name} of a batch", f"shape {array.shape}", f"finite numbers of shape {shape}")
+        for name in ("quaternions", "lights"):
+            norms = np.linalg.norm(getattr(self, name), axis=-1)
+            if not np.all(np.abs(norms - 1) < QUATERNION_NORM_TOLERANCE):
+                raise InvalidInput(f"norms of the {name} of a batch", f"{norms.min():g} to {norms.max():g}", "1")
         if count > MOST_OBJECTS:
             raise InvalidInput("number of objects", count, f"at most {MOST_OBJECTS}")
 
@@ -122,11 +127,18 @@ class SceneRenderer:
         Args:
             fields: by name.
             table: None for black surroundings.
-            device: "cpu" for compiled code on all cores; anything else for PyTorch on that device.
+            device: "cpu" for compiled code on all cores, "cuda" for PyTorch on a GPU, "auto" for a GPU if there is one.
+
+        Raises:
+            InvalidInput: if there is no such device.
         """
         self._fields = dict(fields)
         self._table = table
         self._device = device
+        if device != "cpu":
+            from osfcore.fields.devices import pick_device
+
+            self._device = pick_device(device).type
         self._packs: dict[tuple[tuple[str, ...], bool], tuple[Packed, np.ndarray]] = {}
 
     @property
@@ -167,7 +179,8 @@ class SceneRenderer:
     def _packed(self, batch: SceneBatch) -> tuple[Packed, np.ndarray]:
         """The batch's fields, each packed once, and which of them each object has."""
         key = (batch.names, batch.pusher is not None)
-        if key not in self._packs:
+        packed = self._packs.get(key)
+        if packed is None:
             if len(self._packs) > _MOST_PACKS:  # a viewer that goes through many scenes must not keep them all
                 self._packs.clear()
             names = list(dict.fromkeys(batch.names))
@@ -178,8 +191,9 @@ class SceneRenderer:
                 fields.append(pusher_field(hidden))
             if batch.pusher is not None:
                 numbers.append(len(fields) - 1)
-            self._packs[key] = pack(fields), np.array(numbers, np.int64)
-        return self._packs[key]
+            packed = pack(fields), np.array(numbers, np.int64)
+            self._packs[key] = packed
+        return packed
 
 
 def check_request(
