@@ -1,0 +1,94 @@
+"""What only the compiled code does: run on several threads, from several threads, with arrays of fixed size."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import numba
+import numpy as np
+import pytest
+
+from osfcore.render.kernels import MOST_OBJECTS as ROOM
+from osfcore.render.scene_renderer import MOST_OBJECTS, OUTPUTS, PLANNING, SceneBatch, SceneRenderer
+from tests.core.render.scenes import random_scene, view, wooden_table
+
+
+def test_there_is_room_for_every_object_and_the_pusher():
+    assert MOST_OBJECTS + 1 <= ROOM
+
+
+def test_threads_that_render_at_once_do_not_disturb_each_other():
+    fields, scene = random_scene(4)
+    shared, batch = SceneRenderer(fields, wooden_table()), SceneBatch.of(scene)
+    jobs = [(shared, (0.5, 0, 0.4)), (shared, (0, 0.5, 0.3)), (SceneRenderer(fields, None), (0.3, 0.3, 0.3))]
+    expected = [r.render(batch, [view(p)], outputs=OUTPUTS) for r, p in jobs]
+    wrong, start = [], threading.Barrier(6)
+
+    def work(number: int) -> None:
+        renderer, place = jobs[number]
+        start.wait()
+        for _ in range(8):
+            found = renderer.render(batch, [view(place)], outputs=OUTPUTS)
+            if not (
+                np.array_equal(found.rgb, expected[number].rgb) and np.array_equal(found.depth, expected[number].depth)
+            ):
+                wrong.append(number)
+
+    threads = [threading.Thread(target=work, args=(n % 3,)) for n in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+_CROWD = """
+import threading
+import numba
+import numpy as np
+from osfcore.fields.marching import march
+from osfcore.render.scene_renderer import SceneBatch, SceneRenderer
+from tests.core.render.scenes import ball, plain_table, state, view
+
+renderer, batch = SceneRenderer({"ball": ball()}, plain_table()), SceneBatch.of(state({"ball": (0, 0, 0.05)}))
+rays = np.tile(np.float32([0, 0, 1]), (20_000, 1))
+
+def draw():
+    for _ in range(30):
+        renderer.render(batch, [view()])
+
+def walk():
+    for _ in range(30):
+        march(ball(), rays, -rays, step=0.001)
+
+threads = [threading.Thread(target=f) for f in (draw, walk, draw, walk)]
+[t.start() for t in threads]
+[t.join() for t in threads]
+print(numba.threading_layer())
+"""
+
+
+@pytest.mark.parametrize("layer", ["workqueue", "default"])
+def test_no_threading_layer_ends_the_process_when_threads_meet(layer):
+    """Numba's own layer, which machines without OpenMP get, aborts when two calls overlap."""
+    env = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "2", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", _CROWD], env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    if layer == "workqueue":
+        assert done.stdout.split() == ["workqueue"]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_number_of_threads_changes_nothing(threads):
+    fields, scene = random_scene(2)
+    renderer = SceneRenderer(fields, wooden_table())
+    expected = renderer.render(SceneBatch.of(scene), [view()], quality=PLANNING).rgb
+    before = numba.get_num_threads()
+    if threads > numba.config.NUMBA_NUM_THREADS:
+        pytest.skip("this process has one thread")
+    numba.set_num_threads(threads)
+    try:
+        np.testing.assert_array_equal(renderer.render(SceneBatch.of(scene), [view()], quality=PLANNING).rgb, expected)
+    finally:
+        numba.set_num_threads(before)

@@ -1,0 +1,342 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.poses import quaternion_exp
+from osfcore.render.reference import render_reference
+from osfcore.render.scene_renderer import (
+    EXACT,
+    MASK_OPACITY,
+    MOST_OBJECTS,
+    OUTPUTS,
+    PLANNING,
+    Quality,
+    SceneBatch,
+    SceneRenderer,
+)
+from osfcore.scene import PUSHER_CENTRE_Z_M, Camera, Light
+from tests.core.render.scenes import UPRIGHT, ball, block, fog, plain_table, random_scene, state, view, wooden_table
+
+CAMERAS = {
+    "usual": view((0.45, 0.1, 0.35), size=24, fov_y_deg=40),
+    "close": view((0.16, -0.05, 0.12), size=24, fov_y_deg=60),
+    "inside": view((0.02, 0.01, 0.06), (0.1, 0.0, 0.0), 24, 90),
+    "away": view((0.4, 0, 0.3), (1.0, 0, 0.5), 24, 60),
+    "below": view((0.3, 0, -0.2), (0, 0, 0.03), 24, 60),
+    "flat": view((0.5, 0, 0.03), (0, 0, 0.03), 24, 40),
+}
+
+
+def batch_of(names, scenes: int, seed: int = 0, pusher: bool = True) -> SceneBatch:
+    rng = np.random.default_rng(seed)
+    count = len(names)
+    positions = np.concatenate(
+        [rng.uniform(-0.1, 0.1, (scenes, count, 2)), rng.uniform(0.03, 0.08, (scenes, count, 1))], 2
+    )
+    lights = np.stack([Light.random(rng).direction for _ in range(scenes)])
+    centre = np.concatenate([rng.uniform(-0.1, 0.1, (scenes, 2)), np.full((scenes, 1), PUSHER_CENTRE_Z_M)], axis=1)
+    return SceneBatch(
+        names, positions, quaternion_exp(rng.normal(size=(scenes, count, 3))), lights, centre if pusher else None
+    )
+
+
+def same(a, b, atol: float = 0.0) -> None:
+    for name in ("rgb", "opacity", "depth"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=atol, err_msg=name)
+    clear = np.abs(a.opacity - MASK_OPACITY) > 1e-3
+    np.testing.assert_array_equal(a.masks[clear], b.masks[clear])
+
+
+# Seeds are chosen so that one, two and four objects, pushers and lights down to 10 deg all occur.
+@pytest.mark.parametrize("seed", [1, 2, 6, 9, 11])
+def test_exact_is_the_reference(seed):
+    fields, scene = random_scene(seed)
+    table = None if seed % 3 == 0 else wooden_table(seed=seed)
+    camera = view(np.random.default_rng(seed).normal(size=3) * 0.1 + [0.35, 0, 0.3], size=20, fov_y_deg=50)
+    fast = SceneRenderer(fields, table).render(SceneBatch.of(scene), [camera], outputs=OUTPUTS)
+    same(fast, render_reference(fields, table, scene, camera, outputs=OUTPUTS), 1e-3)
+    assert fast.rgb.dtype == fast.opacity.dtype == fast.depth.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_exact_is_the_reference_from_odd_places(name):
+    """A camera close by, within an object, looking away, below the table, level with it."""
+    fields, scene = random_scene(9)
+    scene = replace(scene, pusher=np.array([0.05, -0.05, PUSHER_CENTRE_Z_M]))
+    fast = SceneRenderer(fields, wooden_table()).render(SceneBatch.of(scene), [CAMERAS[name]], outputs=OUTPUTS)
+    same(fast, render_reference(fields, wooden_table(), scene, CAMERAS[name], outputs=OUTPUTS), 1e-3)
+
+
+@pytest.mark.parametrize("light", [(1, 0.2, np.tan(np.deg2rad(10))), (0.3, 0, 1)])
+def test_objects_that_sink_into_the_table_shade_it_as_in_the_reference(light):
+    """Candidates of a search do; the part below shows and shades nothing."""
+    fields = {"a": block(albedo=(0.9, 0.2, 0.2)), "b": ball()}
+    tilted = quaternion_exp(np.array([0.5, 0.4, 0.1]))
+    scene = state({"a": ((0, 0.05, 0.01), tilted), "b": ((0.02, -0.08, -0.02), UPRIGHT)}, light)
+    camera = view((0.3, 0.1, 0.4), size=32, fov_y_deg=60)
+    fast = SceneRenderer(fields, plain_table()).render(SceneBatch.of(scene), [camera], outputs=OUTPUTS)
+    same(fast, render_reference(fields, plain_table(), scene, camera, outputs=OUTPUTS), 1e-3)
+
+
+def test_several_rays_a_pixel_are_those_of_the_reference():
+    fields, scene = random_scene(9)
+    table = plain_table(half_side=0.15)  # whose edge is in view
+    quality = Quality(samples_per_side=2)
+    fast = SceneRenderer(fields, table).render(
+        SceneBatch.of(scene), [CAMERAS["usual"]], quality=quality, outputs=OUTPUTS
+    )
+    slow = render_reference(fields, table, scene, CAMERAS["usual"], quality=quality, outputs=OUTPUTS)
+    np.testing.assert_allclose(fast.rgb, slow.rgb, atol=1e-3)
+    np.testing.assert_allclose(fast.opacity, slow.opacity, atol=1e-3)
+    np.testing.assert_allclose(fast.depth, slow.depth, atol=5e-3)  # the mean over a pixel's rays, less exactly
+    one = SceneRenderer(fields, table).render(SceneBatch.of(scene), [CAMERAS["usual"]])
+    assert np.abs(one.rgb - fast.rgb).max() > 0.05
+
+
+def test_several_rays_a_pixel_are_the_mean_of_a_larger_image():
+    fields, scene = random_scene(0)
+    renderer, batch = SceneRenderer(fields, wooden_table()), SceneBatch.of(scene)
+    camera = view(size=32)
+    fine = renderer.render(batch, [camera.resized(64, 64)], outputs=OUTPUTS)
+    coarse = renderer.render(batch, [camera], quality=Quality(samples_per_side=2), outputs=OUTPUTS)
+    mean = fine.rgb.reshape(1, 1, 32, 2, 32, 2, 3).mean(axis=(3, 5))
+    opacity = fine.opacity.reshape(1, 1, -1, 32, 2, 32, 2).mean(axis=(4, 6))
+    np.testing.assert_allclose(coarse.opacity, opacity, atol=1e-4)
+    # The plain table is drawn with one ray where a pixel lies wholly on it: there its colour is as good as linear.
+    on_object = opacity.sum(axis=2) > 1e-3
+    np.testing.assert_allclose(coarse.rgb[on_object], mean[on_object], atol=1e-3)
+    np.testing.assert_allclose(coarse.rgb, mean, atol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_planning_stays_above_40_db(seed):
+    """Against the exact path, which the tests above tie to the reference; with hard edges, as trained fields have."""
+    rng = np.random.default_rng(seed)
+    fields = {
+        "a": block(rng.uniform(0.02, 0.05, 3), voxel=0.002, albedo=tuple(rng.uniform(0.2, 0.9, 3))),
+        "b": ball(rng.uniform(0.02, 0.05), voxel=0.002, albedo=tuple(rng.uniform(0.2, 0.9, 3))),
+        "c": block(rng.uniform(0.02, 0.05, 3), voxel=0.002),
+    }
+    renderer, batch = SceneRenderer(fields, wooden_table()), batch_of(tuple(fields), 1, seed)
+    camera = Camera.look_at("0", (0.65, 0, 0.55), (0, 0, 0.04), size=128)
+    exact = renderer.render(batch, [camera]).rgb
+    error = np.mean((renderer.render(batch, [camera], quality=PLANNING).rgb - exact) ** 2)
+    assert -10 * np.log10(error) > 40
+
+
+def test_planning_of_random_fields_is_near_the_reference():
+    fields, scene = random_scene(1)
+    camera = view(size=32)
+    fast = SceneRenderer(fields, wooden_table()).render(SceneBatch.of(scene), [camera], quality=PLANNING)
+    slow = render_reference(fields, wooden_table(), scene, camera)
+    assert -10 * np.log10(np.mean((fast.rgb - slow.rgb) ** 2)) > 30  # fog and noise, the worst there is
+
+
+@pytest.mark.parametrize("quality", [EXACT, PLANNING])
+@pytest.mark.parametrize("seed", range(8))
+def test_the_order_of_objects_changes_nothing(seed, quality):
+    fields, scene = random_scene(seed, count=4)
+    order = np.random.default_rng(seed).permutation(4)
+    names = tuple(scene.names[i] for i in order)
+    shuffled = replace(scene, names=names, poses=scene.poses[order])
+    renderer = SceneRenderer(fields, wooden_table())
+    a, b = (renderer.render(SceneBatch.of(s), [view()], quality=quality, outputs=OUTPUTS) for s in (scene, shuffled))
+    np.testing.assert_allclose(a.rgb, b.rgb, atol=1e-6)
+    np.testing.assert_allclose(a.opacity[:, :, order], b.opacity, atol=1e-6)
+    np.testing.assert_allclose(a.depth, b.depth, atol=1e-6)
+
+
+@pytest.mark.parametrize("quality", [EXACT, PLANNING])
+@pytest.mark.parametrize("pusher", [False, True])
+def test_a_batch_is_its_scenes_and_cameras_one_by_one(quality, pusher):
+    fields, _ = random_scene(4, count=3)
+    renderer = SceneRenderer(fields, wooden_table())
+    batch = batch_of(tuple(fields), 5, pusher=pusher)
+    batch = replace(batch, lights=batch.lights[[0, 1, 0, 2, 1]])  # some share their empty table
+    cameras = [CAMERAS["usual"], CAMERAS["close"], CAMERAS["away"]]
+    whole = renderer.render(batch, cameras, quality=quality, outputs=OUTPUTS)
+    assert whole.rgb.shape == (5, 3, 24, 24, 3)
+    for b in range(5):
+        parts = (a[b : b + 1] for a in (batch.positions, batch.quaternions, batch.lights))
+        one = SceneBatch(batch.names, *parts, batch.pusher[b : b + 1] if pusher else None)
+        for v, camera in enumerate(cameras):
+            single = renderer.render(one, [camera], quality=quality, outputs=OUTPUTS)
+            for name in ("rgb", "opacity", "masks", "depth"):
+                np.testing.assert_array_equal(getattr(whole, name)[b, v], getattr(single, name)[0, 0], err_msg=name)
+
+
+def test_the_same_object_may_stand_in_a_scene_twice():
+    fields = {"ball": ball()}
+    two = SceneBatch(("ball", "ball"), np.array([[[0, -0.1, 0.05], [0, 0.1, 0.05]]]), np.tile(UPRIGHT, (1, 2, 1)),
+                     np.array([[0, 0, 1.0]]), None)  # fmt: skip
+    rendered = SceneRenderer(fields, plain_table()).render(two, [view((0.5, 0, 0.4))], outputs=OUTPUTS)
+    left, right = rendered.opacity[0, 0]
+    assert left.sum() > 10
+    np.testing.assert_allclose(left, right[:, ::-1], atol=1e-3)
+    np.testing.assert_allclose(rendered.rgb[0, 0], rendered.rgb[0, 0, :, ::-1], atol=2e-3)
+
+
+def test_opacities_masks_and_what_lies_behind_add_up():
+    fields, scene = random_scene(2)
+    scene = replace(scene, pusher=None)  # which shows, but is no object
+    rendered = SceneRenderer(fields, None).render(SceneBatch.of(scene), [view()], outputs=OUTPUTS)
+    total = rendered.opacity.sum(axis=2)
+    assert rendered.opacity.min() >= 0
+    assert total.max() <= 1 + 1e-5
+    assert np.all(rendered.masks.sum(axis=2) <= 1)
+    np.testing.assert_array_equal(rendered.masks, rendered.opacity >= MASK_OPACITY)
+    assert rendered.rgb[total < 1e-6].max() < 1e-5
+    assert not rendered.depth[total < 1e-6].any()
+    assert np.all(rendered.depth[total > 0.01] > 0)
+
+
+def test_the_nearer_object_hides_the_other():
+    fields = {"near": block((0.03, 0.03, 0.03)), "far": ball(0.05)}
+    scene = state({"near": (0.1, 0, 0.05), "far": (-0.1, 0, 0.05)})
+    camera = view((1, 0, 0.05), (0, 0, 0.05), 32, 8)
+    rendered = SceneRenderer(fields, plain_table()).render(SceneBatch.of(scene), [camera], outputs=OUTPUTS)
+    near, far = rendered.masks[0, 0]
+    assert near[16, 16]
+    assert not far[16, 16]
+    assert far.any()
+    np.testing.assert_allclose(rendered.depth[0, 0, 16, 16], 1 - 0.13, atol=3e-3)
+    # Interpenetrating: what is in front wins sample by sample.
+    inside = state({"near": (0, 0, 0.05), "far": (0, 0, 0.05)})
+    rendered = SceneRenderer(fields, None).render(SceneBatch.of(inside), [camera], outputs=OUTPUTS)
+    assert rendered.masks[0, 0, 1, 16, 16]
+    assert rendered.opacity[0, 0, 0, 16, 16] < 0.05
+
+
+def test_objects_out_of_sight_leave_the_picture_alone():
+    fields = {"seen": ball(), "gone": block()}
+    camera, table = view((0.5, 0, 0.4)), plain_table()
+    for place in ((0.9, 0, 0.4), (0, 5.0, 0.05), (0, 0, -3.0), (0, 0, 40.0), (1e5, 1e5, 0.1)):  # behind, beside, far
+        scene = state({"seen": (0, 0, 0.05), "gone": place}, (0.3, -0.2, 0.9))
+        rendered = SceneRenderer(fields, table).render(SceneBatch.of(scene), [camera], outputs=OUTPUTS)
+        alone = SceneRenderer(fields, table).render(
+            SceneBatch.of(state({"seen": (0, 0, 0.05)}, (0.3, -0.2, 0.9))), [camera], outputs=OUTPUTS
+        )
+        np.testing.assert_allclose(rendered.rgb, alone.rgb, atol=1e-5)
+        assert not rendered.opacity[0, 0, 1].any()
+
+
+def test_a_camera_far_away_sees_what_a_long_lens_sees():
+    """Distances of many thousand voxels, where float32 is coarse, lead neither out of the grid nor to garbage."""
+    fields = {"ball": ball()}
+    for distance in (50.0, 2000.0):
+        camera = view((distance, 0, 0), (0, 0, 0), 24, np.rad2deg(2 * np.arctan(0.08 / distance)))
+        rendered = SceneRenderer(fields, None).render(
+            SceneBatch.of(state({"ball": (0, 0, 0)})), [camera], outputs=OUTPUTS
+        )
+        assert np.all(np.isfinite(rendered.rgb))
+        assert abs(rendered.masks.sum() / (np.pi * (12 * 0.05 / 0.08) ** 2) - 1) < 0.25
+
+
+def test_a_light_on_the_horizon_or_below_gives_ambient_only_to_the_table():
+    fields = {"ball": ball()}
+    for light in ((1.0, 0, 0), (0.6, 0, -0.8)):
+        batch = SceneBatch(("ball",), np.array([[[0, 0, 0.05]]]), np.array([[UPRIGHT]]), np.array([light]), None)
+        rendered = SceneRenderer(fields, plain_table()).render(batch, [view((0.3, 0.1, 0.4))], outputs=OUTPUTS)
+        np.testing.assert_allclose(rendered.rgb[0, 0][rendered.opacity[0, 0, 0] < 1e-6], 0.125, atol=1e-4)
+
+
+def test_an_empty_scene_is_the_table_or_black():
+    empty = SceneBatch.of(state({}))
+    black = SceneRenderer({}, None).render(empty, [view()], outputs=OUTPUTS)
+    assert not black.rgb.any()
+    assert not black.depth.any()
+    assert black.opacity.shape == black.masks.shape == (1, 1, 0, 32, 32)
+    assert SceneRenderer({"ball": ball()}, plain_table()).render(empty, [view()]).rgb.min() > 0.05
+
+
+def test_scenes_and_the_pusher_come_and_go_without_leaving_a_trace():
+    """Packs are kept between calls, and dropped when there are many."""
+    fields = {f"object{i}": ball(0.02 + 0.002 * i) for i in range(12)}
+    renderer = SceneRenderer(fields, plain_table())
+    assert renderer.names == tuple(fields)
+    first = None
+    for _ in range(2):
+        for i in range(12):
+            for pusher in (None, (0.1, 0, PUSHER_CENTRE_Z_M)):
+                rendered = renderer.render(
+                    SceneBatch.of(state({f"object{i}": (0, 0, 0.05)}, pusher=pusher)), [view(size=16)]
+                )
+                if i == 0 and pusher is None:
+                    first = rendered.rgb if first is None else first
+                    np.testing.assert_array_equal(rendered.rgb, first)
+
+
+def test_as_many_objects_as_allowed():
+    fields = {"ball": ball(0.02)}
+
+    def batch(count):
+        positions = np.stack([np.linspace(-0.25, 0.25, count), np.zeros(count), np.full(count, 0.03)], axis=1)[None]
+        return SceneBatch(("ball",) * count, positions, np.tile(UPRIGHT, (1, count, 1)), np.array([[0, 0, 1.0]]),
+                          np.array([[0, 0.1, PUSHER_CENTRE_Z_M]]))  # fmt: skip
+
+    rendered = SceneRenderer(fields, plain_table()).render(
+        batch(MOST_OBJECTS), [view((0, -0.6, 0.4), size=128)], outputs=OUTPUTS
+    )
+    assert np.all(rendered.masks[0, 0].any(axis=(1, 2)))
+    with pytest.raises(InvalidInput, match=f"number of objects is 24, but it must be at most {MOST_OBJECTS}"):
+        batch(MOST_OBJECTS + 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": np.zeros((2, 3))}, "positions of a batch is shape"),
+        ({"positions": np.full((2, 1, 3), np.nan)}, "positions of a batch.*finite"),
+        ({"positions": np.full((2, 1, 3), 1e300)}, "positions of a batch"),
+        ({"quaternions": np.zeros((2, 1, 4))}, "norms of the quaternions of a batch"),
+        ({"quaternions": np.zeros((2, 2, 4))}, "quaternions of a batch is shape"),
+        ({"lights": np.full((2, 3), 0.1)}, "norms of the lights"),
+        ({"lights": np.zeros((3, 3))}, "batch is shape"),
+        ({"pusher": np.zeros((1, 3))}, "pusher of a batch"),
+        ({"names": ("ball", "ball")}, "positions of a batch"),
+    ],
+)
+def test_batches_that_make_no_sense_are_told(change, message):
+    good = {"names": ("ball",), "positions": np.zeros((2, 1, 3)), "quaternions": np.tile(UPRIGHT, (2, 1, 1)),
+            "lights": np.array([[0, 0, 1.0]] * 2), "pusher": None}  # fmt: skip
+    SceneBatch(**good)
+    with pytest.raises(InvalidInput, match=message):
+        SceneBatch(**good | change)
+
+
+def test_requests_that_make_no_sense_are_told():
+    renderer, batch = SceneRenderer({"ball": ball()}, None), SceneBatch.of(state({"ball": (0, 0, 0)}))
+    with pytest.raises(InvalidInput, match="outputs is normals, rays, but it must be depth, masks, opacity, rgb"):
+        renderer.render(batch, [view()], outputs={"rays", "normals", "rgb"})
+    with pytest.raises(InvalidInput, match="image sizes.*one size"):
+        renderer.render(batch, [view(size=16), view(size=32)])
+    with pytest.raises(InvalidInput, match="image sizes"):
+        renderer.render(batch, [])
+    with pytest.raises(UnknownName, match="no field named 'mug'; known: ball"):
+        renderer.render(SceneBatch.of(state({"mug": (0, 0, 0)})), [view()])
+    other = SceneRenderer({"ball": ball(), "fog": replace(fog(), hidden=7)}, None)
+    with pytest.raises(InvalidInput, match="widths of the fields' networks"):
+        other.render(SceneBatch.of(state({"ball": (0, 0, 0), "fog": (0, 0, 0)})), [view()])
+
+
+def test_images_need_not_be_square():
+    camera = view(size=48).resized(40, 24)
+    fields, scene = random_scene(9)
+    rendered = SceneRenderer(fields, wooden_table()).render(SceneBatch.of(scene), [camera], outputs=OUTPUTS)
+    assert rendered.rgb.shape == (1, 1, 24, 40, 3)
+    same(rendered, render_reference(fields, wooden_table(), scene, camera, outputs=OUTPUTS), 1e-3)
+
+
+def test_what_was_not_asked_for_is_none_and_asking_changes_no_colour():
+    fields, scene = random_scene(3)
+    renderer, batch = SceneRenderer(fields, wooden_table()), SceneBatch.of(scene)
+    everything = renderer.render(batch, [view()], outputs=OUTPUTS)
+    for names in ({"rgb"}, {"depth"}, {"masks"}, {"opacity"}, set()):
+        rendered = renderer.render(batch, [view()], outputs=names)
+        np.testing.assert_array_equal(rendered.rgb, everything.rgb)
+        for name in ("opacity", "masks", "depth"):
+            assert (getattr(rendered, name) is not None) == (name in names)
+            if name in names:
+                np.testing.assert_array_equal(getattr(rendered, name), getattr(everything, name))
