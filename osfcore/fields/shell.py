@@ -21,7 +21,7 @@ _INSIDE_G = 6.0
 _BLUR_PX = 1.0
 _MISSED_SHARE = 0.01  # of the views may contradict a voxel
 _VISIBLE_WEIGHT = 5e-3
-_NEEDED_WEIGHT = 2e-3
+_NEEDED_WEIGHT = 2e-2
 _PIXELS_LOOKED_AT = 400_000
 
 
@@ -128,7 +128,7 @@ def trim(field: KiloOSF, images: ImageSet) -> KiloOSF:
     for i, j, k in np.ndindex(2, 2, 2):  # a voxel needs its eight corners
         nx, ny, nz = used.shape
         corners[i:, j:, k:] |= used[: nx - i, : ny - j, : nz - k]
-    keep = ndimage.binary_dilation(corners) & (field.index > 0)
+    keep = corners & (field.index > 0)
     features = field.rows[field.index]
     return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
 
