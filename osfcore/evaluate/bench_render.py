@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, MissingAssets
+from osfcore.errors import InvalidInput
+from osfcore.evaluate.fields import measurable
 from osfcore.evaluate.images import Comparison, as_bytes, psnr
 from osfcore.fields.library import FieldLibrary
 from osfcore.fields.table import TableField
@@ -159,7 +160,7 @@ def bench_render(config: BenchRender, fields: FieldLibrary, assets: AssetLibrary
     """Measure everything, one part after the other.
 
     Raises:
-        InvalidInput: if a number is out of range.
+        InvalidInput: if a number is out of range, or there is no field.
         MissingAssets: if no object has both a field and a mesh.
     """
     if min(config.scenes, config.repeats) < 1:
@@ -231,9 +232,7 @@ class _Stage:
     """Objects, both renderers, and the scenes that they are timed on."""
 
     def __init__(self, config: BenchRender, fields: FieldLibrary, assets: AssetLibrary) -> None:
-        available = [name for name in fields.names() if assets.has(name)]
-        if not available:
-            raise MissingAssets(fields.names())
+        available = measurable(fields, assets)
         self._config = config
         self._rng = np.random.default_rng(config.seed)
         count = max(OBJECTS, *config.counts)

@@ -199,6 +199,22 @@ def evaluate_set(config: EvaluateSet) -> Iterator[EvaluationStep]:
     yield EvaluationStep(1, 1, "Everything is measured", report)
 
 
+def measurable(fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """The objects with both a field and a mesh.
+
+    Raises:
+        InvalidInput: if there is no field at all.
+        MissingAssets: if there are fields, but no mesh for any.
+    """
+    known = fields.names()
+    if not known:
+        raise InvalidInput("number of trained fields", 0, "1 or more: train one with 'osf train field'")
+    names = tuple(name for name in known if assets.has(name))
+    if not names:
+        raise MissingAssets(known)
+    return names
+
+
 def _checked(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
     """The objects to measure, after everything asked for was found possible."""
     limits = {
@@ -211,10 +227,7 @@ def _checked(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary)
             raise InvalidInput(what, value, f"between {low} and {high}")
     image_side(config.size)
     if config.names is None:
-        names = tuple(name for name in fields.names() if assets.has(name))
-        if not names:
-            raise MissingAssets(fields.names())
-        return names
+        return measurable(fields, assets)
     for name in config.names:
         fields.info(name)  # raises UnknownName
         if not assets.has(name):

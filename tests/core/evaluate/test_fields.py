@@ -192,4 +192,6 @@ def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library
         next(evaluate_fields(EvaluateFields(out), solids, nothing))
     with pytest.raises(MissingAssets, match=SOLIDS[1]):
         next(evaluate_fields(EvaluateFields(out, SOLIDS[1:2]), solids, nothing))
+    with pytest.raises(InvalidInput, match="train one"):
+        next(evaluate_fields(EvaluateFields(out), FieldLibrary(None, shipped=tmp_path), library))
     assert not out.exists()
