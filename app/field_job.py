@@ -102,7 +102,7 @@ def _collect(mesh: str, params: dict[str, Any], out: Path, place: Place, begin: 
 def _train(params: dict[str, Any], data: Path, out: Path, preview: Path, begin: TrainingStep) -> Iterator[TrainingStep]:
     from osfcore.fields.training import TrainField, train_field
 
-    config = TrainField(data, out, minutes=params["minutes"], seed=params["seed"])
+    config = TrainField(data, out, minutes=params["minutes"], seed=params["seed"], hollow=params["hollow"])
     previews = 0
     for told in train_field(config):
         if told.preview is not None:

@@ -65,6 +65,7 @@ class TrainFieldParams(Input):
     minutes: float = Field(30, ge=0.1, le=1440, description="How long to train [min].")
     seed: Seed = 0
     images: int = Field(300, ge=60, le=5000, description="Images to take of a mesh; a set has its own.")
+    hollow: bool = Field(False, description="The object has hollows that no silhouette shows, such as a bowl's.")
 
 
 class CollectPushesJob(Input):

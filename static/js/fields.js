@@ -125,7 +125,7 @@ async function deleteSet() {
 // Training
 
 async function train() {
-  const { mesh, set, name, images, minutes, seed } = form().elements;
+  const { mesh, set, name, images, minutes, seed, hollow } = form().elements;
   const isMesh = source() === "mesh";
   if (isMesh && !mesh.value) throw new Error("No meshes are on this machine yet; fetch objects first.");
   if (!isMesh && !set.value) throw new Error("Upload a zip with an image set first.");
@@ -135,6 +135,7 @@ async function train() {
     source: isMesh ? { mesh: mesh.value } : { set: set.value },
     minutes: Number(minutes.value),
     seed: Number(seed.value),
+    hollow: hollow.checked,
     ...(isMesh ? { images: Number(images.value) } : {}),
   };
   showJob(await post("jobs", { kind: "train_field", params }));
