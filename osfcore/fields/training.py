@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from osfcore.fields.devices import pick_device
 from osfcore.fields.distill import Distillation, first_student
@@ -136,6 +136,9 @@ def train_field(config: TrainField, recipe: Recipe | None = None) -> Iterator[Fi
     recipe = recipe or Recipe()
     yield FieldStep(Progress(0, _total(config), "Reading the images"), None, None, None)
     train, test = read_splits(config.data)
+    if train.is_opaque:
+        expected = "an object before a transparent background is expected (opaque sets show the bare table)"
+        raise CorruptFile(config.data, f"its images are opaque all over; {expected}")
     yield from _Run(config, recipe, device, train, test).steps()
 
 
