@@ -1,4 +1,4 @@
-"""Image sets drawn by the project's own renderer from solids made by formula: small, and learnable to the last decibel."""
+"""Image sets drawn by the project's own renderer from solids made by formula: small, and easy to learn."""
 
 import json
 from collections.abc import Callable
