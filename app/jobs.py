@@ -82,6 +82,7 @@ class Jobs:
         self._run: _Run | None = None
         self._is_stopping = False
         self._last_event = 0.0
+        self._untold: Job | None = None  # the latest progress, if it came too soon after the one before
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -245,6 +246,8 @@ class Jobs:
             with self._changed:
                 if outcome is not None:
                     break
+                if self._untold is not None:
+                    self._set(self._untold, is_progress=True)
                 if self._is_stopping:
                     outcome = Failure(0, "Stopped", STOPPED_NOTE)
                 elif run.cancel_at is not None and time.monotonic() > run.cancel_at:
@@ -311,7 +314,10 @@ class Jobs:
             self._jobs[job.id] = job
             now = time.monotonic()
             if is_progress and now - self._last_event < _EVENT_INTERVAL_S:
+                self._untold = job
                 return
+            if self._untold is not None and self._untold.id == job.id:
+                self._untold = None
             self._last_event = now if is_progress else self._last_event
             self._keep_and_tell(job)
 

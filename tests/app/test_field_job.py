@@ -15,7 +15,14 @@ from osfcore.errors import MissingAssets
 from osfcore.progress import Progress
 
 GELATIN = "009_gelatin_box"
-ORDER = {"name": GELATIN, "source": {"mesh": GELATIN, "set": None}, "minutes": 0.5, "seed": 3, "images": 60, "hollow": False}
+ORDER = {
+    "name": GELATIN,
+    "source": {"mesh": GELATIN, "set": None},
+    "minutes": 0.5,
+    "seed": 3,
+    "images": 60,
+    "hollow": False,
+}
 
 
 @pytest.fixture

@@ -177,3 +177,16 @@ def test_a_training_that_was_killed_says_that_it_can_go_on_and_a_cancelled_one_l
     assert time.monotonic() - start < 2.5
     assert not shop.exists()
     assert jobs.live("train_field") == ()
+
+
+def test_progress_that_comes_too_soon_is_told_when_nothing_follows(open_jobs):
+    jobs, events = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    jobs.pause(job.id)  # a step may be on its way still
+    events.clear()
+    jobs.resume(job.id)
+    until(lambda: jobs.get(job.id).done > 200)
+    os.kill(jobs._run.process.pid, signal.SIGSTOP)  # nothing follows, as in a long step
+    until(lambda: events and events[-1].job.done == jobs.get(job.id).done)
+    jobs.cancel(job.id)

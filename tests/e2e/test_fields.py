@@ -13,7 +13,7 @@ from tests.live import live_service
 
 pytestmark = pytest.mark.e2e
 GELATIN = "009_gelatin_box"
-TRAIN_S = 240  # 12 s of descent, and the looks at images, on a busy machine
+TRAIN_S = 400  # 12 s of descent, and the looks at images, on a busy machine
 
 
 @pytest.fixture(scope="module")
