@@ -4,33 +4,37 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G, MACRO, KiloOSF, network_size, occupied_blocks
+from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G, MACRO, KiloOSF, block_distances, network_size
 from osfcore.fields.query import KiloQuery
 from tests.core.render.scenes import ball, block
 
 
-def blocks_by_hand(density):
-    """Every block of 4 x 4 x 4 voxels together with all its 5 x 5 x 5 corners."""
+def distances_by_hand(density):
+    """Every block of 4 x 4 x 4 voxels together with all its 5 x 5 x 5 corners, against every other."""
     shape = [-(-(n - 1) // MACRO) for n in density.shape]
-    blocks = np.zeros(shape, np.uint8)
-    for i, j, k in np.ndindex(*shape):
-        part = density[tuple(slice(MACRO * b, MACRO * (b + 1) + 1) for b in (i, j, k))]
-        blocks[i, j, k] = np.any(part > FLOOR_G)
+    occupied = []
+    for place in np.ndindex(*shape):
+        part = density[tuple(slice(MACRO * b, MACRO * (b + 1) + 1) for b in place)]
+        if np.any(part > FLOOR_G):
+            occupied.append(place)
+    blocks = np.full(shape, 255, np.uint8)
+    for place in np.ndindex(*shape) if occupied else ():
+        blocks[place] = np.abs(np.array(occupied) - place).max(axis=1).min()
     return blocks
 
 
-@given(shape=st.tuples(*[st.integers(2, 14)] * 3), seed=st.integers(0, 10**6), share=st.sampled_from([0.0, 0.005, 0.1]))
-def test_blocks_are_occupied_where_any_of_their_corners_is(shape, seed, share):
+@given(shape=st.tuples(*[st.integers(2, 22)] * 3), seed=st.integers(0, 10**6), share=st.sampled_from([0.0, 5e-4, 0.1]))
+def test_blocks_know_how_far_away_density_is(shape, seed, share):
     rng = np.random.default_rng(seed)
     density = np.where(rng.random(shape) < share, 1.0, EMPTY_G).astype(np.float32)
-    np.testing.assert_array_equal(occupied_blocks(density), blocks_by_hand(density))
+    np.testing.assert_array_equal(block_distances(density), distances_by_hand(density))
 
 
 def test_a_corner_at_the_floor_is_empty():
     density = np.full((6, 6, 6), FLOOR_G, np.float32)
-    assert not occupied_blocks(density).any()
+    assert np.all(block_distances(density) == 255)
     density[2, 2, 2] = np.nextafter(np.float32(FLOOR_G), np.float32(0))
-    assert occupied_blocks(density).sum() == 1
+    assert (block_distances(density) == 0).sum() == 1
 
 
 def test_box_and_extent_of_a_block():
@@ -48,13 +52,13 @@ def test_the_extent_of_nothing_is_the_whole_box():
     empty = KiloOSF(field.origin, field.voxel, 0 * field.index, field.rows, field.cells, field.networks, field.hidden,
                     field.ambient)  # fmt: skip
     np.testing.assert_array_equal(empty.extent, empty.box)
-    assert not empty.macro.any()
+    assert np.all(empty.macro == 255)
 
 
 def test_density_and_blocks_are_derived_from_rows():
     field = ball()
     np.testing.assert_array_equal(field.density, field.rows[field.index, 0])
-    np.testing.assert_array_equal(field.macro, blocks_by_hand(field.density))
+    np.testing.assert_array_equal(field.macro, distances_by_hand(field.density))
 
 
 @pytest.mark.parametrize("hidden", [1, 8, 16])

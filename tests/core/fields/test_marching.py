@@ -7,7 +7,7 @@ from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, FLOOR_G, KiloOSF
 from osfcore.fields.marching import march
 from tests.core.render.scenes import ball, block, fog, fog_depth
 
-EVERYTHING = {"min_weight": 0.0, "min_transmittance": 0.0, "most": 4096}
+EVERYTHING = {"min_weight": -1.0, "min_transmittance": -1.0, "most": 4096}  # also where float32 leaves no light
 
 
 def softplus(g):
@@ -55,7 +55,7 @@ def depth_found(field: KiloOSF, origins, directions, step, **settings):
     return (optical_density(g_at(field, points)) * used).sum(axis=1) * step / field.voxel
 
 
-@pytest.mark.parametrize("g", [-2.0, 0.0, 3.0, 20.0])
+@pytest.mark.parametrize("g", [-2.0, 0.0, 3.0, 5.0])  # denser slabs let less through than float32 can tell
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_optical_depth_of_a_slab_is_density_times_thickness(g, axis):
     field = fog(g=g)
