@@ -65,7 +65,9 @@ def _check_field(path: Path) -> Report:
     field = read_field(path)
     size = " x ".join(f"{side:.3g}" for side in field.extent[1] - field.extent[0])
     facts = {"corners": len(field.rows) - 1, "networks": len(field.networks)}
-    return Report("field", f"an object of {size}, {facts['corners']} voxel corners, {facts['networks']} networks", facts)
+    return Report(
+        "field", f"an object of {size}, {facts['corners']} voxel corners, {facts['networks']} networks", facts
+    )
 
 
 def _check_pushes(path: Path) -> Report:

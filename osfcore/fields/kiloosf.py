@@ -1,14 +1,15 @@
 """KiloOSF: one object's relightable scattering function, as a voxel shell and a grid of tiny networks.
 
-f(x, light direction, view direction) -> (rho, sigma), paper eq. 1. A point's features are interpolated between the eight
-corners of its voxel; the tiny network of its cell turns them, the light and the view into the direct light it scatters:
+f(x, light direction, view direction) -> (rho, sigma), paper eq. 1. A point's features are interpolated between the
+eight corners of its voxel; the tiny network of its cell turns them, the light and the view into the direct light it
+scatters:
 
     sigma = max(softplus(g) - softplus(FLOOR), 0) / voxel                       [1 / unit of length]
     rho   = albedo * (ambient + max(n . l + network(n . l, latent, l, v, position in the cell), 0))
 
-with g, albedo, n and latent the features. Deviations from the paper, each measured in docs/fields.md: density, reflectance
-and a dipole (n) live in voxels and not in the networks, so that occupied space, silhouettes and shadows need no network;
-the ambient part of rho is kept apart, so that a shadow can remove the direct part alone.
+with g, albedo, n and latent the features. Deviations from the paper, each measured in docs/fields.md: density,
+reflectance and a dipole (n) live in voxels and not in the networks, so that occupied space, silhouettes and shadows
+need no network; the ambient part of rho is kept apart, so that a shadow can remove the direct part alone.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int32, UInt8
+from scipy import ndimage
 
 FEATURES = 8  # g, albedo (3), n (3), latent
 NETWORK_INPUTS = 11  # n . l, latent, l (3), v (3), position in the cell (3)
@@ -25,7 +27,8 @@ FLOOR_G = -6.0  # at and below it the density is exactly 0
 DENSITY_FLOOR = float(np.log1p(np.exp(FLOOR_G)))
 STEP_VOXELS = 0.5  # distance between samples along a ray, in training and in exact rendering
 MOST_HIDDEN = 64  # width of the tiny networks
-MACRO = 4  # side of the blocks that tell occupied from empty space [voxels]
+MACRO_BITS = 2
+MACRO = 1 << MACRO_BITS  # side of the blocks that tell occupied from empty space [voxels]
 
 
 def network_size(hidden: int) -> int:
@@ -46,7 +49,7 @@ class KiloOSF:
         networks: parameters of C tiny networks, layer by layer: weights (inputs x outputs), then biases.
         hidden: width of the tiny networks.
         ambient: what an unlit white point sends out, per colour.
-        macro: blocks of 4 x 4 x 4 voxels that hold any density; derived.
+        macro: of each block of 4 x 4 x 4 voxels, how many blocks away the nearest density is; derived.
         density: g on every corner; derived.
     """
 
@@ -59,13 +62,13 @@ class KiloOSF:
     hidden: int
     ambient: Float32[np.ndarray, "3"]
     density: Float32[np.ndarray, "nx ny nz"] = field(init=False)
-    macro: np.ndarray = field(init=False)
+    macro: UInt8[np.ndarray, "bx by bz"] = field(init=False)
 
     def __post_init__(self) -> None:
         """Derive what marching looks at."""
         density = np.ascontiguousarray(self.rows[:, 0][self.index])
         object.__setattr__(self, "density", density)
-        object.__setattr__(self, "macro", occupied_blocks(density))
+        object.__setattr__(self, "macro", block_distances(density))
 
     @property
     def box(self) -> Float32[np.ndarray, "2 3"]:
@@ -82,13 +85,20 @@ class KiloOSF:
         return (self.origin + self.voxel * np.stack([solid.min(axis=0), solid.max(axis=0)])).astype(np.float32)
 
 
-def occupied_blocks(density: Float32[np.ndarray, "nx ny nz"]) -> np.ndarray:
-    """Which blocks of voxels hold density, uint8; a block counts the corners on all its faces."""
+def block_distances(density: Float32[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "bx by bz"]:
+    """How far blocks of voxels are from the nearest one that holds density: in blocks, along the worst axis.
+
+    0 for those with density, 255 where there is none at all. A block counts the corners on all its faces. A ray in a
+    block at distance d may leave all blocks less than d away at once.
+    """
     shape = tuple(-(-(n - 1) // MACRO) for n in density.shape)
     solid = density > FLOOR_G
-    blocks = np.zeros(shape, np.uint8)
+    blocks = np.zeros(shape, bool)
     for start in np.ndindex(*((MACRO + 1,) * 3)):
         part = solid[tuple(slice(s, None, MACRO) for s in start)]
         cut = tuple(slice(0, min(a, b)) for a, b in zip(part.shape, shape, strict=True))
         blocks[cut] |= part[cut]
-    return blocks
+    if not blocks.any():
+        return np.full(shape, 255, np.uint8)
+    distances = np.asarray(ndimage.distance_transform_cdt(~blocks, metric="chessboard"))
+    return np.minimum(distances, 255).astype(np.uint8)

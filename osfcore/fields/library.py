@@ -87,7 +87,9 @@ class FieldLibrary:
     def _info(self, name: str) -> FieldInfo:
         trained = None if self._trained is None else self._trained / name / FIELD_FILE
         if trained is not None and trained.is_file():
-            return FieldInfo(name, "trained", trained, trained.stat().st_size, _metrics(trained.with_name(METRICS_FILE)))
+            return FieldInfo(
+                name, "trained", trained, trained.stat().st_size, _metrics(trained.with_name(METRICS_FILE))
+            )
         path = self._shipped / f"{name}{_SUFFIX}"
         return FieldInfo(name, "shipped", path, path.stat().st_size, _metrics(path.with_suffix(".json")))
 

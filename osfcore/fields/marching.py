@@ -1,7 +1,7 @@
 """Walking along a ray through one field's density; compiled for the CPU.
 
-Samples lie at t = (k + 1/2) * step from the ray's origin, whatever the field's box, so that a ray meets the same samples
-however it is cut into pieces.
+Samples lie at t = (k + 1/2) * step from the ray's origin, whatever the field's box, so that a ray meets the same
+samples however it is cut into pieces.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from osfcore.fields.kiloosf import DENSITY_FLOOR, FLOOR_G, MACRO, KiloOSF
+from osfcore.fields.kiloosf import DENSITY_FLOOR, FLOOR_G, MACRO, MACRO_BITS, KiloOSF
 
 # Where neither OpenMP nor TBB is there, numba's threads end the process when two calls into parallel code overlap.
 ONE_AT_A_TIME = threading.Lock()
@@ -22,9 +22,9 @@ _ONE = np.float32(1)
 _EDGE = np.float32(1.001)  # before the last corner, so that there is always a next one
 
 
-@numba.njit(fastmath=True, inline="always")
+@numba.njit(fastmath=True, error_model="numpy", inline="always")
 def optical_density(g):  # noqa: ANN001, ANN201
-    """sigma * voxel of a density feature g."""
+    """Sigma * voxel of a density feature g."""
     if g <= _FLOOR_G:
         return np.float32(0)
     if g > np.float32(15):
@@ -32,11 +32,11 @@ def optical_density(g):  # noqa: ANN001, ANN201
     return np.log(_ONE + np.exp(g)) - _FLOOR
 
 
-@numba.njit(fastmath=True, inline="always")
+@numba.njit(fastmath=True, error_model="numpy", inline="always")
 def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201
     """Trilinear value at voxel coordinates of a grid that begins at `start` of a flat array."""
     i, j, k = int(px), int(py), int(pz)
-    fx, fy, fz = px - i, py - j, pz - k
+    fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)  # int64 would promote to double
     at = start + (i * ny + j) * nz + k
     far = at + ny * nz
     a = flat[at] + (flat[at + 1] - flat[at]) * fz
@@ -48,13 +48,13 @@ def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201
     return a + (c - a) * fx
 
 
-@numba.njit(fastmath=True, inline="always")
+@numba.njit(fastmath=True, error_model="numpy", inline="always")
 def within(p, count):  # noqa: ANN001, ANN201
     """A voxel coordinate moved between the first and the last of `count` corners."""
     return min(max(p, np.float32(0)), np.float32(count) - _EDGE)
 
 
-@numba.njit(fastmath=True, inline="always")
+@numba.njit(fastmath=True, error_model="numpy", inline="always")
 def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201
     """The part of [t0, t1] in which origin + t * direction lies between low and high."""
     if abs(direction) < np.float32(1e-9):
@@ -63,17 +63,23 @@ def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201
     return max(t0, min(a, b)), min(t1, max(a, b))
 
 
-@numba.njit(fastmath=True, inline="always")
-def leave_block(p, d, block):  # noqa: ANN001, ANN201
-    """Distance along a ray, in voxels per unit of d, to the end of a block on one axis."""
-    if d > np.float32(1e-9):
-        return ((block + 1) * MACRO - p) / d
-    if d < np.float32(-1e-9):
-        return (block * MACRO - p) / d
+@numba.njit(fastmath=True, error_model="numpy", inline="always")
+def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
+    """How far a ray stays, on one axis, among the blocks less than `distance` away from its own; inverse: of d."""
+    if d >= np.float32(0):
+        return (np.float32((block + distance) * MACRO) - p) * inverse
+    return (p - np.float32((block + 1 - distance) * MACRO)) * abs(inverse)
+
+
+@numba.njit(fastmath=True, error_model="numpy", inline="always")
+def inverted(d):  # noqa: ANN001, ANN201
+    """1 / d; very large for (almost) 0."""
+    if abs(d) > np.float32(1e-9):
+        return _ONE / d
     return np.float32(1e9)
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True, nogil=True)
+@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
 def _march(origins, directions, density, macro, low, voxel, step, offsets, min_weight, min_transmittance, ts, counts):  # noqa: ANN001, ANN202
     nx, ny, nz = density.shape
     my, mz = macro.shape[1], macro.shape[2]
@@ -87,20 +93,23 @@ def _march(origins, directions, density, macro, low, voxel, step, offsets, min_w
             (origins[r, 2] - low[2]) / voxel,
         )
         dx, dy, dz = directions[r, 0] / voxel, directions[r, 1] / voxel, directions[r, 2] / voxel
+        ix, iy, iz = inverted(dx), inverted(dy), inverted(dz)
         t0, t1 = clip_axis(ox, dx, np.float32(0), np.float32(nx) - _EDGE, np.float32(0), np.float32(1e9))
         t0, t1 = clip_axis(oy, dy, np.float32(0), np.float32(ny) - _EDGE, t0, t1)
         t0, t1 = clip_axis(oz, dz, np.float32(0), np.float32(nz) - _EDGE, t0, t1)
         found, transmittance = 0, _ONE
         k = int(np.ceil(t0 / step - offsets[r]))
         while found < most and transmittance > min_transmittance:
-            t = (k + offsets[r]) * step
+            t = (np.float32(k) + offsets[r]) * step
             if t >= t1:
                 break
             # Rounding must not lead out of the grid, however far away the ray began.
             px, py, pz = within(ox + t * dx, nx), within(oy + t * dy, ny), within(oz + t * dz, nz)
-            bx, by, bz = int(px) // MACRO, int(py) // MACRO, int(pz) // MACRO
-            if blocks[(bx * my + by) * mz + bz] == 0:
-                skip = min(leave_block(px, dx, bx), leave_block(py, dy, by), leave_block(pz, dz, bz))
+            bx, by, bz = int(px) >> MACRO_BITS, int(py) >> MACRO_BITS, int(pz) >> MACRO_BITS
+            free = np.int64(blocks[(bx * my + by) * mz + bz])
+            if free > 0:
+                skip = min(leave_blocks(px, dx, ix, bx, free), leave_blocks(py, dy, iy, by, free))
+                skip = min(skip, leave_blocks(pz, dz, iz, bz, free))
                 k = max(k + 1, int(np.ceil((t + skip) / step - offsets[r])))
                 continue
             depth = optical_density(interpolate(flat, 0, ny, nz, px, py, pz)) * (step / voxel)

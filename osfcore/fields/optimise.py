@@ -52,7 +52,9 @@ def composite(
     ray = torch.as_tensor(np.nonzero(used)[0], device=device)
     points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[used]
     light, view = (torch.as_tensor(a, device=device)[ray] for a in (rays.lights, rays.directions))
-    scatter: Scatter = query(torch.as_tensor(points, device=device), light, view, cell_jitter=jitter, generator=generator)
+    scatter: Scatter = query(
+        torch.as_tensor(points, device=device), light, view, cell_jitter=jitter, generator=generator
+    )
     depth = torch.zeros(mask.shape, device=device).masked_scatter(mask, scatter.sigma * step)
     before = torch.cumsum(depth, dim=1) - depth
     weights = torch.exp(-before) * -torch.expm1(-depth)
@@ -82,9 +84,7 @@ class Stage:
         for group, factor in zip(self._optimiser.param_groups, (1.0, _NETWORK_RATE), strict=True):
             group["lr"] = rate * factor
         offsets = rng.random(len(rays.alpha), dtype=np.float32)
-        rgb, alpha = composite(
-            self.query, self.field, rays, offsets=offsets, jitter=_CELL_JITTER, generator=generator
-        )
+        rgb, alpha = composite(self.query, self.field, rays, offsets=offsets, jitter=_CELL_JITTER, generator=generator)
         device = rgb.device
         loss = functional.mse_loss(rgb, torch.as_tensor(rays.rgb, device=device)) * 3
         loss = loss + _ALPHA_WEIGHT * functional.mse_loss(alpha, torch.as_tensor(rays.alpha, device=device))

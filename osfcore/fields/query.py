@@ -31,6 +31,13 @@ class Scatter(NamedTuple):
 class KiloQuery(nn.Module):
     """A KiloOSF whose numbers are parameters."""
 
+    row_units: Float[Tensor, "8"]
+    low: Float[Tensor, "3"]
+    cell_size: Float[Tensor, "3"]
+    index: Int[Tensor, "corners"]
+    cells: Int[Tensor, "cells"]
+    corners: Int[Tensor, "8"]
+
     def __init__(
         self,
         field: KiloOSF,
@@ -109,8 +116,8 @@ class KiloQuery(nn.Module):
             x: points in the field's frame [m].
             light: unit vectors toward the light, in the field's frame.
             view: unit vectors from the camera into the scene, in the field's frame.
-            cell_jitter: in training, how far beyond its own cell a network is asked, in cells: neighbours that have seen
-                the same points agree at their border, so that relighting is smooth across it.
+            cell_jitter: in training, how far beyond its own cell a network is asked, in cells: neighbours that have
+                seen the same points agree at their border, so that relighting is smooth across it.
             generator: of the jitter.
         """
         features = self.features(x)

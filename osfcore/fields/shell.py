@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -21,7 +23,6 @@ _INSIDE_G = 6.0
 _BLUR_PX = 1.0
 _MISSED_SHARE = 0.01  # of the views may contradict a voxel
 _VISIBLE_WEIGHT = 5e-3
-_NEEDED_WEIGHT = 2e-2
 _PIXELS_LOOKED_AT = 400_000
 
 
@@ -39,7 +40,7 @@ def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int,
         rng: for the networks' first weights.
     """
     origin, voxel, shape = grid_over(box, across)
-    points = origin + voxel * np.stack(np.indices(shape), axis=-1).reshape(-1, 3)
+    points = origin + voxel * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
     alphas = [cv2.GaussianBlur(a.astype(np.float32) / 255, (0, 0), _BLUR_PX) for a in images.rgba[..., 3]]
     misses = int(_MISSED_SHARE * len(alphas))
     least = shares_of_views(points.astype(np.float32), images.cameras, alphas, misses)[0].reshape(shape)
@@ -89,7 +90,7 @@ def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Gene
     coarse[..., 0] = field.density
     # Interpolation near the shell's rim must not mix colours with the nothing outside.
     nearest = ndimage.distance_transform_edt(field.index == 0, return_distances=False, return_indices=True)
-    coarse[..., 1:] = coarse[tuple(nearest)][..., 1:]
+    coarse[..., 1:] = coarse[tuple(np.asarray(nearest))][..., 1:]
     places = (origin[:, None] + voxel * np.indices(shape).reshape(3, -1) - field.origin[:, None]) / field.voxel
     parts = [ndimage.map_coordinates(coarse[..., c], places, order=1, mode="nearest") for c in range(FEATURES)]
     features = np.stack(parts, axis=-1).reshape(*shape, FEATURES).astype(np.float32)
@@ -114,30 +115,38 @@ def seen_corners(field: KiloOSF, images: ImageSet, rng: np.random.Generator) -> 
     return seen
 
 
-def trim(field: KiloOSF, images: ImageSet) -> KiloOSF:
-    """The same field without the corners that no view of its training set needs: it renders the same and is smaller."""
+def trim(field: KiloOSF, images: ImageSet, needed_weight: float) -> KiloOSF:
+    """The field without the corners that no view of its training set needs: smaller, and it renders the same.
+
+    Args:
+        field: what was trained.
+        images: what it was trained on.
+        needed_weight: samples that show less in every view need no corners; above 0.05 it begins to cost quality.
+    """
     source = RaySource(images)
     used = np.zeros(field.index.shape, bool)
     pixels = source.silhouette_pixels()
     for part in np.array_split(pixels, max(1, len(pixels) // 50_000)):
         rays = source.batch(part)
-        ts, found = march(field, rays.origins, rays.directions, step=field.voxel / 2, min_weight=_NEEDED_WEIGHT)
+        ts, found = march(field, rays.origins, rays.directions, step=field.voxel / 2, min_weight=needed_weight)
         points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[found]
         used[tuple(np.floor((points - field.origin) / field.voxel).astype(int).T)] = True
     corners = used.copy()
-    for i, j, k in np.ndindex(2, 2, 2):  # a voxel needs its eight corners
-        nx, ny, nz = used.shape
+    nx, ny, nz = field.index.shape
+    for i, j, k in product((0, 1), repeat=3):  # a voxel needs its eight corners
         corners[i:, j:, k:] |= used[: nx - i, : ny - j, : nz - k]
     keep = corners & (field.index > 0)
     features = field.rows[field.index]
     return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
 
 
-def _moved_cells(field: KiloOSF, origin: np.ndarray, voxel: float, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _moved_cells(
+    field: KiloOSF, origin: np.ndarray, voxel: float, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
     """The networks for a box of another size: each new cell starts from the old cell at its centre."""
     counts = np.array(field.cells.shape)
     size = voxel * (np.array(shape) - 1)
-    centres = origin + size * (np.stack(np.indices(counts), axis=-1).reshape(-1, 3) + 0.5) / counts
+    centres = origin + size * (np.moveaxis(np.indices(counts.tolist()), 0, -1).reshape(-1, 3) + 0.5) / counts
     low, high = field.box
     old = np.clip(np.floor((centres - low) / (high - low) * counts), 0, counts - 1).astype(int)
     numbers = np.arange(np.prod(counts), dtype=np.int32).reshape(counts)

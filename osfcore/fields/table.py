@@ -2,8 +2,8 @@
 
     radiance(x, y, l) = albedo(x, y) * (ambient + l_z * network(l))
 
-The direct part carries the factor l_z, so that it vanishes as the light sinks to the table's plane: that is what tells it
-from the ambient part, although no training image shows a shadow. Shadows remove the direct part.
+The direct part carries the factor l_z, so that it vanishes as the light sinks to the table's plane: that is what tells
+it from the ambient part, although no training image shows a shadow. Shadows remove the direct part.
 """
 
 from __future__ import annotations

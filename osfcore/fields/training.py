@@ -35,6 +35,9 @@ from osfcore.fields.weights import field_bytes, read_field, write_atomically, wr
 from osfcore.progress import Progress
 
 _REPORT_S = 1.0
+_AIMED_BYTES = 2_000_000
+_NEEDED_WEIGHTS = (0.02, 0.05, 0.1, 0.2)  # of samples that a view must show, tried until the file is small enough
+_COARSE_RATES, _FINE_RATES = Rates(2e-2, 1e-2), Rates(2e-2, 1e-3)
 _CHECKPOINT_S = 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MIN_LOOK_S = 5.0
@@ -71,8 +74,8 @@ class Recipe:
     solid_g: float = 6.0
     hollow_g: float = -3.0
     hollow_share: float = 0.3
-    coarse_rates: Rates = Rates(2e-2, 1e-2)
-    fine_rates: Rates = Rates(2e-2, 1e-3)
+    coarse_rates: Rates = _COARSE_RATES
+    fine_rates: Rates = _FINE_RATES
     teacher_share: float = 0.45
     distil_share: float = 0.1
 
@@ -276,7 +279,7 @@ class _Run:
     def _finish(self, field: KiloOSF) -> FieldStep:
         """Write the file, read it back, and measure what was read: that is what users get."""
         out = self._config.out
-        data = field_bytes(trim(field, self._images))
+        data = self._trimmed(field)
         write_atomically(out, data)
         look = self._holdout.everything(read_field(out))
         metrics = {
@@ -303,6 +306,15 @@ class _Run:
         words = f"{look.psnr_full:.2f} dB held out, {look.psnr_mask:.2f} dB in the mask, {len(data) / 1e6:.2f} MB"
         total = _total(self._config)
         return FieldStep(Progress(total, total, words), look.psnr_full, look.psnr_mask, look.preview)
+
+    def _trimmed(self, field: KiloOSF) -> bytes:
+        """The field as a file of at most the size aimed at, if leaving out what hardly shows can make it so."""
+        data = b""
+        for needed_weight in _NEEDED_WEIGHTS:
+            data = field_bytes(trim(field, self._images, needed_weight))
+            if len(data) <= _AIMED_BYTES:
+                break
+        return data
 
     @property
     def _checkpoint_path(self) -> Path:

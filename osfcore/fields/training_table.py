@@ -106,7 +106,9 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
         loss.backward()
         optimiser.step()
         if done % _REPORT_EVERY == 0:
-            yield Progress(done, _ITERATIONS, f"{-10 * np.log10(float(loss.detach()) + 1e-10):.1f} dB on its own images")
+            yield Progress(
+                done, _ITERATIONS, f"{-10 * np.log10(float(loss.detach()) + 1e-10):.1f} dB on its own images"
+            )
     yield _finish(config, model, train, test, device)
 
 

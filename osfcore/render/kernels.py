@@ -1,10 +1,12 @@
 """Compiled ray marching through several fields at once, with shadows. Only `launch.py` calls it.
 
-Everything happens in voxel coordinates: those of object n in which its grid's corners are whole numbers. Samples of object
-n lie at t = (k + 1/2) * step_n from the camera, those of a shadow ray at the same spacing from the point that asks for
-light; t is in metres throughout. Arrays are indexed in full, never sliced: slices cost more than the arithmetic here.
+Everything happens in voxel coordinates: those of object n in which its grid's corners are whole numbers. Samples of
+object n lie at t = (k + 1/2) * step_n from the camera, those of a shadow ray at the same spacing from the point that
+asks for light; t is in metres throughout. Arrays are indexed in full, never sliced, integers are made float32 before
+they meet one, and helpers are inlined: slices, double precision and passing many arrays on would each cost more than
+the arithmetic here.
 """
-# ruff: noqa: ANN001, ANN202, D103, PLR0913 - compiled helpers; types are given by their callers
+# ruff: noqa: ANN001, ANN202 - compiled helpers; types are given by their callers
 
 from __future__ import annotations
 
@@ -13,15 +15,14 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from osfcore.fields.kiloosf import FEATURES, MACRO, MOST_HIDDEN, NETWORK_INPUTS
-from osfcore.fields.marching import interpolate, optical_density, within
+from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, MOST_HIDDEN, NETWORK_INPUTS
+from osfcore.fields.marching import interpolate, inverted, leave_blocks, optical_density, within
 
 MOST_OBJECTS = 24
 BAND_ROWS = 8  # rows of an image that one thread draws at a time
 _FAR = np.float32(1e9)
 _TINY = np.float32(1e-9)
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_MACRO = np.float32(MACRO)
 
 
 class _Work(NamedTuple):
@@ -36,41 +37,25 @@ class _Work(NamedTuple):
     ks: np.ndarray
     lasts: np.ndarray
     depths: np.ndarray
-    best: np.ndarray
-    best_t: np.ndarray
+    lit: np.ndarray
     where: np.ndarray
     near: np.ndarray
     result: np.ndarray
     total: np.ndarray
 
 
-@numba.njit
+@numba.njit(error_model="numpy")
 def _workspace():
     n, f = MOST_OBJECTS, np.float32
     return _Work(
         np.empty((n, 3), f), np.empty((n, 3), f), np.empty(NETWORK_INPUTS, f), np.empty(MOST_HIDDEN, f),
         np.empty(MOST_HIDDEN, f), np.empty(6, f), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, f),
-        np.empty(n, f), np.empty(n, f), np.empty(1, np.int64), np.zeros(n, np.bool_), np.empty(5 + n, f),
+        np.empty(n, f), np.empty(1, np.int64), np.zeros(n, np.bool_), np.empty(5 + n, f),
         np.empty(5 + n, f),
     )  # fmt: skip
 
 
-@numba.njit(fastmath=True, forceinline=True)
-def _inverse(d):
-    if abs(d) > _TINY:
-        return _ONE / d
-    return _FAR
-
-
-@numba.njit(fastmath=True, forceinline=True)
-def _leave_block(p, d, inverse, block):
-    """Distance along a ray to the end of a block on one axis."""
-    if d >= _ZERO:
-        return ((block + 1) * _MACRO - p) * inverse
-    return (p - block * _MACRO) * abs(inverse)
-
-
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
     """First and last sample of a ray within the occupied part of object n; last < first: none."""
     a, b = (reach[n, 0] - ox) * ix, (reach[n, 3] - ox) * ix
@@ -84,20 +69,22 @@ def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
     return int(np.ceil(t0 / step - _HALF)), int(np.floor(t1 / step - _HALF))
 
 
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels):
-    """The next sample k <= last of field a with any density: its number and optical depth; k > last if there is none."""
+    """The next sample k <= last of field a with any density, and its optical depth; k > last if there is none."""
     corners, blocks = pack.starts[a, 0], pack.starts[a, 2]
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
     my, mz = pack.shapes[a, 4], pack.shapes[a, 5]
     depth = _ZERO
     while k <= last:
-        t = (k + _HALF) * step
+        t = (np.float32(k) + _HALF) * step
         # Rounding must not lead out of the grid, however far away the ray began.
         px, py, pz = within(ox + t * dx, nx), within(oy + t * dy, ny), within(oz + t * dz, nz)
-        bx, by, bz = int(px) // MACRO, int(py) // MACRO, int(pz) // MACRO
-        if pack.macro[blocks + (bx * my + by) * mz + bz] == 0:
-            skip = min(_leave_block(px, dx, ix, bx), _leave_block(py, dy, iy, by), _leave_block(pz, dz, iz, bz))
+        bx, by, bz = int(px) >> MACRO_BITS, int(py) >> MACRO_BITS, int(pz) >> MACRO_BITS
+        free = np.int64(pack.macro[blocks + (bx * my + by) * mz + bz])
+        if free > 0:
+            skip = min(leave_blocks(px, dx, ix, bx, free), leave_blocks(py, dy, iy, by, free))
+            skip = min(skip, leave_blocks(pz, dz, iz, bz, free))
             k = max(k + 1, int(np.ceil((t + skip) / step - _HALF)))
             continue
         depth = optical_density(interpolate(pack.density, corners, ny, nz, px, py, pz)) * step_voxels
@@ -107,7 +94,7 @@ def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, ste
     return k, depth
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_voxels, enough):
     """Optical depth of object n between a point, in its voxel coordinates, and the light; stops when it is enough."""
     dx, dy, dz = lit[b, n, 0], lit[b, n, 1], lit[b, n, 2]
@@ -121,7 +108,7 @@ def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_
     return total
 
 
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _transform(matrix, b, n, m, x, y, z):
     """A point in object n's voxel coordinates in those of object m; n = N stands for the world."""
     return (
@@ -131,7 +118,7 @@ def _transform(matrix, b, n, m, x, y, z):
     )
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _visibility(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
     """Share of the light that reaches a point in object n's voxel coordinates past all others; n = N: of the world."""
     depth = _ZERO
@@ -147,12 +134,12 @@ def _visibility(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
     return np.exp(-depth)
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
-    """rho of field a at voxel coordinates: ambient part in out[0:3], direct part in out[3:6]."""
+    """Rho of field a at voxel coordinates: ambient part in out[0:3], direct part in out[3:6]."""
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
     i, j, k = int(px), int(py), int(pz)
-    fx, fy, fz = px - i, py - j, pz - k
+    fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
     f1 = f2 = f3 = f4 = f5 = f6 = f7 = _ZERO
     start, first = pack.starts[a, 0] + (i * ny + j) * nz + k, pack.starts[a, 1]
     for corner in range(8):
@@ -168,19 +155,23 @@ def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
         f7 += w * pack.rows[row + 7]
     dipole = f4 * lx + f5 * ly + f6 * lz
     cx, cy, cz = pack.shapes[a, 6], pack.shapes[a, 7], pack.shapes[a, 8]
-    qx, qy, qz = px * cx / np.float32(nx - 1), py * cy / np.float32(ny - 1), pz * cz / np.float32(nz - 1)
+    qx = px * np.float32(cx) / np.float32(nx - 1)
+    qy = py * np.float32(cy) / np.float32(ny - 1)
+    qz = pz * np.float32(cz) / np.float32(nz - 1)
     i, j, k = min(int(qx), cx - 1), min(int(qy), cy - 1), min(int(qz), cz - 1)
     inputs[0], inputs[1] = dipole, f7
     inputs[2], inputs[3], inputs[4] = lx, ly, lz
     inputs[5], inputs[6], inputs[7] = vx, vy, vz
-    inputs[8], inputs[9], inputs[10] = _TWO * (qx - i) - _ONE, _TWO * (qy - j) - _ONE, _TWO * (qz - k) - _ONE
+    inputs[8] = _TWO * (qx - np.float32(i)) - _ONE
+    inputs[9] = _TWO * (qy - np.float32(j)) - _ONE
+    inputs[10] = _TWO * (qz - np.float32(k)) - _ONE
     network = pack.starts[a, 4] + pack.cells[pack.starts[a, 3] + (i * cy + j) * cz + k]
     z0, z1, z2 = _run_network(pack.networks, network * pack.parameters, pack.hidden, inputs, h1, h2)
     out[0], out[1], out[2] = f1 * pack.ambient[a, 0], f2 * pack.ambient[a, 1], f3 * pack.ambient[a, 2]
     out[3], out[4], out[5] = f1 * max(dipole + z0, _ZERO), f2 * max(dipole + z1, _ZERO), f3 * max(dipole + z2, _ZERO)
 
 
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _run_network(flat, at, hidden, inputs, h1, h2):
     """The three outputs of a tiny network whose parameters begin at `at`."""
     bias = at + NETWORK_INPUTS * hidden
@@ -209,7 +200,7 @@ def _run_network(flat, at, hidden, inputs, h1, h2):
     return z0, z1, z2
 
 
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _pixel_ray(cameras, view, u, v):
     """Unit direction through pixel coordinates, and 1 / the length it had."""
     x = cameras[view, 3] * u + cameras[view, 4] * v + cameras[view, 5]
@@ -219,7 +210,7 @@ def _pixel_ray(cameras, view, u, v):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _meet_table(table, cameras, view, dx, dy, dz):
     """Distance along a ray to the table; very far if it misses."""
     if table.exists and dz < -_TINY and cameras[view, 2] > _ZERO:
@@ -230,14 +221,14 @@ def _meet_table(table, cameras, view, dx, dy, dz):
     return _FAR
 
 
-@numba.njit(fastmath=True, forceinline=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _table_colour(table, directs, b, x, y, visible):
     """Radiance of the table at a point of it."""
     g = len(table.albedo)
     u = (x / table.half_side + _ONE) * _HALF * np.float32(g - 1)
     v = (y / table.half_side + _ONE) * _HALF * np.float32(g - 1)
     i, j = min(max(int(u), 0), g - 2), min(max(int(v), 0), g - 2)
-    fu, fv = u - i, v - j
+    fu, fv = u - np.float32(i), v - np.float32(j)
     w00, w01, w10, w11 = (_ONE - fu) * (_ONE - fv), (_ONE - fu) * fv, fu * (_ONE - fv), fu * fv
     al = table.albedo
     r = al[i, j, 0] * w00 + al[i, j + 1, 0] * w01 + al[i + 1, j, 0] * w10 + al[i + 1, j + 1, 0] * w11
@@ -250,9 +241,9 @@ def _table_colour(table, directs, b, x, y, visible):
     )
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _colour_at(pack, fields, scene, b, n, t, rules, work):
-    """rho of object n where the ray of `work` is at t, in out[0:6], and the light that reaches it."""
+    """Rho of object n where the ray of `work` is at t, in out[0:6], and the light that reaches it."""
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
     a, view = fields[n], work.where[0]
     x = within(scene.eye[b, view, n, 0] + t * d[n, 0], pack.shapes[a, 0])
@@ -263,12 +254,17 @@ def _colour_at(pack, fields, scene, b, n, t, rules, work):
              d[n, 0] * s, d[n, 1] * s, d[n, 2] * s, inputs, h1, h2, out)  # fmt: skip
     if out[3] + out[4] + out[5] <= _ZERO:
         return _ZERO
-    return _visibility(pack, fields, scene, b, n, x, y, z, rules.shadow_voxels, rules.enough)
+    if rules.one_shadow and work.lit[n] >= _ZERO:
+        return work.lit[n]
+    work.lit[n] = _visibility(pack, fields, scene, b, n, x, y, z, rules.shadow_voxels, rules.enough)
+    return work.lit[n]
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
 def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, rules, work, result):
-    """One ray: radiance in result[0:3], distance times weight in result[3], weight in result[4], and the seen share of
+    """Follow one ray.
+
+    It leaves radiance in result[0:3], distance times weight in result[3], weight in result[4] and the seen share of
     object n in result[5 + n]. `near` marks the objects whose screen box holds the pixel.
     """
     count = len(fields)
@@ -287,7 +283,7 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
             row = 3 * c
             value = scene.ray[b, view, n, row] * u + scene.ray[b, view, n, row + 1] * v + scene.ray[b, view, n, row + 2]
             d[n, c] = value * unit
-            inv[n, c] = _inverse(d[n, c])
+            inv[n, c] = inverted(d[n, c])
         step = rules.step_voxels * pack.scales[a, 3]
         ox, oy, oz = scene.eye[b, view, n, 0], scene.eye[b, view, n, 1], scene.eye[b, view, n, 2]
         k, last = _clip(scene.reach, n, ox, oy, oz, inv[n, 0], inv[n, 1], inv[n, 2], table_t, step)
@@ -295,13 +291,13 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
             k, depths[n] = _next_sample(pack, a, ox, oy, oz, d[n, 0], d[n, 1], d[n, 2], inv[n, 0], inv[n, 1], inv[n, 2],
                                         k, last, step, rules.step_voxels)  # fmt: skip
         ks[n], lasts[n] = k, last
-        work.best[n], work.best_t[n] = _ZERO, _ZERO
-    left, out = _ONE, work.out
+        work.lit[n] = -_ONE
+    left, coloured, out = _ONE, _ZERO, work.out
     while left > rules.stop:
         n, t = -1, _FAR
         for m in range(count):  # the nearest of all objects' next samples
             if ks[m] <= lasts[m]:
-                candidate = (ks[m] + _HALF) * rules.step_voxels * pack.scales[fields[m], 3]
+                candidate = (np.float32(ks[m]) + _HALF) * rules.step_voxels * pack.scales[fields[m], 3]
                 if candidate < t:
                     n, t = m, candidate
         if n < 0:
@@ -312,13 +308,11 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
         result[3] += weight * t
         result[4] += weight
         result[5 + n] += weight
-        if rules.one_colour:
-            if weight > work.best[n]:
-                work.best[n], work.best_t[n] = weight, t
-        elif weight > rules.min_weight:
-            visible = _colour_at(pack, fields, scene, b, n, t, rules, work)
+        if weight > rules.min_weight:
+            lit = _colour_at(pack, fields, scene, b, n, t, rules, work)
+            coloured += weight
             for c in range(3):
-                result[c] += weight * (out[c] + visible * out[3 + c])
+                result[c] += weight * (out[c] + lit * out[3 + c])
         ks[n] += 1
         if ks[n] <= lasts[n]:
             step = rules.step_voxels * pack.scales[fields[n], 3]
@@ -326,12 +320,9 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
                 pack, fields[n], scene.eye[b, view, n, 0], scene.eye[b, view, n, 1], scene.eye[b, view, n, 2],
                 d[n, 0], d[n, 1], d[n, 2], inv[n, 0], inv[n, 1], inv[n, 2], ks[n], lasts[n], step, rules.step_voxels,
             )  # fmt: skip
-    if rules.one_colour:
-        for n in range(count):
-            if result[5 + n] > rules.min_weight:
-                visible = _colour_at(pack, fields, scene, b, n, work.best_t[n], rules, work)
-                for c in range(3):
-                    result[c] += result[5 + n] * (out[c] + visible * out[3 + c])
+    if coloured > _ZERO:  # what was too faint to be coloured looks like the rest
+        for c in range(3):
+            result[c] *= result[4] / coloured
     if left <= rules.stop:  # what lies behind no longer shows; what was found stands for all
         whole = _ONE / result[4]
         for c in range(5 + count):
@@ -351,9 +342,9 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
             result[c] += left * table.background[c]
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True, nogil=True)
-def render_base(table, cameras, directs, samples, rgb, distance):
-    """The empty, unshaded table under L lights from V cameras: rgb L x V x h x w x 3; distance likewise, 0 for nothing."""
+@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
+def render_base(table, cameras, directs, samples, rgb, distance) -> None:
+    """The empty, unshaded table under L lights from V cameras: rgb L x V x h x w x 3; distance likewise, 0: nothing."""
     lights, views, height, width = distance.shape
     for job in numba.prange(lights * views * height):
         row, view, b = job % height, (job // height) % views, job // (height * views)
@@ -385,14 +376,14 @@ def render_base(table, cameras, directs, samples, rgb, distance):
             rgb[b, view, row, column, 2] = blue
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True, nogil=True)
+@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
 def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_distance, base_of, boxes, shadows, rules,
-                 rgb, opacity, distance):  # fmt: skip
+                 rgb, opacity, distance) -> None:  # fmt: skip
     """Every image of a batch; what no object and no shadow can touch is copied from the empty table.
 
-    fields: N; scene: see `launch.Scene`; cameras: V x 12; base_of: number of the base light of each scene; boxes, shadows:
-    B x V x N x 4 (columns from, to, rows from, to); rgb: B x V x h x w x 3; opacity: B x V x N' x h x w or empty;
-    distance: B x V x h x w or empty.
+    fields: N; scene: see `launch.Scene`; cameras: V x 12; base_of: number of the base light of each scene; boxes,
+    shadows: B x V x N x 4 (columns from, to, rows from, to); rgb: B x V x h x w x 3;
+    opacity: B x V x N' x h x w or empty; distance: B x V x h x w or empty.
     """
     scenes, views, height, width = rgb.shape[0], rgb.shape[1], rgb.shape[2], rgb.shape[3]
     count = len(fields)

@@ -45,7 +45,7 @@ class Scene(NamedTuple):
         ray: B x V x N x 9, from pixel coordinates (u, v, 1) to directions, of the length that they have in pixels.
         lit: B x N x 3, toward the light, per metre.
         lit_inverse: the same, each number inverted.
-        between: B x (N + 1) x N x 12, from the voxel coordinates of one object to those of another; the last is the world.
+        between: B x (N + 1) x N x 12, from the voxel coordinates of one object to another's; the last: the world.
         reach: N x 6, lowest and highest corner of what is occupied.
     """
 
@@ -64,7 +64,7 @@ class Rules(NamedTuple):
     min_weight: np.float32
     stop: np.float32
     enough: np.float32
-    one_colour: bool
+    one_shadow: bool
     shadow_voxels: np.float32
     samples: int
 
@@ -103,8 +103,8 @@ def launch(
     with ONE_AT_A_TIME:
         if table is not None:  # the empty table, once per light
             render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
-        render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows, rules,
-                     rgb, opacity, distance)  # fmt: skip
+        render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows,
+                     rules, rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,
@@ -131,7 +131,9 @@ def _scene(
     lit = np.einsum("bnij,bj->bni", into, lights)
     # From object n: x_world = R_n^T (voxel_n * x + origin_n) + position_n; the world comes as it is.
     scenes, count = positions.shape[:2]
-    linear = np.concatenate([np.swapaxes(rotations, -1, -2) * voxel[..., None], np.tile(np.eye(3), (scenes, 1, 1, 1))], 1)
+    linear = np.concatenate(
+        [np.swapaxes(rotations, -1, -2) * voxel[..., None], np.tile(np.eye(3), (scenes, 1, 1, 1))], 1
+    )
     shift = np.einsum("bnji,nj->bni", rotations, origin) + positions
     shift = np.concatenate([shift, np.zeros((scenes, 1, 3))], axis=1)
     between = np.empty((scenes, count + 1, count, 3, 4))
@@ -149,7 +151,7 @@ def _scene(
 def _rules(quality: Quality) -> Rules:
     f = np.float32
     return Rules(f(quality.step_voxels), f(quality.min_weight), f(quality.stop), f(-np.log(quality.stop)),
-                 quality.one_colour, f(quality.shadow_voxels), quality.samples_per_side)  # fmt: skip
+                 quality.one_shadow, f(quality.shadow_voxels), quality.samples_per_side)  # fmt: skip
 
 
 def _corners_world(

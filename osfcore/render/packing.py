@@ -18,7 +18,7 @@ class Packed(NamedTuple):
         density: g on all corners.
         index: rows of all corners.
         rows: features, one after another.
-        macro: occupied blocks.
+        macro: distances between blocks and density.
         cells: numbers of networks.
         networks: parameters, one network after another.
         starts: N x 5: offsets into density and index, rows, macro, cells, networks.
@@ -31,7 +31,7 @@ class Packed(NamedTuple):
     """
 
     density: np.ndarray
-    index: np.ndarray
+    index: np.ndarray  # pyright: ignore[reportIncompatibleMethodOverride]
     rows: np.ndarray
     macro: np.ndarray
     cells: np.ndarray

@@ -1,8 +1,8 @@
 """The plain renderer: every ray, every sample, in PyTorch, in any dtype, on any device.
 
-It says what the fast path must compute, and it is what a GPU runs. Along a ray, the samples of all objects are sorted by
-distance and composited (paper eq. 3, each radiance weighted by density); the light that reaches a point is what the other
-objects let through (transmittance along the way to the light), as a shadow map of unlimited resolution would say.
+It says what the fast path must compute, and it is what a GPU runs. Along a ray, the samples of all objects are sorted
+by distance and composited (paper eq. 3, each radiance weighted by density); the light that reaches a point is what the
+other objects let through (transmittance along the way to the light), as a shadow map of unlimited resolution would say.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.query import KiloQuery
 from osfcore.fields.table import TableField
 from osfcore.poses import quaternion_to_matrix
-from osfcore.render.scene_renderer import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
+from osfcore.render.scene_renderer import (
+    EXACT,
+    MASK_OPACITY,
+    Quality,
+    Rendered,
+    SceneBatch,
+    camera_numbers,
+    check_request,
+)
 from osfcore.render.solids import pusher_field
 from osfcore.scene import Camera, SceneState
 
@@ -83,7 +91,7 @@ def render_on_device(
 
 
 @torch.no_grad()
-def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001, PLR0913
+def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001
     queries = {name: KiloQuery(fields[name], dtype=dtype, device=device) for name in dict.fromkeys(batch.names)}
     extents = {name: _extent(fields[name]) for name in queries}
     pusher = None  # not among the named ones: an object may have any name
@@ -125,7 +133,7 @@ def _extent(field: KiloOSF) -> np.ndarray:
     return np.stack([np.maximum(low - field.voxel, box[0]), np.minimum(high + field.voxel, box[1])])
 
 
-def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN202, PLR0913
+def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN202
     """Colours (h, w, 3), shares of the objects (N, h, w) and z-depths (h, w) of one image."""
     s = quality.samples_per_side
     height, width = camera.height, camera.width
@@ -149,8 +157,8 @@ def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN2
     return pixels(colour), pixels(shares).permute(2, 0, 1), depth
 
 
-def _rays(placed, table, light, origin, directions, quality, tensor):  # noqa: ANN001, ANN202, PLR0913
-    """Radiance (R, 3), shares of the objects (R, N), weighted distance (R) and total weight (R) of rays from one point."""
+def _rays(placed, table, light, origin, directions, quality, tensor):  # noqa: ANN001, ANN202
+    """Radiance (R, 3), shares of the objects (R, N), weighted distance (R) and weight (R) of rays from one point."""
     count = len(directions)
     table_t = _meet_table(table, origin, directions)
     samples = [_object_samples(placed, n, light, origin, directions, table_t, quality) for n in range(len(placed))]
@@ -194,7 +202,11 @@ def _meet_table(table: TableField | None, origin: Tensor, directions: Float[Tens
 
 
 def _sample_places(
-    placed: _Placed, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], far: Float[Tensor, "R"], step: float
+    placed: _Placed,
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    far: Float[Tensor, "R"],
+    step: float,
 ) -> Iterator[tuple[Float[Tensor, "R"], Float[Tensor, "R"]]]:
     """Distances of the samples within an object's extent, one after another, and which rays have one there."""
     safe = torch.where(directions.abs() < 1e-9, 1e-9, directions)
@@ -213,7 +225,7 @@ def _into(placed: _Placed, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]
     return (points - placed.position) @ placed.rotation.T
 
 
-def _object_samples(placed, n, light, origin, directions, table_t, quality) -> _Samples:  # noqa: ANN001, PLR0913
+def _object_samples(placed, n, light, origin, directions, table_t, quality) -> _Samples:  # noqa: ANN001
     """All samples of object n, lit by what the others let through."""
     own = placed[n]
     step = quality.step_voxels * own.query.voxel

@@ -31,7 +31,7 @@ class Quality:
         step_voxels: distance between samples [voxels of the field].
         min_weight: samples that show less are not coloured.
         stop: a ray ends where less of what lies behind would show.
-        one_colour: ask for colour and light once per ray and object, where most of it is seen, not at every sample.
+        one_shadow: ask once per ray and object whether the light arrives, not at every sample.
         shadow_voxels: distance between samples of shadow rays [voxels].
         samples_per_side: rays per pixel, squared.
     """
@@ -39,13 +39,13 @@ class Quality:
     step_voxels: float = 0.5
     min_weight: float = 1e-5
     stop: float = 1e-4
-    one_colour: bool = False
+    one_shadow: bool = False
     shadow_voxels: float = 0.5
     samples_per_side: int = 1
 
 
 EXACT = Quality()
-PLANNING = Quality(step_voxels=1.0, min_weight=0.02, stop=0.03, one_colour=True, shadow_voxels=1.0)
+PLANNING = Quality(step_voxels=1.0, min_weight=0.1, stop=0.03, one_shadow=True, shadow_voxels=1.5)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

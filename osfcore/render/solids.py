@@ -57,7 +57,7 @@ def solid_field(
     """
     count = 2 * (np.ceil(np.asarray(half_size) / voxel).astype(int) + 2) + 1
     origin = -(count - 1) / 2 * voxel
-    points = origin + voxel * np.stack(np.indices(count), axis=-1)
+    points = origin + voxel * np.moveaxis(np.indices(count.tolist()), 0, -1)
     features = np.zeros((*count, FEATURES), np.float32)
     features[..., 0] = np.clip(edge_g * depth(points) / voxel, EMPTY_G, g)
     features[..., 1:4] = albedo
