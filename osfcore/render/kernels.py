@@ -3,14 +3,14 @@
 Everything happens in voxel coordinates: those of object n in which its grid's corners are whole numbers. Samples of
 object n lie at t = (k + 1/2) * step_n from the camera, those of a shadow ray at the same spacing from the point that
 asks for light; t is in metres throughout. Arrays are indexed in full, never sliced, integers are made float32 before
-they meet one, and helpers are inlined: slices, double precision and passing many arrays on would each cost more than
-the arithmetic here.
+they meet one, and helpers are inlined and count no references (`_nrt=False`; they allocate nothing): slices, double
+precision and counting would each cost more than the arithmetic here.
 """
 # ruff: noqa: ANN001, ANN202 - compiled helpers; types are given by their callers
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -19,6 +19,9 @@ from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, MOST_HIDDEN, NETWORK_IN
 from osfcore.fields.marching import interpolate, inverted, leave_blocks, optical_density, within
 
 MOST_OBJECTS = 24
+NO_OUTLINE = np.float32(1e8)
+_HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
+_KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
 BAND_ROWS = 8  # rows of an image that one thread draws at a time
 _FAR = np.float32(1e9)
 _TINY = np.float32(1e-9)
@@ -42,6 +45,7 @@ class _Work(NamedTuple):
     near: np.ndarray
     result: np.ndarray
     total: np.ndarray
+    spans: np.ndarray
 
 
 @numba.njit(error_model="numpy")
@@ -51,11 +55,11 @@ def _workspace():
         np.empty((n, 3), f), np.empty((n, 3), f), np.empty(NETWORK_INPUTS, f), np.empty(MOST_HIDDEN, f),
         np.empty(MOST_HIDDEN, f), np.empty(6, f), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, f),
         np.empty(n, f), np.empty(1, np.int64), np.zeros(n, np.bool_), np.empty(5 + n, f),
-        np.empty(5 + n, f),
+        np.empty(5 + n, f), np.empty((n, 4), np.int64),
     )  # fmt: skip
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
     """First and last sample of a ray within the occupied part of object n; last < first: none."""
     a, b = (reach[n, 0] - ox) * ix, (reach[n, 3] - ox) * ix
@@ -69,7 +73,7 @@ def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
     return int(np.ceil(t0 / step - _HALF)), int(np.floor(t1 / step - _HALF))
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels):
     """The next sample k <= last of field a with any density, and its optical depth; k > last if there is none."""
     corners, blocks = pack.starts[a, 0], pack.starts[a, 2]
@@ -94,7 +98,7 @@ def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, ste
     return k, depth
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_voxels, enough):
     """Optical depth of object n between a point, in its voxel coordinates, and the light; stops when it is enough."""
     dx, dy, dz = lit[b, n, 0], lit[b, n, 1], lit[b, n, 2]
@@ -108,7 +112,7 @@ def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_
     return total
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _transform(matrix, b, n, m, x, y, z):
     """A point in object n's voxel coordinates in those of object m; n = N stands for the world."""
     return (
@@ -118,7 +122,7 @@ def _transform(matrix, b, n, m, x, y, z):
     )
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _visibility(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
     """Share of the light that reaches a point in object n's voxel coordinates past all others; n = N: of the world."""
     depth = _ZERO
@@ -134,7 +138,7 @@ def _visibility(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
     return np.exp(-depth)
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
     """Rho of field a at voxel coordinates: ambient part in out[0:3], direct part in out[3:6]."""
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
@@ -171,7 +175,7 @@ def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
     out[3], out[4], out[5] = f1 * max(dipole + z0, _ZERO), f2 * max(dipole + z1, _ZERO), f3 * max(dipole + z2, _ZERO)
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _run_network(flat, at, hidden, inputs, h1, h2):
     """The three outputs of a tiny network whose parameters begin at `at`."""
     bias = at + NETWORK_INPUTS * hidden
@@ -200,7 +204,7 @@ def _run_network(flat, at, hidden, inputs, h1, h2):
     return z0, z1, z2
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _pixel_ray(cameras, view, u, v):
     """Unit direction through pixel coordinates, and 1 / the length it had."""
     x = cameras[view, 3] * u + cameras[view, 4] * v + cameras[view, 5]
@@ -210,7 +214,7 @@ def _pixel_ray(cameras, view, u, v):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _meet_table(table, cameras, view, dx, dy, dz):
     """Distance along a ray to the table; very far if it misses."""
     if table.exists and dz < -_TINY and cameras[view, 2] > _ZERO:
@@ -221,7 +225,7 @@ def _meet_table(table, cameras, view, dx, dy, dz):
     return _FAR
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _table_colour(table, directs, b, x, y, visible):
     """Radiance of the table at a point of it."""
     g = len(table.albedo)
@@ -241,7 +245,7 @@ def _table_colour(table, directs, b, x, y, visible):
     )
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _colour_at(pack, fields, scene, b, n, t, rules, work):
     """Rho of object n where the ray of `work` is at t, in out[0:6], and the light that reaches it."""
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
@@ -260,7 +264,7 @@ def _colour_at(pack, fields, scene, b, n, t, rules, work):
     return work.lit[n]
 
 
-@numba.njit(fastmath=True, error_model="numpy", forceinline=True)
+@numba.njit(**_HELPER)
 def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, rules, work, result):
     """Follow one ray.
 
@@ -342,7 +346,7 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
             result[c] += left * table.background[c]
 
 
-@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
+@numba.njit(**_KERNEL)
 def render_base(table, cameras, directs, samples, rgb, distance) -> None:
     """The empty, unshaded table under L lights from V cameras: rgb L x V x h x w x 3; distance likewise, 0: nothing."""
     lights, views, height, width = distance.shape
@@ -350,7 +354,7 @@ def render_base(table, cameras, directs, samples, rgb, distance) -> None:
         row, view, b = job % height, (job // height) % views, job // (height * views)
         for column in range(width):
             hits = 0
-            for s in range(4):  # a pixel that straddles the table's edge shows a part of it
+            for s in range(4 if samples > 1 else 0):  # a pixel that straddles the table's edge shows a part of it
                 u, v = np.float32(column + s % 2), np.float32(row + s // 2)
                 dx, dy, dz, _ = _pixel_ray(cameras, view, u, v)
                 hits += _meet_table(table, cameras, view, dx, dy, dz) < _FAR
@@ -376,13 +380,41 @@ def render_base(table, cameras, directs, samples, rgb, distance) -> None:
             rgb[b, view, row, column, 2] = blue
 
 
-@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
-def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_distance, base_of, boxes, shadows, rules,
-                 rgb, opacity, distance) -> None:  # fmt: skip
+@numba.njit(**_HELPER)
+def _row_span(outlines, boxes, b, view, n, row):
+    """The columns of a row of pixels, from and to, that the outline of object n may touch.
+
+    The outline is the convex hull of eight points; between any two of them a line lies in it, and some are its edges.
+    """
+    if not boxes[b, view, n, 2] <= row < boxes[b, view, n, 3]:
+        return 0, 0
+    first, last = boxes[b, view, n, 0], boxes[b, view, n, 1]
+    if outlines[b, view, n, 0, 0] >= NO_OUTLINE:  # the box must do
+        return first, last
+    top, bottom = np.float32(row), np.float32(row + 1)
+    low, high = _FAR, -_FAR
+    for i in range(8):
+        x0, y0 = outlines[b, view, n, i, 0], outlines[b, view, n, i, 1]
+        for j in range(i):
+            x1, y1 = outlines[b, view, n, j, 0], outlines[b, view, n, j, 1]
+            if max(y0, y1) < top or min(y0, y1) > bottom:
+                continue
+            slope = (x1 - x0) / (y1 - y0) if abs(y1 - y0) > _TINY else _ZERO
+            a = x0 if top <= y0 <= bottom else x0 + ((top if y0 < top else bottom) - y0) * slope
+            c = x1 if top <= y1 <= bottom else x1 + ((top if y1 < top else bottom) - y1) * slope
+            low, high = min(low, a, c), max(high, a, c)
+    if low > high:
+        return 0, 0
+    return max(first, np.int64(np.floor(low))), min(last, np.int64(np.ceil(high)))
+
+
+@numba.njit(**_KERNEL)
+def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_distance, base_of, boxes, shadows,
+                 outlines, rules, rgb, opacity, distance) -> None:  # fmt: skip
     """Every image of a batch; what no object and no shadow can touch is copied from the empty table.
 
     fields: N; scene: see `launch.Scene`; cameras: V x 12; base_of: number of the base light of each scene; boxes,
-    shadows: B x V x N x 4 (columns from, to, rows from, to); rgb: B x V x h x w x 3;
+    shadows: B x V x N x 4 (columns from, to, rows from, to); outlines: see `launch.Outlines`; rgb: B x V x h x w x 3;
     opacity: B x V x N' x h x w or empty; distance: B x V x h x w or empty.
     """
     scenes, views, height, width = rgb.shape[0], rgb.shape[1], rgb.shape[2], rgb.shape[3]
@@ -395,23 +427,22 @@ def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_di
         band, view, b = job % bands, (job // bands) % views, job // (bands * views)
         base = base_of[b]
         work = _workspace()
-        near, result, total = work.near, work.result, work.total
+        near, result, total, spans = work.near, work.result, work.total, work.spans
         for row in range(band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)):
             first, last = width, 0
             for n in range(count):
-                if boxes[b, view, n, 2] <= row < boxes[b, view, n, 3]:
-                    first, last = min(first, boxes[b, view, n, 0]), max(last, boxes[b, view, n, 1])
-                if shadows[b, view, n, 2] <= row < shadows[b, view, n, 3]:
-                    first, last = min(first, shadows[b, view, n, 0]), max(last, shadows[b, view, n, 1])
+                spans[n, 0], spans[n, 1] = _row_span(outlines.objects, boxes, b, view, n, row)
+                spans[n, 2], spans[n, 3] = _row_span(outlines.shadows, shadows, b, view, n, row)
+                if spans[n, 0] < spans[n, 1]:
+                    first, last = min(first, spans[n, 0]), max(last, spans[n, 1])
+                if spans[n, 2] < spans[n, 3]:
+                    first, last = min(first, spans[n, 2]), max(last, spans[n, 3])
             for column in range(width):
                 touched = False
                 if first <= column < last:
                     for n in range(count):
-                        near[n] = (boxes[b, view, n, 0] <= column < boxes[b, view, n, 1]
-                                   and boxes[b, view, n, 2] <= row < boxes[b, view, n, 3])  # fmt: skip
-                        is_shaded = (shadows[b, view, n, 0] <= column < shadows[b, view, n, 1]
-                                     and shadows[b, view, n, 2] <= row < shadows[b, view, n, 3])  # fmt: skip
-                        touched = touched or near[n] or is_shaded
+                        near[n] = spans[n, 0] <= column < spans[n, 1]
+                        touched = touched or near[n] or spans[n, 2] <= column < spans[n, 3]
                 if not touched:
                     for c in range(3):
                         rgb[b, view, row, column, c] = base_rgb[base, view, row, column, c]

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from osfcore.fields.marching import ONE_AT_A_TIME
 from osfcore.fields.table import TableField
-from osfcore.render.kernels import render_base, render_batch
+from osfcore.render.kernels import NO_OUTLINE, render_base, render_batch
 from osfcore.render.packing import Packed
 from osfcore.render.scene_renderer import (
     MASK_OPACITY,
@@ -57,6 +57,13 @@ class Scene(NamedTuple):
     reach: np.ndarray
 
 
+class Outlines(NamedTuple):
+    """Corners of boxes on the screen, B x V x N x 8 x 2 [px]; `NO_OUTLINE` where a box reaches behind the camera."""
+
+    objects: np.ndarray
+    shadows: np.ndarray
+
+
 class Rules(NamedTuple):
     """`Quality` for compiled code; `enough` is the optical depth past which no light counts."""
 
@@ -84,11 +91,10 @@ def launch(
     scenes, views, count = len(batch.lights), len(cameras), len(batch.names)
     lenses = np.array([camera_numbers(camera) for camera in cameras])
     corners = _corners_world(pack.extents[numbers], rotations, positions)
-    boxes = np.stack([screen_boxes(corners, camera) for camera in cameras], axis=1)
-    shadows = np.zeros_like(boxes)
+    boxes, outline = _on_screen(corners, cameras)
+    shadows, shadow_outline = np.zeros_like(boxes), np.zeros_like(outline)
     if table is not None:
-        dropped = _on_table(corners, batch.lights)
-        shadows = np.stack([screen_boxes(dropped, camera) for camera in cameras], axis=1)
+        shadows, shadow_outline = _on_screen(_on_table(corners, batch.lights), cameras)
     shape = (scenes, views, *size)
     rgb = np.empty((*shape, 3), np.float32)
     wants_opacity = bool({"opacity", "masks"} & set(outputs))
@@ -104,7 +110,7 @@ def launch(
         if table is not None:  # the empty table, once per light
             render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
         render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows,
-                     rules, rgb, opacity, distance)  # fmt: skip
+                     Outlines(outline, shadow_outline), rules, rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,
@@ -163,8 +169,21 @@ def _corners_world(
     return np.einsum("bnji,ncj->bnci", rotations, corners) + positions[:, :, None]
 
 
-def screen_boxes(points: Float[np.ndarray, "B N 8 3"], camera: Camera) -> Int[np.ndarray, "B N 4"]:
-    """The pixels that hold the projections of boxes' corners: columns from, to, rows from, to (not included)."""
+def _on_screen(
+    points: Float[np.ndarray, "B N 8 3"], cameras: Sequence[Camera]
+) -> tuple[Int[np.ndarray, "B V N 4"], Float32[np.ndarray, "B V N 8 2"]]:
+    """Boxes of pixels and outlines of boxes' corners, from every camera."""
+    boxes, outlines = zip(*(screen_boxes(points, camera) for camera in cameras), strict=True)
+    return np.stack(boxes, axis=1), np.stack(outlines, axis=1)
+
+
+def screen_boxes(
+    points: Float[np.ndarray, "B N 8 3"], camera: Camera
+) -> tuple[Int[np.ndarray, "B N 4"], Float32[np.ndarray, "B N 8 2"]]:
+    """The pixels that hold the projections of boxes' corners: columns from, to, rows from, to (not included).
+
+    And the projections themselves [px]; `NO_OUTLINE` where a box reaches behind the camera.
+    """
     inverse = camera.T_world_camera.inverse().matrix()
     local = points @ inverse[:3, :3].T + inverse[:3, 3]
     depth = local[..., 2]
@@ -178,7 +197,8 @@ def screen_boxes(points: Float[np.ndarray, "B N 8 3"], camera: Camera) -> Int[np
     cut = (np.any(depth < _NEAREST_M, axis=2) | ~is_sane)[..., None] & ~behind
     low, high = np.where(cut, 0, low), np.where(cut, limits, high)
     high = np.where(behind, low, high)
-    return np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1).astype(np.int64)
+    boxes = np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1).astype(np.int64)
+    return boxes, np.where(cut[..., None], NO_OUTLINE, pixels).astype(np.float32)
 
 
 def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B N 8 3"]:

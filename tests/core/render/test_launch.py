@@ -23,7 +23,7 @@ def test_a_screen_box_holds_every_pixel_that_the_box_touches(seed):
     half, centre = rng.uniform(0.01, 0.4, 3), rng.normal(size=3) * 0.7
     turn = quaternion_exp(rng.normal(size=3))
     pose = Pose(centre, turn)
-    left, right, top, bottom = screen_boxes(pose.apply(CORNERS * half)[None, None], camera)[0, 0]
+    left, right, top, bottom = screen_boxes(pose.apply(CORNERS * half)[None, None], camera)[0][0, 0]
     inside = pose.apply(rng.uniform(-1, 1, (500, 3)) * half)
     depth = camera.T_world_camera.inverse().apply(inside)[:, 2]
     u, v = camera.project(inside[depth > 1e-3]).T
@@ -38,7 +38,7 @@ def test_a_screen_box_holds_every_pixel_that_the_box_touches(seed):
 
 def test_a_screen_box_is_tight():
     camera = view((0, 0, 1), (0, 0, 0), 64, 53.13)  # half a metre to each side at the distance of 1 m
-    left, right, top, bottom = screen_boxes((CORNERS * [0.25, 0.25, 0])[None, None], camera)[0, 0]
+    left, right, top, bottom = screen_boxes((CORNERS * [0.25, 0.25, 0])[None, None], camera)[0][0, 0]
     np.testing.assert_allclose([left, right, top, bottom], [16, 48, 16, 48], atol=1)
 
 
@@ -48,7 +48,7 @@ def test_numbers_beyond_all_bounds_fill_the_screen(value):
     points = np.full((1, 1, 8, 3), value)
     points[0, 0, 0] = 0
     with np.errstate(all="ignore"):
-        left, right, top, bottom = screen_boxes(points, view((0, 0, 1), (0, 0, 0), 32))[0, 0]
+        left, right, top, bottom = screen_boxes(points, view((0, 0, 1), (0, 0, 0), 32))[0][0, 0]
     assert 0 <= left <= right <= 32
     assert 0 <= top <= bottom <= 32
 
