@@ -57,7 +57,7 @@ def _show(result: dict[str, Any]) -> None:
     print(
         f"New scene: TinyRenderer {result['tinyrenderer_ms']:.1f} ms, ours {result['scene_ms']:.1f} ms "
         f"({result['ratio']:.1f} times faster, {result['threads']} threads; "
-        f"{result['ratio_planning']:.1f} times at planning quality); "
+        f"{result['ratio_exact']:.1f} times in exact quality); "
         f"reference {result['reference_ms']:.0f} ms.\n"
         f"Planning: {result['planning_renders_per_s']:.0f} renders a second, "
         f"{result['planning_psnr']:.1f} dB against exact ones."

@@ -73,7 +73,7 @@ def pixels(page, selector: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
 
 
-def wait_until(condition, timeout_s: float = 15.0):
+def wait_until(condition, timeout_s: float = 60.0):
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         if condition():
