@@ -10,21 +10,18 @@ precision and counting would each cost more than the arithmetic here.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, MOST_HIDDEN, NETWORK_INPUTS
 from osfcore.fields.marching import interpolate, inverted, leave_blocks, optical_density, within
+from osfcore.render.table_kernels import FAR, HELPER, KERNEL, TINY, meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
-_HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
-_KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
 BAND_ROWS = 8  # rows of an image that one thread draws at a time
-_FAR = np.float32(1e9)
-_TINY = np.float32(1e-9)
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 
 
@@ -59,7 +56,7 @@ def _workspace():
     )  # fmt: skip
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
     """First and last sample of a ray within the occupied part of object n; last < first: none."""
     a, b = (reach[n, 0] - ox) * ix, (reach[n, 3] - ox) * ix
@@ -73,7 +70,7 @@ def _clip(reach, n, ox, oy, oz, ix, iy, iz, far, step):
     return int(np.ceil(t0 / step - _HALF)), int(np.floor(t1 / step - _HALF))
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels):
     """The next sample k <= last of field a with any density, and its optical depth; k > last if there is none."""
     corners, blocks = pack.starts[a, 0], pack.starts[a, 2]
@@ -98,12 +95,12 @@ def _next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, ste
     return k, depth
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_voxels, enough):
     """Optical depth of object n between a point, in its voxel coordinates, and the light; stops when it is enough."""
     dx, dy, dz = lit[b, n, 0], lit[b, n, 1], lit[b, n, 2]
     ix, iy, iz = lit_inverse[b, n, 0], lit_inverse[b, n, 1], lit_inverse[b, n, 2]
-    k, last = _clip(reach, n, x, y, z, ix, iy, iz, _FAR, step)
+    k, last = _clip(reach, n, x, y, z, ix, iy, iz, FAR, step)
     total = _ZERO
     while k <= last and total < enough:
         k, depth = _next_sample(pack, a, x, y, z, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels)
@@ -112,7 +109,7 @@ def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_
     return total
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _transform(matrix, b, n, m, x, y, z):
     """A point in object n's voxel coordinates in those of object m; n = N stands for the world."""
     return (
@@ -122,7 +119,7 @@ def _transform(matrix, b, n, m, x, y, z):
     )
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _visibility(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
     """Share of the light that reaches a point in object n's voxel coordinates past all others; n = N: of the world."""
     depth = _ZERO
@@ -138,7 +135,7 @@ def _visibility(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
     return np.exp(-depth)
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
     """Rho of field a at voxel coordinates: ambient part in out[0:3], direct part in out[3:6]."""
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
@@ -175,7 +172,7 @@ def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
     out[3], out[4], out[5] = f1 * max(dipole + z0, _ZERO), f2 * max(dipole + z1, _ZERO), f3 * max(dipole + z2, _ZERO)
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _run_network(flat, at, hidden, inputs, h1, h2):
     """The three outputs of a tiny network whose parameters begin at `at`."""
     bias = at + NETWORK_INPUTS * hidden
@@ -204,48 +201,7 @@ def _run_network(flat, at, hidden, inputs, h1, h2):
     return z0, z1, z2
 
 
-@numba.njit(**_HELPER)
-def _pixel_ray(cameras, view, u, v):
-    """Unit direction through pixel coordinates, and 1 / the length it had."""
-    x = cameras[view, 3] * u + cameras[view, 4] * v + cameras[view, 5]
-    y = cameras[view, 6] * u + cameras[view, 7] * v + cameras[view, 8]
-    z = cameras[view, 9] * u + cameras[view, 10] * v + cameras[view, 11]
-    inverse = _ONE / np.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse, inverse
-
-
-@numba.njit(**_HELPER)
-def _meet_table(table, cameras, view, dx, dy, dz):
-    """Distance along a ray to the table; very far if it misses."""
-    if table.exists and dz < -_TINY and cameras[view, 2] > _ZERO:
-        t = -cameras[view, 2] / dz
-        x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
-        if abs(x) <= table.half_side and abs(y) <= table.half_side:
-            return t
-    return _FAR
-
-
-@numba.njit(**_HELPER)
-def _table_colour(table, directs, b, x, y, visible):
-    """Radiance of the table at a point of it."""
-    g = len(table.albedo)
-    u = (x / table.half_side + _ONE) * _HALF * np.float32(g - 1)
-    v = (y / table.half_side + _ONE) * _HALF * np.float32(g - 1)
-    i, j = min(max(int(u), 0), g - 2), min(max(int(v), 0), g - 2)
-    fu, fv = u - np.float32(i), v - np.float32(j)
-    w00, w01, w10, w11 = (_ONE - fu) * (_ONE - fv), (_ONE - fu) * fv, fu * (_ONE - fv), fu * fv
-    al = table.albedo
-    r = al[i, j, 0] * w00 + al[i, j + 1, 0] * w01 + al[i + 1, j, 0] * w10 + al[i + 1, j + 1, 0] * w11
-    g_ = al[i, j, 1] * w00 + al[i, j + 1, 1] * w01 + al[i + 1, j, 1] * w10 + al[i + 1, j + 1, 1] * w11
-    b_ = al[i, j, 2] * w00 + al[i, j + 1, 2] * w01 + al[i + 1, j, 2] * w10 + al[i + 1, j + 1, 2] * w11
-    return (
-        r * (table.ambient[0] + directs[b, 0] * visible),
-        g_ * (table.ambient[1] + directs[b, 1] * visible),
-        b_ * (table.ambient[2] + directs[b, 2] * visible),
-    )
-
-
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _colour_at(pack, fields, scene, b, n, t, rules, work):
     """Rho of object n where the ray of `work` is at t, in out[0:6], and the light that reaches it."""
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
@@ -264,7 +220,7 @@ def _colour_at(pack, fields, scene, b, n, t, rules, work):
     return work.lit[n]
 
 
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, rules, work, result):
     """Follow one ray.
 
@@ -275,8 +231,8 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
     ks, lasts, depths, d, inv = work.ks, work.lasts, work.depths, work.direction, work.inverse
     for c in range(5 + count):
         result[c] = _ZERO
-    dx, dy, dz, unit = _pixel_ray(cameras, view, u, v)
-    table_t = _meet_table(table, cameras, view, dx, dy, dz)
+    dx, dy, dz, unit = pixel_ray(cameras, view, u, v)
+    table_t = meet_table(table, cameras, view, dx, dy, dz)
     work.where[0] = view
     for n in range(count):
         ks[n], lasts[n] = 0, -1
@@ -298,7 +254,7 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
         work.lit[n] = -_ONE
     left, coloured, out = _ONE, _ZERO, work.out
     while left > rules.stop:
-        n, t = -1, _FAR
+        n, t = -1, FAR
         for m in range(count):  # the nearest of all objects' next samples
             if ks[m] <= lasts[m]:
                 candidate = (np.float32(ks[m]) + _HALF) * rules.step_voxels * pack.scales[fields[m], 3]
@@ -332,10 +288,10 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
         for c in range(5 + count):
             result[c] *= whole
         return
-    if table_t < _FAR:
+    if table_t < FAR:
         x, y = cameras[view, 0] + table_t * dx, cameras[view, 1] + table_t * dy
         visible = _visibility(pack, fields, scene, b, count, x, y, _ZERO, rules.shadow_voxels, rules.enough)
-        r, g, blue = _table_colour(table, directs, b, x, y, visible)
+        r, g, blue = table_colour(table, directs, b, x, y, visible)
         result[0] += left * r
         result[1] += left * g
         result[2] += left * blue
@@ -346,41 +302,7 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
             result[c] += left * table.background[c]
 
 
-@numba.njit(**_KERNEL)
-def render_base(table, cameras, directs, samples, rgb, distance) -> None:
-    """The empty, unshaded table under L lights from V cameras: rgb L x V x h x w x 3; distance likewise, 0: nothing."""
-    lights, views, height, width = distance.shape
-    for job in numba.prange(lights * views * height):
-        row, view, b = job % height, (job // height) % views, job // (height * views)
-        for column in range(width):
-            hits = 0
-            for s in range(4 if samples > 1 else 0):  # a pixel that straddles the table's edge shows a part of it
-                u, v = np.float32(column + s % 2), np.float32(row + s // 2)
-                dx, dy, dz, _ = _pixel_ray(cameras, view, u, v)
-                hits += _meet_table(table, cameras, view, dx, dy, dz) < _FAR
-            count = samples if 0 < hits < 4 else 1
-            share = _ONE / np.float32(count * count)
-            red = green = blue = reach = _ZERO
-            hits = 0
-            for s in range(count * count):
-                u = np.float32(column + (s % count + 0.5) / count)
-                v = np.float32(row + (s // count + 0.5) / count)
-                dx, dy, dz, _ = _pixel_ray(cameras, view, u, v)
-                t = _meet_table(table, cameras, view, dx, dy, dz)
-                if t < _FAR:
-                    x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
-                    r, g, bl = _table_colour(table, directs, b, x, y, _ONE)
-                    hits, reach = hits + 1, reach + t
-                else:
-                    r, g, bl = table.background[0], table.background[1], table.background[2]
-                red, green, blue = red + share * r, green + share * g, blue + share * bl
-            distance[b, view, row, column] = reach / max(hits, 1)
-            rgb[b, view, row, column, 0] = red
-            rgb[b, view, row, column, 1] = green
-            rgb[b, view, row, column, 2] = blue
-
-
-@numba.njit(**_HELPER)
+@numba.njit(**HELPER)
 def _row_span(outlines, boxes, b, view, n, row):
     """The columns of a row of pixels, from and to, that the outline of object n may touch.
 
@@ -392,14 +314,14 @@ def _row_span(outlines, boxes, b, view, n, row):
     if outlines[b, view, n, 0, 0] >= NO_OUTLINE:  # the box must do
         return first, last
     top, bottom = np.float32(row), np.float32(row + 1)
-    low, high = _FAR, -_FAR
+    low, high = FAR, -FAR
     for i in range(8):
         x0, y0 = outlines[b, view, n, i, 0], outlines[b, view, n, i, 1]
         for j in range(i):
             x1, y1 = outlines[b, view, n, j, 0], outlines[b, view, n, j, 1]
             if max(y0, y1) < top or min(y0, y1) > bottom:
                 continue
-            slope = (x1 - x0) / (y1 - y0) if abs(y1 - y0) > _TINY else _ZERO
+            slope = (x1 - x0) / (y1 - y0) if abs(y1 - y0) > TINY else _ZERO
             a = x0 if top <= y0 <= bottom else x0 + ((top if y0 < top else bottom) - y0) * slope
             c = x1 if top <= y1 <= bottom else x1 + ((top if y1 < top else bottom) - y1) * slope
             low, high = min(low, a, c), max(high, a, c)
@@ -408,7 +330,7 @@ def _row_span(outlines, boxes, b, view, n, row):
     return max(first, np.int64(np.floor(low))), min(last, np.int64(np.ceil(high)))
 
 
-@numba.njit(**_KERNEL)
+@numba.njit(**KERNEL)
 def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_distance, base_of, boxes, shadows,
                  outlines, rules, rgb, opacity, distance) -> None:  # fmt: skip
     """Every image of a batch; what no object and no shadow can touch is copied from the empty table.

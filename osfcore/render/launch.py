@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32, Int
 
 from osfcore.fields.marching import ONE_AT_A_TIME
 from osfcore.fields.table import TableField
-from osfcore.render.kernels import NO_OUTLINE, render_base, render_batch
+from osfcore.render.kernels import NO_OUTLINE, render_batch
 from osfcore.render.packing import Packed
 from osfcore.render.scene_renderer import (
     MASK_OPACITY,
@@ -20,6 +20,7 @@ from osfcore.render.scene_renderer import (
     camera_numbers,
     poses_of,
 )
+from osfcore.render.table_kernels import render_base
 from osfcore.scene import Camera
 
 _LAST_CORNER = 1.001  # interpolation needs the corner after

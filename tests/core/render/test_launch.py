@@ -4,9 +4,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.poses import Pose, quaternion_exp
-from osfcore.render.kernels import render_base, render_batch
+from osfcore.render.kernels import render_batch
 from osfcore.render.launch import screen_boxes
 from osfcore.render.scene_renderer import EXACT, OUTPUTS, PLANNING, SceneBatch, SceneRenderer
+from osfcore.render.table_kernels import render_base
 from osfcore.scene import PUSHER_CENTRE_Z_M, Camera
 from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, state, view
 

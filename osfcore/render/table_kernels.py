@@ -1,0 +1,90 @@
+"""Compiled rays from pixels to the table, and the table where nothing stands on it."""
+# ruff: noqa: ANN001, ANN201 - compiled helpers; types are given by their callers
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+FAR = np.float32(1e9)
+TINY = np.float32(1e-9)
+HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
+KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+
+
+@numba.njit(**HELPER)
+def pixel_ray(cameras, view, u, v):
+    """Unit direction through pixel coordinates, and 1 / the length it had."""
+    x = cameras[view, 3] * u + cameras[view, 4] * v + cameras[view, 5]
+    y = cameras[view, 6] * u + cameras[view, 7] * v + cameras[view, 8]
+    z = cameras[view, 9] * u + cameras[view, 10] * v + cameras[view, 11]
+    inverse = _ONE / np.sqrt(x * x + y * y + z * z)
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@numba.njit(**HELPER)
+def meet_table(table, cameras, view, dx, dy, dz):
+    """Distance along a ray to the table; very far if it misses."""
+    if table.exists and dz < -TINY and cameras[view, 2] > _ZERO:
+        t = -cameras[view, 2] / dz
+        x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
+        if abs(x) <= table.half_side and abs(y) <= table.half_side:
+            return t
+    return FAR
+
+
+@numba.njit(**HELPER)
+def table_colour(table, directs, b, x, y, visible):
+    """Radiance of the table at a point of it."""
+    g = len(table.albedo)
+    u = (x / table.half_side + _ONE) * _HALF * np.float32(g - 1)
+    v = (y / table.half_side + _ONE) * _HALF * np.float32(g - 1)
+    i, j = min(max(int(u), 0), g - 2), min(max(int(v), 0), g - 2)
+    fu, fv = u - np.float32(i), v - np.float32(j)
+    w00, w01, w10, w11 = (_ONE - fu) * (_ONE - fv), (_ONE - fu) * fv, fu * (_ONE - fv), fu * fv
+    al = table.albedo
+    r = al[i, j, 0] * w00 + al[i, j + 1, 0] * w01 + al[i + 1, j, 0] * w10 + al[i + 1, j + 1, 0] * w11
+    g_ = al[i, j, 1] * w00 + al[i, j + 1, 1] * w01 + al[i + 1, j, 1] * w10 + al[i + 1, j + 1, 1] * w11
+    b_ = al[i, j, 2] * w00 + al[i, j + 1, 2] * w01 + al[i + 1, j, 2] * w10 + al[i + 1, j + 1, 2] * w11
+    return (
+        r * (table.ambient[0] + directs[b, 0] * visible),
+        g_ * (table.ambient[1] + directs[b, 1] * visible),
+        b_ * (table.ambient[2] + directs[b, 2] * visible),
+    )
+
+
+@numba.njit(**KERNEL)
+def render_base(table, cameras, directs, samples, rgb, distance) -> None:
+    """The empty, unshaded table under L lights from V cameras: rgb L x V x h x w x 3; distance likewise, 0: nothing."""
+    lights, views, height, width = distance.shape
+    for job in numba.prange(lights * views * height):
+        row, view, b = job % height, (job // height) % views, job // (height * views)
+        for column in range(width):
+            hits = 0
+            for s in range(4 if samples > 1 else 0):  # a pixel that straddles the table's edge shows a part of it
+                u, v = np.float32(column + s % 2), np.float32(row + s // 2)
+                dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
+                hits += meet_table(table, cameras, view, dx, dy, dz) < FAR
+            count = samples if 0 < hits < 4 else 1
+            share = _ONE / np.float32(count * count)
+            red = green = blue = reach = _ZERO
+            hits = 0
+            for s in range(count * count):
+                u = np.float32(column + (s % count + 0.5) / count)
+                v = np.float32(row + (s // count + 0.5) / count)
+                dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
+                t = meet_table(table, cameras, view, dx, dy, dz)
+                if t < FAR:
+                    x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
+                    r, g, bl = table_colour(table, directs, b, x, y, _ONE)
+                    hits, reach = hits + 1, reach + t
+                else:
+                    r, g, bl = table.background[0], table.background[1], table.background[2]
+                red, green, blue = red + share * r, green + share * g, blue + share * bl
+            distance[b, view, row, column] = reach / max(hits, 1)
+            rgb[b, view, row, column, 0] = red
+            rgb[b, view, row, column, 1] = green
+            rgb[b, view, row, column, 2] = blue
