@@ -1,5 +1,6 @@
 import json
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -39,6 +40,17 @@ class Ellipsoid(OSF):
         normal = (x - torch.tensor(CENTRE, dtype=x.dtype)) / torch.tensor(HALF**2, dtype=x.dtype)
         shade = torch.relu((torch.nn.functional.normalize(normal, dim=-1) * light).sum(-1, keepdim=True))
         return Scatter(ALBEDO * 0.25 * torch.ones(len(x), 1), 0.75 * ALBEDO * shade, self.density(x))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Two threads that wait for each other on a busy machine take a hundred times as long for such small work."""
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 import copy
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,17 @@ from osfcore.fields.teacher import (
 
 CPU = torch.device("cpu")
 SMALL = TeacherRecipe(OSFSize(2, 32), across=24, rays=256, rebake=20, rates=Rates(1e-2, 2e-3))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Two threads that wait for each other on a busy machine take a hundred times as long for such small work."""
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
 
 
 @pytest.fixture(scope="module")
