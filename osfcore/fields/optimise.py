@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,21 +42,29 @@ class Rates:
 
 
 def composite(
-    query: KiloQuery, field: KiloOSF, rays: RayBatch, *, offsets: np.ndarray | None = None, min_weight: float = 1e-3,
-    most: int = MOST_SAMPLES, jitter: float = 0.0, generator: torch.Generator | None = None,
+    query: Callable[[Tensor, Tensor, Tensor], Scatter], field: KiloOSF, rays: RayBatch, *,
+    offsets: np.ndarray | None = None, min_weight: float = 1e-3, most: int = MOST_SAMPLES,
+    device: torch.device | str = "cpu",
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:  # fmt: skip
-    """Radiance over black and opacity along rays (paper eq. 3 for one object), samples chosen by `field`'s density."""
+    """Radiance over black and opacity along rays (paper eq. 3 for one object).
+
+    Args:
+        query: what is looked at, a `KiloQuery` or an `OSF`: takes points, lights and views.
+        field: its density chooses the samples.
+        rays: R rays.
+        offsets: of each ray's first sample, in steps.
+        min_weight: samples that would contribute less are left out.
+        most: samples a ray at most.
+        device: where `query` computes.
+    """
     step = STEP_VOXELS * field.voxel
     ts, used = march(field, rays.origins, rays.directions, step=step, offsets=offsets, min_weight=min_weight,
                      most=most)  # fmt: skip
-    device = query.rows.device
     mask = torch.as_tensor(used, device=device)
     ray = torch.as_tensor(np.nonzero(used)[0], device=device)
     points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[used]
     light, view = (torch.as_tensor(a, device=device)[ray] for a in (rays.lights, rays.directions))
-    scatter: Scatter = query(
-        torch.as_tensor(points, device=device), light, view, cell_jitter=jitter, generator=generator
-    )
+    scatter = query(torch.as_tensor(points, device=device), light, view)
     depth = torch.zeros(mask.shape, device=device).masked_scatter(mask, scatter.sigma * step)
     before = torch.cumsum(depth, dim=1) - depth
     weights = torch.exp(-before) * -torch.expm1(-depth)
@@ -84,8 +94,9 @@ class Stage:
         for group, factor in zip(self._optimiser.param_groups, (1.0, _NETWORK_RATE), strict=True):
             group["lr"] = rate * factor
         offsets = rng.random(len(rays.alpha), dtype=np.float32)
-        rgb, alpha = composite(self.query, self.field, rays, offsets=offsets, jitter=_CELL_JITTER, generator=generator)
-        device = rgb.device
+        query = partial(self.query, cell_jitter=_CELL_JITTER, generator=generator)
+        device = self.query.rows.device
+        rgb, alpha = composite(query, self.field, rays, offsets=offsets, device=device)
         loss = functional.mse_loss(rgb, torch.as_tensor(rays.rgb, device=device)) * 3
         loss = loss + _ALPHA_WEIGHT * functional.mse_loss(alpha, torch.as_tensor(rays.alpha, device=device))
         self._optimiser.zero_grad(set_to_none=True)

@@ -17,16 +17,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 from scipy import ndimage
-from torch import Tensor
 from torch.nn import functional
 
 from osfcore.errors import InvalidInput
 from osfcore.fields.holdout import Holdout
 from osfcore.fields.hull import silhouette_box
 from osfcore.fields.image_set import ImageSet, read_splits
-from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, FEATURES, FLOOR_G, STEP_VOXELS, KiloOSF
-from osfcore.fields.marching import march
-from osfcore.fields.optimise import Rates
+from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, FEATURES, FLOOR_G, KiloOSF
+from osfcore.fields.optimise import Rates, composite
 from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.query import KiloQuery
 from osfcore.fields.rays import RayBatch, RaySource
@@ -172,7 +170,9 @@ class Teacher:
         for group in self._optimiser.param_groups:
             group["lr"] = self.recipe.rates.at(share) * min(1.0, self._count / _WARM_UP)
         offsets = rng.random(len(rays.alpha), dtype=np.float32)
-        rgb, alpha = render(self.osf, self._proposal, rays, offsets=offsets)
+        rgb, alpha = composite(
+            self.osf, self._proposal, rays, offsets=offsets, most=_MOST_SAMPLES, device=self.osf.ambient.device
+        )
         loss = functional.mse_loss(rgb, torch.as_tensor(rays.rgb, device=rgb.device)) * 3
         loss = loss + _ALPHA_WEIGHT * functional.mse_loss(alpha, torch.as_tensor(rays.alpha, device=rgb.device))
         self._optimiser.zero_grad(set_to_none=True)
@@ -228,30 +228,10 @@ class TeacherHoldout(Holdout):
     @torch.no_grad()
     def _pair(self, query: KiloQuery, field: KiloOSF, number: int) -> tuple[np.ndarray, np.ndarray]:
         rays = self._source.batch(self._source.image_pixels(number))
-        colour, _ = render(self._teacher.osf, field, rays, min_weight=1e-4, most=_EVERY_SAMPLE)
+        osf = self._teacher.osf
+        colour, _ = composite(osf, field, rays, min_weight=1e-4, most=_EVERY_SAMPLE, device=osf.ambient.device)
         shape = (*self._source.image_shape, 3)
         return rays.rgb.reshape(shape), np.clip(colour.cpu().numpy(), 0, 1).reshape(shape)
-
-
-def render(
-    osf: OSF, proposal: KiloOSF, rays: RayBatch, *, offsets: Float32[np.ndarray, "R"] | None = None,
-    min_weight: float = 1e-3, most: int = _MOST_SAMPLES,
-) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:  # fmt: skip
-    """Radiance over black and opacity along rays (paper eq. 3 for one object); `proposal` chooses the samples."""
-    step = STEP_VOXELS * proposal.voxel
-    ts, used = march(proposal, rays.origins, rays.directions, step=step, offsets=offsets, min_weight=min_weight,
-                     most=most)  # fmt: skip
-    device = osf.ambient.device
-    mask, ray = torch.as_tensor(used, device=device), torch.as_tensor(np.nonzero(used)[0], device=device)
-    points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[used]
-    light, view = (torch.as_tensor(a, device=device)[ray] for a in (rays.lights, rays.directions))
-    scatter = osf(torch.as_tensor(points, device=device), light, view)
-    depth = torch.zeros(mask.shape, device=device).masked_scatter(mask, scatter.sigma * step)
-    before = torch.cumsum(depth, dim=1) - depth
-    weights = torch.exp(-before) * -torch.expm1(-depth)
-    radiance = scatter.ambient + scatter.direct
-    colour = torch.zeros(len(ts), 3, device=device).index_add(0, ray, weights[mask][:, None] * radiance)
-    return colour, weights.sum(dim=1)
 
 
 def corners(grid: KiloOSF) -> Float32[np.ndarray, "nx ny nz 3"]:

@@ -1,6 +1,5 @@
 import json
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -8,7 +7,6 @@ import torch
 from osfcore.fields.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from osfcore.fields.distill import Distillation, first_student
 from osfcore.fields.hull import silhouette_box
-from osfcore.fields.image_set import read_image_set
 from osfcore.fields.kiloosf import FLOOR_G
 from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.query import KiloQuery, Scatter
@@ -42,20 +40,7 @@ class Ellipsoid(OSF):
         return Scatter(ALBEDO * 0.25 * torch.ones(len(x), 1), 0.75 * ALBEDO * shade, self.density(x))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Two threads that wait for each other on a busy machine take a hundred times as long for such small work."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
-
-
-@pytest.fixture(scope="module")
-def images(pristine_set):
-    return read_image_set(pristine_set, "train")
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

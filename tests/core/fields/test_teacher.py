@@ -1,15 +1,13 @@
 import copy
 
-import numba
 import numpy as np
 import pytest
 import torch
 
 from osfcore.errors import InvalidInput
 from osfcore.fields.hull import silhouette_box
-from osfcore.fields.image_set import read_image_set
 from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G
-from osfcore.fields.optimise import Rates
+from osfcore.fields.optimise import Rates, composite
 from osfcore.fields.osf import DENSITY_GAIN, OSFSize
 from osfcore.fields.query import KiloQuery
 from osfcore.fields.rays import RayBatch, RaySource
@@ -21,7 +19,6 @@ from osfcore.fields.teacher import (
     baked_g,
     corners,
     inverse_density,
-    render,
     train_teacher,
 )
 
@@ -29,20 +26,7 @@ CPU = torch.device("cpu")
 SMALL = TeacherRecipe(OSFSize(2, 32), across=24, rays=256, rebake=20, rates=Rates(1e-2, 2e-3))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Two threads that wait for each other on a busy machine take a hundred times as long for such small work."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
-
-
-@pytest.fixture(scope="module")
-def images(pristine_set):
-    return read_image_set(pristine_set, "train")
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture
@@ -76,7 +60,7 @@ def test_the_first_proposals_fill_the_silhouettes(teacher, images):
     rays = source.batch(source.silhouette_pixels())
     uniform(teacher.osf, 2000.0)
     with torch.no_grad():
-        _, alpha = render(teacher.osf, teacher.snapshot(), rays)
+        _, alpha = composite(teacher.osf, teacher.snapshot(), rays, most=40)
     assert (alpha.numpy()[rays.alpha == 1] > 0.9).mean() > 0.97
 
 
@@ -92,7 +76,7 @@ def test_opacity_of_a_slab(teacher):
         origin, np.float32([[1, 0, 0]]), np.float32([[0, 0, 1]]), np.zeros((1, 3), np.float32), np.ones(1, np.float32)
     )
     with torch.no_grad():
-        colour, alpha = render(teacher.osf, grid, rays, min_weight=0, most=256)
+        colour, alpha = composite(teacher.osf, grid, rays, min_weight=0, most=256)
         scatter = teacher.osf(
             torch.from_numpy(middle[None].astype(np.float32)),
             *(torch.from_numpy(a) for a in (rays.lights, rays.directions)),
