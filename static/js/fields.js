@@ -36,7 +36,7 @@ function doubted(button, text, action) {
 function entry(field) {
   const { psnr_full: full, psnr_mask: mask, minutes } = field.metrics;
   const quality = Number.isFinite(full) && Number.isFinite(mask) ? psnrText(field.metrics) : "not measured";
-  const origin = field.source === "trained" ? "trained here" : "shipped";
+  const origin = field.source === "trained" ? "trained here" : "shipped, trained";
   const effort = Number.isFinite(minutes) ? ` in ${Number(minutes.toPrecision(2))} min` : "";
   const item = el(
     "li", {},
