@@ -7,6 +7,18 @@ the facts and write the sentence. Nothing here knows of exit codes or HTTP.
 from collections.abc import Iterable
 from pathlib import Path
 
+_MOST_CHARACTERS = 2000  # of a sentence, however long the names in it are
+_VALUE_CHARACTERS = 300  # of a value that was given, which may be a path or a list
+_SHOWN_CHARACTERS = 100
+
+
+def shown(value: object, most: int = _SHOWN_CHARACTERS) -> str:
+    """A value from a file as a sentence may show it: on one line, printable, cut in the middle if it is long."""
+    text = str(value)
+    if len(text) > most:
+        text = f"{text[: most * 2 // 3]}...{text[-most // 3 :]}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names)) or "none"
@@ -20,6 +32,9 @@ def _rebuilt(kind: type["OsfError"], sentence: str, facts: dict[str, object]) ->
 
 class OsfError(ValueError):
     """A mistake in an input, told in one sentence that a user can act on."""
+
+    def __init__(self, sentence: str = "") -> None:
+        super().__init__(shown(sentence, _MOST_CHARACTERS))
 
     def __reduce__(self) -> tuple[object, ...]:
         """Survive the way out of a worker process, although constructors take facts rather than the sentence."""
@@ -36,7 +51,7 @@ class InvalidInput(OsfError):
     """
 
     def __init__(self, what: str, value: object, allowed: str) -> None:
-        super().__init__(f"{what} is {value}, but it must be {allowed}.")
+        super().__init__(f"{what} is {shown(value, _VALUE_CHARACTERS)}, but it must be {allowed}.")
         self.what = what
 
 
@@ -50,7 +65,7 @@ class UnknownName(OsfError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"There is no {kind} named {name!r}; known: {_listed(known)}.")
+        super().__init__(f"There is no {kind} named {shown(repr(name))}; known: {_listed(known)}.")
 
 
 class MissingAssets(OsfError):

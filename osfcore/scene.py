@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, shown
 from osfcore.poses import Pose, quaternion_from_matrix, rotate, unit_quaternion
 
 TABLE_SIDE_M = 1.2
@@ -30,6 +30,7 @@ DIFFUSE = 0.75
 MIN_LIGHT_ELEVATION_DEG = 5.0
 MAX_OBJECTS = 8
 MIN_IMAGE_SIDE, MAX_IMAGE_SIDE = 16, 1024
+MAX_SEED = 2**63 - 1
 DEFAULT_IMAGE_SIDE = 128
 FIELD_OF_VIEW_DEG = 45.0
 SCENE_CENTRE = (0.0, 0.0, 0.04)
@@ -63,6 +64,17 @@ def image_side(value: int, what: str = "image size [px]") -> int:
     return int(value)
 
 
+def check_seed(value: int) -> int:
+    """A seed that every random generator takes.
+
+    Raises:
+        InvalidInput: if it is negative or has more than 63 bits.
+    """
+    if not 0 <= value <= MAX_SEED:
+        raise InvalidInput("seed", value, f"between 0 and {MAX_SEED}")
+    return int(value)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Camera:
     """A pinhole camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
@@ -83,13 +95,14 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Check the image size and the intrinsics."""
-        image_side(self.width, f"width of camera {self.name} [px]")
-        image_side(self.height, f"height of camera {self.name} [px]")
+        name = shown(self.name)
+        image_side(self.width, f"width of camera {name} [px]")
+        image_side(self.height, f"height of camera {name} [px]")
         K = self.intrinsics
         is_sane = K.shape == (3, 3) and np.all(np.isfinite(K)) and K[0, 0] > 0 and K[1, 1] > 0
         if not is_sane or not np.array_equal(K[2], (0, 0, 1)):
             allowed = "a 3 x 3 matrix with positive focal lengths and last row 0, 0, 1"
-            raise InvalidInput(f"K of camera {self.name}", K.tolist(), allowed)
+            raise InvalidInput(f"K of camera {name}", K.tolist(), allowed)
 
     @staticmethod
     def look_at(

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.errors import CorruptFile, InvalidInput, shown
 from osfcore.poses import Pose
 from osfcore.scene import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, Camera
 
@@ -29,6 +29,7 @@ MAX_IMAGES = 20_000
 MAX_ANNOTATION_BYTES = 64_000_000
 MAX_SPLIT_BYTES = 1 << 30  # of decoded images: both splits and the training itself stay below 4 GB
 OPAQUE = 128  # alpha from which a pixel counts as the object's
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RIGID_TOLERANCE = 1e-3
 _MAX_NUMBER = 1e9  # in any unit of length a set may have
 Split = Literal["train", "test"]
@@ -62,6 +63,15 @@ class ImageSet:
     cameras: tuple[Camera, ...]
     light_directions: Float[np.ndarray, "n 3"]
     rgba: UInt8[np.ndarray, "n h w 4"]
+
+    def digest(self) -> str:
+        """Tells this split from any other: of its pixels, cameras and lights."""
+        digest = hashlib.blake2b(np.ascontiguousarray(self.rgba).tobytes(), digest_size=16)
+        digest.update(repr(self.rgba.shape).encode())
+        for camera in self.cameras:
+            digest.update(camera.T_world_camera.matrix().tobytes() + camera.intrinsics.tobytes())
+        digest.update(np.ascontiguousarray(self.light_directions).tobytes())
+        return digest.hexdigest()
 
     @property
     def is_opaque(self) -> bool:
@@ -118,7 +128,7 @@ def _images(folder: Path, split: str) -> Iterator[tuple[AnnotatedImage, UInt8[np
         image_path = _image_path(folder, path, number, entry)
         if first_use.setdefault(image_path, number) != number:
             earlier = first_use[image_path]
-            raise CorruptFile(path, f"entries {earlier} and {number} name the same image {entry['filename']}")
+            raise CorruptFile(path, f"entries {earlier} and {number} name the same image {shown(entry['filename'])}")
         rgba = _read_rgba(image_path)
         height, width = rgba.shape[:2]
         _refuse_other_size(path, number, entry, (width, height))
@@ -162,9 +172,9 @@ def _entries(folder: Path, split: str, path: Path) -> list[Any]:
 def _image_path(folder: Path, path: Path, number: int, entry: Mapping[str, Any]) -> Path:
     """Where the image of an entry lies, which is inside the set, whatever the name says."""
     name = entry.get("filename")
-    if not isinstance(name, str) or not name or "\0" in name:
+    if not isinstance(name, str) or not name or "\0" in name or not _is_text(name):
         raise CorruptFile(path, f"entry {number} lacks or garbles filename, the name of its PNG")
-    place = f"entry {number} names {name[:100]!r}"
+    place = f"entry {number} names {shown(repr(name))}"
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise CorruptFile(path, f"{place}; a file name without '..', relative to anno.json, is expected")
     image = path.parent / name
@@ -176,19 +186,29 @@ def _image_path(folder: Path, path: Path, number: int, entry: Mapping[str, Any])
     if not is_inside:
         raise CorruptFile(path, f"{place}, a link that leads out of the set; images inside it are expected")
     if not is_there:
-        raise CorruptFile(
-            image, f"there is no readable PNG of that name, but entry {number} of {path.name} asks for it"
-        )
+        reason = f"there is no readable PNG of that name, but entry {number} of {path.name} asks for it"
+        raise CorruptFile(path.parent / shown(name), reason)
     return image
+
+
+def _is_text(name: str) -> bool:
+    """Whether a name can be written at all: JSON may hold halves of characters."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
     """The pixels of a PNG; its header is judged before anything is decoded."""
     try:
+        with path.open("rb") as file:
+            head = file.read(24)
+        if head.startswith(_PNG_SIGNATURE) and head[12:16] == b"IHDR":  # Pillow names no size when it refuses one
+            _check_sides(path, struct.unpack(">II", head[16:]))
         with Image.open(path, formats=["PNG"]) as image:
-            if not MIN_IMAGE_SIDE <= min(image.size) <= max(image.size) <= MAX_IMAGE_SIDE:
-                expected = f"sides from {MIN_IMAGE_SIDE} to {MAX_IMAGE_SIDE} px are read"
-                raise CorruptFile(path, f"it is {image.width} x {image.height} px; {expected}")
+            _check_sides(path, image.size)
             if image.mode != "RGBA":
                 raise CorruptFile(path, f"it is {image.mode} without transparency; 8-bit RGBA is expected")
             return np.array(image, np.uint8)
@@ -206,6 +226,12 @@ def _read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
         raise CorruptFile(path, "it is no readable PNG: truncated, damaged or of another kind") from error
 
 
+def _check_sides(path: Path, size: tuple[int, int]) -> None:
+    if not MIN_IMAGE_SIDE <= min(size) <= max(size) <= MAX_IMAGE_SIDE:
+        expected = f"sides from {MIN_IMAGE_SIDE} to {MAX_IMAGE_SIDE} px are read"
+        raise CorruptFile(path, f"it is {size[0]} x {size[1]} px; {expected}")
+
+
 def _refuse_other_size(path: Path, number: int, entry: Mapping[str, Any], size: tuple[int, int]) -> None:
     """Compare an image with its `resolution`: absent, a side of a square [px], or width and height [px]."""
     value = entry.get("resolution")
@@ -215,12 +241,13 @@ def _refuse_other_size(path: Path, number: int, entry: Mapping[str, Any], size: 
     if len(sides) != 2 or not all(isinstance(s, int | float) and not isinstance(s, bool) for s in sides):
         raise CorruptFile(path, f"resolution of entry {number} is not one side or [width, height] in pixels")
     if tuple(sides) != size:
-        name = f"{size[0]} x {size[1]} px, but resolution of entry {number} says {sides[0]} x {sides[1]}"
-        raise CorruptFile(path.parent / entry["filename"], f"it is {name}")
+        told = shown(f"{sides[0]} x {sides[1]}")
+        reason = f"it is {size[0]} x {size[1]} px, but resolution of entry {number} says {told}"
+        raise CorruptFile(path.parent / shown(entry["filename"]), reason)
 
 
 def _annotated(path: Path, number: int, entry: Mapping[str, Any], image: Path, size: tuple[int, int]) -> AnnotatedImage:
-    where = f"entry {number} ({entry['filename']})"
+    where = f"entry {number} ({shown(entry['filename'])})"
     RT = _numbers(path, where, entry, "RT", (3, 4))
     K = _numbers(path, where, entry, "K", (3, 3))
     light = _numbers(path, where, entry, "light_pos", (3,))

@@ -28,3 +28,25 @@ def test_sentences_carry_the_facts():
     assert "a, b" in str(SENTENCES[1])
     assert "12 mm" in str(SENTENCES[3])
     assert "at least 5" in str(SENTENCES[0])
+
+
+def test_sentences_stay_on_one_short_line_whatever_the_values_hold():
+    nasty = "a\nb\x1b[31m\udc80" + 10_000 * "x"
+    for error in (
+        errors.InvalidInput("name", nasty, "short"),
+        errors.UnknownName("field", nasty, [nasty]),
+        errors.CorruptFile(nasty, nasty),
+    ):
+        text = str(error)
+        assert text.isprintable()
+        assert len(text) < 2100
+        assert text.endswith(".")
+        text.encode()
+
+
+def test_values_are_cut_in_the_middle():
+    text = errors.shown("start" + 1000 * "-" + "end\t")
+    assert len(text) < 110
+    assert text.startswith("start")
+    assert text.endswith("end\\t")
+    assert errors.shown("mug.png") == "mug.png"

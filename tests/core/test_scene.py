@@ -12,6 +12,7 @@ from osfcore.scene import (
     Light,
     SceneState,
     check_action,
+    check_seed,
     default_cameras,
     goal_camera,
 )
@@ -119,3 +120,18 @@ def test_states_that_cannot_be_are_refused(bad, words):
 def test_pose_of_an_object_by_name():
     both = state(("a", "b"), [[0.0, 0, 0], [0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(both.pose("b").position, [0.1, 0.2, 0.3])
+
+
+def test_seeds_are_what_every_generator_takes():
+    assert check_seed(0) == 0
+    assert check_seed(2**63 - 1) == 2**63 - 1
+    for seed in (-1, 2**63, 10**400):
+        with pytest.raises(InvalidInput, match="but it must be between 0 and 9223372036854775807"):
+            check_seed(seed)
+
+
+def test_a_long_camera_name_makes_no_long_sentence():
+    camera = goal_camera()
+    with pytest.raises(InvalidInput, match="^K of camera xxx") as caught:
+        Camera("x" * 5000, camera.T_world_camera, np.zeros((3, 3)), 32, 32)
+    assert len(str(caught.value)) < 400

@@ -1,6 +1,7 @@
 import json
 import os
 import shutil
+import struct
 
 import cv2
 import numpy as np
@@ -98,6 +99,9 @@ def test_the_bare_table_is_opaque(table_set):
         (lambda e: e.update(filename=7), "entry 3 lacks or garbles filename"),
         (lambda e: e.update(filename="a\0.png"), "entry 3 lacks or garbles filename"),
         (lambda e: e.update(filename="x" * 5000), "no readable PNG"),
+        (lambda e: e.update(filename="r_3\ud800.png"), "entry 3 lacks or garbles filename"),
+        (lambda e: e.update(filename="r_\udc80.png"), "entry 3 lacks or garbles filename"),
+        (lambda e: e.update(resolution=[10**4000, 32]), "resolution of entry 3 says 1000.*000 x 32"),
         (lambda e: e.update(filename="../test/r_1.png"), "entry 3 names '../test/r_1.png'; .*without '..'"),
         (lambda e: e.update(filename="/etc/passwd"), "entry 3 names '/etc/passwd'; .*relative to anno.json"),
     ],
@@ -106,6 +110,47 @@ def test_broken_entries_are_told_with_their_place(image_set, change, words):
     edit(image_set, change)
     with pytest.raises(CorruptFile, match=words):
         read_splits(image_set)
+
+
+@pytest.mark.parametrize("name", ["\x1b[31mred\n.png", "x" * 5000, "../" + "\n" * 5000, "y/" * 3000 + "\t.png"])
+@pytest.mark.parametrize("change", [{}, {"light_pos": "up"}])
+def test_long_and_unprintable_names_are_told_in_one_short_line(image_set, name, change):
+    edit(image_set, lambda e: e.update(filename=name, **change))
+    with pytest.raises(CorruptFile) as caught:
+        read_splits(image_set)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < len(str(image_set)) + 350
+
+
+def test_names_that_are_used_twice_are_told_in_one_short_line(image_set):
+    name = "./" * 500 + "r_4\n.png"
+    (image_set / "train" / "r_4.png").rename(image_set / "train" / "r_4\n.png")
+    edit(image_set, lambda e: e.update(filename=name))
+    edit(image_set, lambda e: e.update(filename=name), number=4)
+    with pytest.raises(CorruptFile, match="entries 3 and 4 name the same image") as caught:
+        read_splits(image_set)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < len(str(image_set)) + 350
+
+
+def test_digests_tell_sets_apart(image_set):
+    digests = {read_image_set(image_set, "train").digest()}
+    assert read_image_set(image_set, "train").digest() in digests
+    for number, change in enumerate(
+        (
+            lambda e: e.update(light_pos=[0, 0, 1]),
+            lambda e: e["RT"][0].__setitem__(3, e["RT"][0][3] + 1e-3),
+            lambda e: e["K"][0].__setitem__(2, 15.0),
+        )
+    ):
+        edit(image_set, change)
+        digests.add(read_image_set(image_set, "train").digest())
+        assert len(digests) == number + 2
+    bgra = pixels(image_set / "train" / "r_3.png")
+    bgra[16, 16, 0] ^= 1
+    cv2.imwrite(str(image_set / "train" / "r_3.png"), bgra)
+    digests.add(read_image_set(image_set, "train").digest())
+    assert len(digests) == 5
 
 
 def test_entries_that_are_no_objects_are_told(image_set):
@@ -167,6 +212,15 @@ def test_huge_images_are_refused_from_their_header(image_set):
     path = image_set / "test" / "r_1.png"
     cv2.imwrite(str(path), np.zeros((2000, 2000, 4), np.uint8))
     with pytest.raises(CorruptFile, match=r"r_1.png.*2000 x 2000 px; sides from 16 to 1024"):
+        read_splits(image_set)
+
+
+@pytest.mark.parametrize("side", [10_000, 60_000])
+def test_images_that_would_fill_the_memory_are_refused_by_their_size(image_set, side):
+    path = image_set / "test" / "r_1.png"
+    data = path.read_bytes()
+    path.write_bytes(data[:16] + struct.pack(">II", side, side) + data[24:])
+    with pytest.raises(CorruptFile, match=rf"r_1.png.*{side} x {side} px; sides from 16 to 1024"):
         read_splits(image_set)
 
 
