@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from osfcore.errors import CannotWrite, CorruptFile
+from osfcore.errors import CannotWrite, CorruptFile, shown
 from osfcore.fields.kiloosf import EMPTY_G, FEATURES, MOST_HIDDEN, KiloOSF, network_size
 
 FORMAT = "kiloosf-1"
@@ -24,6 +24,8 @@ _MAX_CORNERS = 20_000_000
 _LEVELS = 255
 _LARGEST = 1e9  # number in a file, in whatever unit of length
 _VECTORS = {"origin": 3, "ambient": 3, "low": FEATURES, "span": FEATURES}
+_KINDS = {"origin": "f", "voxel": "f", "shape": "iu", "shell": "u", "levels": "u", "low": "f", "span": "f",
+          "cells": "iu", "networks": "f", "ambient": "f"}  # fmt: skip
 
 
 def write_field(path: Path, field: KiloOSF) -> None:
@@ -64,22 +66,40 @@ def read_field(path: Path) -> KiloOSF:
     Raises:
         CorruptFile: if the file is missing, cut short, of another version or not a field.
     """
-    meta, tensors = read_tensors(path, FORMAT)
+    return field_from_bytes(_read(path), path)
+
+
+def field_from_bytes(data: bytes, where: Path | str) -> KiloOSF:
+    """A field from the contents of a file.
+
+    Args:
+        data: as `field_bytes` makes them.
+        where: what messages name.
+
+    Raises:
+        CorruptFile: if they are cut short, of another version or not a field.
+    """
+    meta, tensors = _expected(*_parsed(data, where), FORMAT, where)
     try:
         return _field(int(meta["hidden"]), tensors)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise CorruptFile(path, f"it is not a sound field ({error})") from error
+    except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
+        raise CorruptFile(where, f"it is not a sound field ({shown(error)})") from error
 
 
 def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
+    for name, kinds in _KINDS.items():
+        tensor = tensors[name]
+        if tensor.dtype.kind not in kinds or (kinds == "u" and tensor.dtype != np.uint8):
+            raise ValueError(f"{name} holds {tensor.dtype}")
+        if kinds == "f" and not np.all(np.isfinite(tensor)):
+            raise ValueError(f"{name} has values that are not finite")
     shape = tuple(int(n) for n in tensors["shape"])
     if len(shape) != 3 or min(shape) < 2 or np.prod(shape) > _MAX_CORNERS:
         raise ValueError(f"shape {shape}")
-    for name, tensor in tensors.items():
-        if tensor.dtype.kind == "f" and not np.all(np.isfinite(tensor)):
-            raise ValueError(f"{name} has values that are not finite")
     shell = np.unpackbits(tensors["shell"], count=int(np.prod(shape))).astype(bool).reshape(shape)
     levels = tensors["levels"]
+    if not shell.any():
+        raise ValueError("it has no corners, so it shows nothing")
     if levels.shape != (shell.sum(), FEATURES):
         raise ValueError(f"levels {levels.shape} for {shell.sum()} corners")
     for axis in range(3):
@@ -100,13 +120,15 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
     if not 1 / _LARGEST < voxel < _LARGEST:
         raise ValueError(f"a voxel of {voxel:g}")
     origin, ambient = vectors["origin"], vectors["ambient"]
+    if ambient.min() < 0 or vectors["span"].min() < 0:
+        raise ValueError("ambient or span is negative")
     return KiloOSF(origin, voxel, index, rows.astype(np.float32), cells, networks, hidden, ambient)
 
 
 def _vector(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float32[np.ndarray, "size"]:
     vector = tensors[name].astype(np.float32)
     if vector.shape != (size,) or np.abs(vector).max() > _LARGEST:
-        raise ValueError(f"{name} {vector}")
+        raise ValueError(f"{name} of shape {vector.shape} and numbers up to {np.abs(vector).max(initial=0):g}")
     return vector
 
 
@@ -116,10 +138,15 @@ def read_tensors(path: Path, expected: str) -> tuple[Mapping[str, str], Mapping[
     Raises:
         CorruptFile: if the file is missing, cut short or of another format or version.
     """
-    meta, tensors = _load(path)
+    return _expected(*_parsed(_read(path), path), expected, path)
+
+
+def _expected(
+    meta: Mapping[str, str], tensors: Mapping[str, np.ndarray], expected: str, where: Path | str
+) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
     found = meta.get("format", "no format at all")
     if found != expected:
-        raise CorruptFile(path, f"its format is {found}; this version reads {expected}: train it again")
+        raise CorruptFile(where, f"its format is {shown(found)}; this version reads {expected}: train it again")
     return meta, tensors
 
 
@@ -129,22 +156,25 @@ def tensor_format(path: Path) -> str | None:
     Raises:
         CorruptFile: if the file is missing or cut short.
     """
-    return _load(path)[0].get("format")
+    return _parsed(_read(path), path)[0].get("format")
 
 
-def _load(path: Path) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
+def _read(path: Path) -> bytes:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise CorruptFile(path, f"it is larger than {MAX_FILE_BYTES // 1_000_000} MB")
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise CorruptFile(path, "it cannot be read") from error
+
+
+def _parsed(data: bytes, where: Path | str) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
     try:
         tensors = load(data)
         (length,) = struct.unpack("<Q", data[:8])
-        meta = json.loads(data[8 : 8 + length]).get("__metadata__", {})
-    except (SafetensorError, ValueError, struct.error, KeyError) as error:
-        raise CorruptFile(path, "it is not a whole safetensors file") from error
+        meta = json.loads(data[8 : 8 + length]).get("__metadata__") or {}  # null is allowed
+    except (SafetensorError, ValueError, TypeError, AttributeError, struct.error, KeyError, RecursionError) as error:
+        raise CorruptFile(where, "it is not a whole safetensors file") from error
     return meta, tensors
 
 

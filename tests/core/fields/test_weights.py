@@ -14,6 +14,7 @@ from osfcore.fields.weights import (
     FORMAT,
     MAX_FILE_BYTES,
     field_bytes,
+    field_from_bytes,
     read_field,
     read_tensors,
     write_atomically,
@@ -83,11 +84,63 @@ def test_rows_in_any_order_are_stored_in_that_of_the_grid(tmp_path, field):
         np.testing.assert_array_equal(ours[name], tensor)
 
 
-def test_an_empty_shell_can_be_stored(tmp_path):
+def test_an_empty_shell_is_refused(tmp_path):
     field = ball()
     nothing = replace(field, index=np.zeros_like(field.index), rows=field.rows[:1])
-    write_field(tmp_path / "a.safetensors", nothing)
-    assert not read_field(tmp_path / "a.safetensors").index.any()
+    refused(tmp_path / "a.safetensors", field_bytes(nothing), "it has no corners, so it shows nothing")
+
+
+def test_bytes_are_judged_as_a_file_is(field):
+    np.testing.assert_array_equal(field_from_bytes(field_bytes(field), "it").index, field.index)
+    with pytest.raises(CorruptFile, match="The trained field cannot be used: it is not a whole safetensors file"):
+        field_from_bytes(field_bytes(field)[:-1], "The trained field")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("levels", np.float32),
+        ("levels", np.int8),
+        ("levels", np.uint16),
+        ("cells", np.float32),
+        ("shape", np.float64),
+        ("shell", np.int8),
+        ("origin", np.int32),
+        ("voxel", np.int32),
+        ("networks", np.int16),
+        ("ambient", np.uint8),
+    ],
+)
+def test_tensors_of_another_kind_are_refused(tmp_path, field, name, kind):
+    other = load(field_bytes(field))[name].astype(kind)
+    refused(tmp_path / "a.safetensors", repacked(field, **{name: other}), f"not a sound field .{name} holds")
+
+
+def test_grids_without_end_are_refused(tmp_path, field):
+    refused(tmp_path / "a.safetensors", repacked(field, shape=np.array([np.inf, 5, 5])), "not a sound field .shape")
+
+
+@pytest.mark.parametrize("name", ["ambient", "span"])
+def test_negative_light_is_refused(tmp_path, field, name):
+    tensor = load(field_bytes(field))[name].copy()
+    tensor[1] = -0.1
+    refused(tmp_path / "a.safetensors", repacked(field, **{name: tensor}), "negative")
+
+
+@pytest.mark.parametrize("meta", ["null", "{}"])
+def test_files_without_metadata_are_told(tmp_path, meta):
+    header = f'{{"__metadata__":{meta},"a":{{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}}}'.encode()
+    data = struct.pack("<Q", len(header)) + header + bytes(4)
+    refused(tmp_path / "a.safetensors", data, "no format at all|not a whole safetensors file")
+
+
+def test_odd_formats_are_told_in_one_short_line(tmp_path, field):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(repacked(field, meta={"format": "a\nb" * 5000}))
+    with pytest.raises(CorruptFile, match="its format is") as caught:
+        read_field(path)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < len(str(path)) + 300
 
 
 def test_a_file_cut_short_anywhere_is_refused(tmp_path, field):
