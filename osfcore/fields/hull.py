@@ -23,6 +23,8 @@ from osfcore.scene import Camera
 
 MIN_COVER = 0.85  # of a silhouette, by what all views share
 MAX_WRONG_SHARE = 0.1  # more contradicting views than that: not single images are wrong but the convention
+MIN_SIDE, MAX_COORDINATE = 1e-6, 1e8  # of an object, in the set's unit: what a field's file and its rays can hold
+MAX_OFFSET = 1e4  # coordinates in sizes of the object: beyond it single precision blurs the voxels
 _AGREEING = 0.95  # share of views that must see a cell, so that single wrong images do not carve everything away
 _EXACT_COVER = 0.99
 _VOTERS = 256
@@ -56,7 +58,8 @@ def silhouette_box(*sets: ImageSet, where: Path | str = "The image set") -> Floa
         where: the set's folder, for messages.
 
     Raises:
-        CorruptFile: if the views enclose nothing, or silhouettes contradict each other; single culprits are named.
+        CorruptFile: if the views enclose nothing, silhouettes contradict each other (single culprits are named), or a
+            field could not hold an object of that size at that place.
     """
     hull = carve(*sets)
     if not hull.is_bounded:
@@ -71,7 +74,20 @@ def silhouette_box(*sets: ImageSet, where: Path | str = "The image set") -> Floa
         names = ", ".join(cameras[i].name for i in wrong[:5]) + (", ..." if len(wrong) > 5 else "")
         expected = "check their RT, K and masks"
         raise CorruptFile(where, f"the silhouettes of {names} contradict those of all other images: {expected}")
+    _refuse_scale(hull.box, where)
     return hull.box
+
+
+def _refuse_scale(box: Float[np.ndarray, "2 3"], where: Path | str) -> None:
+    side, farthest = float(np.ptp(box, axis=0).max()), float(np.abs(box).max())
+    if not (side >= MIN_SIDE and farthest <= MAX_COORDINATE and farthest <= MAX_OFFSET * side):
+        expected = (
+            f"a size from {MIN_SIDE:g}, coordinates up to {MAX_COORDINATE:g} and up to {MAX_OFFSET:g} times the size"
+        )
+        raise CorruptFile(
+            where,
+            f"its object is {side:.3g} large and lies at coordinates up to {farthest:.3g}; {expected} can be held",
+        )
 
 
 def carve(*sets: ImageSet, resolution: int = 32) -> Hull:

@@ -68,6 +68,12 @@ def test_a_wrong_camera_in_the_test_split_is_found_too(tmp_path):
         check_path(folder)
 
 
+def test_a_set_of_a_scale_that_no_field_can_hold_is_told(image_set):
+    turn_cameras(image_set, lambda RT: RT * [[1, 1, 1, 1e-8]])
+    with pytest.raises(CorruptFile, match="ellipsoid cannot be used: its object is 1.*e-08 large"):
+        check_path(image_set)
+
+
 def test_broken_and_leaking_sets_are_told(image_set, tmp_path):
     shutil.copyfile(image_set / "train" / "r_2.png", image_set / "test" / "r_1.png")
     with pytest.raises(CorruptFile, match="1 of 4 test images are also training images"):

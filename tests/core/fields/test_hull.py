@@ -123,3 +123,15 @@ def test_contradicting_views_still_give_a_box_to_draw(image_set):
     assert np.all(np.isfinite(hull.box))
     assert np.all(hull.box[1] > hull.box[0])
     assert hull.cover.min() < 0.5
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1e-8, 0), (1e9, 0), (1, 1e6)])
+def test_an_object_that_no_file_can_hold_is_told(many, scale, shift):
+    cameras = []
+    for camera in many.cameras:
+        pose = camera.T_world_camera
+        moved = Pose(scale * (pose.position + [shift, 0, 0]), pose.quaternion)
+        cameras.append(dataclasses.replace(camera, T_world_camera=moved))
+    images = ImageSet(tuple(cameras), many.light_directions, many.rgba)
+    with pytest.raises(CorruptFile, match="object is .* large and lies at coordinates up to .*; a size from 1e-06"):
+        silhouette_box(images)
