@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from safetensors.numpy import save
 
-from osfcore.errors import CorruptFile
-from osfcore.fields.weights import read_tensors, write_atomically
+from osfcore.errors import CorruptFile, shown
+from osfcore.fields.weights import Tensors, read_tensors, tensors_from_bytes, write_atomically
 
 TABLE_FORMAT = "table-1"
 _ARRAYS = ("albedo", "ambient", "background", "w1", "b1", "w2", "b2")
@@ -55,10 +55,15 @@ def write_table(path: Path, table: TableField) -> int:
     Raises:
         CannotWrite: if the disk refuses.
     """
-    tensors = {name: getattr(table, name) for name in _ARRAYS}
-    data = save({**tensors, "half_side": np.array([table.half_side])}, metadata={"format": TABLE_FORMAT})
+    data = table_bytes(table)
     write_atomically(path, data)
     return len(data)
+
+
+def table_bytes(table: TableField) -> bytes:
+    """A table as the contents of a file."""
+    tensors = {name: getattr(table, name) for name in _ARRAYS}
+    return save({**tensors, "half_side": np.array([table.half_side])}, metadata={"format": TABLE_FORMAT})
 
 
 def read_table(path: Path) -> TableField:
@@ -67,13 +72,30 @@ def read_table(path: Path) -> TableField:
     Raises:
         CorruptFile: if the file is missing, cut short, of another version or not a table.
     """
-    _, tensors = read_tensors(path, TABLE_FORMAT)
+    return _table(read_tensors(path, TABLE_FORMAT), path)
+
+
+def table_from_bytes(data: bytes, where: Path | str) -> TableField:
+    """A table from the contents of a file.
+
+    Args:
+        data: as `table_bytes` makes them.
+        where: what messages name.
+
+    Raises:
+        CorruptFile: if they are cut short, of another version or not a table.
+    """
+    return _table(tensors_from_bytes(data, TABLE_FORMAT, where), where)
+
+
+def _table(content: Tensors, path: Path | str) -> TableField:
+    _, tensors = content
     try:
         arrays = {name: tensors[name].astype(np.float32) for name in _ARRAYS}
         half_side = float(tensors["half_side"].reshape(-1)[0])
         hidden, side = arrays["b1"].size, len(arrays["albedo"])
     except (KeyError, IndexError, TypeError) as error:
-        raise CorruptFile(path, f"it is not a sound table ({error})") from error
+        raise CorruptFile(path, f"it is not a sound table ({shown(error)})") from error
     shapes = {"ambient": (3,), "background": (3,), "w1": (3, hidden), "b1": (hidden,), "w2": (hidden, 3), "b2": (3,)}
     shapes["albedo"] = (max(side, 2), max(side, 2), 3)
     for name, shape in shapes.items():

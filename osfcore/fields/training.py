@@ -28,16 +28,19 @@ from osfcore.fields.image_set import ImageSet, read_splits
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.optimise import Rates, Stage
 from osfcore.fields.osf import OSFSize
+from osfcore.fields.outputs import check_weights_place
 from osfcore.fields.rays import RaySource
 from osfcore.fields.shell import first_shell, refine, trim
 from osfcore.fields.teacher import Teacher, TeacherHoldout, TeacherRecipe
-from osfcore.fields.weights import field_bytes, read_field, write_atomically, write_json
+from osfcore.fields.weights import field_bytes, field_from_bytes, write_atomically, write_json
 from osfcore.progress import Progress
+from osfcore.scene import check_seed
 
 _REPORT_S = 1.0
 _AIMED_BYTES = 2_000_000
 _NEEDED_WEIGHTS = (0.02, 0.05, 0.1, 0.2)  # of samples that a view must show, tried until the file is small enough
 _COARSE_RATES, _FINE_RATES = Rates(2e-2, 1e-2), Rates(2e-2, 1e-3)
+_OWN_METRICS = ("psnr_full", "psnr_mask")  # by which a file of metrics is known
 _CHECKPOINT_S = 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MIN_LOOK_S = 5.0
@@ -130,9 +133,10 @@ def train_field(config: TrainField, recipe: Recipe | None = None) -> Iterator[Fi
     """Train a field from an image set and write it.
 
     Raises:
-        InvalidInput: if the settings are out of range, or cuda is asked for and not there.
-        CorruptFile: if the image set is not sound.
-        CannotWrite: if the disk refuses.
+        InvalidInput: if the settings are out of range, cuda is asked for and not there, or a file of somebody else lies
+            where the metrics belong.
+        CorruptFile: if the image set is not sound, or nothing of the object could be learned.
+        CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
     _check(config)
@@ -151,12 +155,10 @@ def _check(config: TrainField) -> None:
     if config.recipe not in ("direct", "distil"):
         raise InvalidInput("recipe", config.recipe, "direct or distil")
     OSFSize(config.teacher_depth, config.teacher_width)  # refuses what cannot be built
-    if config.seed < 0:
-        raise InvalidInput("seed", config.seed, "0 or more")
+    check_seed(config.seed)
     if config.iterations is not None and not 10 <= config.iterations <= 10_000_000:
         raise InvalidInput("iterations", config.iterations, "between 10 and 10,000,000")
-    if config.out.suffix != ".safetensors":
-        raise InvalidInput("output file", config.out, "a path that ends in .safetensors")
+    check_weights_place(config.out, _OWN_METRICS)
 
 
 def _total(config: TrainField) -> int:
@@ -173,6 +175,7 @@ class _Run:
         self._images, self._source = train, RaySource(train)
         self._pixels = self._source.silhouette_pixels()
         self._test, self._holdout = test, Holdout(test)
+        self._digests = [train.digest(), test.digest()]
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator(device).manual_seed(config.seed)
         self._done_s, self._done_steps = 0.0, 0
@@ -277,11 +280,10 @@ class _Run:
         return FieldStep(Progress(round(share * total), total, words), full, mask, None)
 
     def _finish(self, field: KiloOSF) -> FieldStep:
-        """Write the file, read it back, and measure what was read: that is what users get."""
+        """Measure what users will read from the file, and write it once it is known to be sound."""
         out = self._config.out
         data = self._trimmed(field)
-        write_atomically(out, data)
-        look = self._holdout.everything(read_field(out))
+        look = self._holdout.everything(field_from_bytes(data, "The trained field"))
         metrics = {
             "psnr_full": round(look.psnr_full, 3),
             "psnr_mask": round(look.psnr_mask, 3),
@@ -300,6 +302,7 @@ class _Run:
         }
         if self._config.recipe == "distil":
             metrics["teacher"] = asdict(self._teacher_recipe())
+        write_atomically(out, data)
         write_json(out.with_suffix(".json"), metrics)
         self._checkpoint_path.unlink(missing_ok=True)
         self._psnr = look.psnr_full, look.psnr_mask
@@ -323,7 +326,7 @@ class _Run:
     def _fingerprint(self) -> dict[str, Any]:
         """What a checkpoint must agree with to be gone on from."""
         settings = {**asdict(self._config), "data": str(self._config.data.resolve()), "out": str(self._config.out)}
-        return {"settings": settings, "recipe": asdict(self._recipe), "images": len(self._images.cameras)}
+        return {"settings": settings, "recipe": asdict(self._recipe), "images": self._digests}
 
     def _save(self, name: str, stage: _Learner) -> None:
         clock = {"seconds": self._done_s, "steps": self._done_steps, "looked_at": self._looked_at, "psnr": self._psnr}

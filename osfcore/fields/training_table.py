@@ -13,14 +13,15 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
-from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.errors import CorruptFile
 from osfcore.fields.devices import pick_device
 from osfcore.fields.image_set import ImageSet, read_splits
+from osfcore.fields.outputs import check_weights_place
 from osfcore.fields.rays import RayBatch, RaySource
-from osfcore.fields.table import TableField, read_table, write_table
-from osfcore.fields.weights import write_json
+from osfcore.fields.table import TableField, table_bytes, table_from_bytes
+from osfcore.fields.weights import write_atomically, write_json
 from osfcore.progress import Progress
-from osfcore.scene import TABLE_SIDE_M
+from osfcore.scene import TABLE_SIDE_M, check_seed
 
 _ITERATIONS = 3000
 _RAYS = 8192
@@ -28,6 +29,7 @@ _HIDDEN = 16
 _GRID = 16
 _RATES = (2e-2, 2e-4)
 _REPORT_EVERY = 50
+_OWN_METRICS = ("psnr", "test_images")  # by which a file of metrics is known
 _EDGE_M = 0.02  # pixels that straddle the table's edge belong to nobody
 
 
@@ -77,13 +79,14 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
     """Train a table from an image set and write it.
 
     Raises:
-        InvalidInput: if cuda is asked for and not there, or the output file has another suffix.
+        InvalidInput: if the seed is out of range, cuda is asked for and not there, the output file has another suffix,
+            or a file of somebody else lies where the metrics belong.
         CorruptFile: if the image set is not sound or shows an object.
-        CannotWrite: if the disk refuses.
+        CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
-    if config.out.suffix != ".safetensors":
-        raise InvalidInput("output file", config.out, "a path that ends in .safetensors")
+    check_seed(config.seed)
+    check_weights_place(config.out, _OWN_METRICS)
     yield Progress(0, _ITERATIONS, "Reading the images")
     train, test = read_splits(config.data)
     if not train.is_opaque:
@@ -113,11 +116,13 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
 
 
 def _finish(config: TrainTable, model: _Model, train: ImageSet, test: ImageSet, device: torch.device) -> Progress:
-    size = write_table(config.out, model.to_field())
-    psnr = _measure(read_table(config.out), test)
+    data = table_bytes(model.to_field())
+    psnr = _measure(table_from_bytes(data, "The trained table"), test)
+    size = len(data)
     metrics = {"psnr": round(psnr, 3), "test_images": len(test.cameras), "train_images": len(train.cameras),
                "bytes": size, "iterations": _ITERATIONS, "seed": config.seed, "device": str(device),
                "data": config.data.name}  # fmt: skip
+    write_atomically(config.out, data)
     write_json(config.out.with_suffix(".json"), metrics)
     return Progress(_ITERATIONS, _ITERATIONS, f"{psnr:.2f} dB held out, {size / 1000:.0f} kB")
 

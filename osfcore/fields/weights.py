@@ -27,6 +27,8 @@ _VECTORS = {"origin": 3, "ambient": 3, "low": FEATURES, "span": FEATURES}
 _KINDS = {"origin": "f", "voxel": "f", "shape": "iu", "shell": "u", "levels": "u", "low": "f", "span": "f",
           "cells": "iu", "networks": "f", "ambient": "f"}  # fmt: skip
 
+Tensors = tuple[Mapping[str, str], Mapping[str, np.ndarray]]  # metadata, and what is in a file
+
 
 def write_field(path: Path, field: KiloOSF) -> None:
     """Write a field; the file appears only when it is whole.
@@ -79,7 +81,7 @@ def field_from_bytes(data: bytes, where: Path | str) -> KiloOSF:
     Raises:
         CorruptFile: if they are cut short, of another version or not a field.
     """
-    meta, tensors = _expected(*_parsed(data, where), FORMAT, where)
+    meta, tensors = tensors_from_bytes(data, FORMAT, where)
     try:
         return _field(int(meta["hidden"]), tensors)
     except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
@@ -132,18 +134,22 @@ def _vector(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float32[
     return vector
 
 
-def read_tensors(path: Path, expected: str) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
+def read_tensors(path: Path, expected: str) -> Tensors:
     """Metadata and tensors of a safetensors file of the expected format.
 
     Raises:
         CorruptFile: if the file is missing, cut short or of another format or version.
     """
-    return _expected(*_parsed(_read(path), path), expected, path)
+    return tensors_from_bytes(_read(path), expected, path)
 
 
-def _expected(
-    meta: Mapping[str, str], tensors: Mapping[str, np.ndarray], expected: str, where: Path | str
-) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
+def tensors_from_bytes(data: bytes, expected: str, where: Path | str) -> Tensors:
+    """The same from the contents of a file; `where` is what messages name.
+
+    Raises:
+        CorruptFile: if they are cut short or of another format or version.
+    """
+    meta, tensors = _parsed(data, where)
     found = meta.get("format", "no format at all")
     if found != expected:
         raise CorruptFile(where, f"its format is {shown(found)}; this version reads {expected}: train it again")
@@ -168,7 +174,7 @@ def _read(path: Path) -> bytes:
         raise CorruptFile(path, "it cannot be read") from error
 
 
-def _parsed(data: bytes, where: Path | str) -> tuple[Mapping[str, str], Mapping[str, np.ndarray]]:
+def _parsed(data: bytes, where: Path | str) -> Tensors:
     try:
         tensors = load(data)
         (length,) = struct.unpack("<Q", data[:8])

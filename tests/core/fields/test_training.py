@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -138,6 +139,41 @@ def test_a_checkpoint_of_other_settings_is_not_gone_on_from(block_set, tmp_path,
     assert steps[1].progress.note == "Carving the silhouettes"
 
 
+def test_a_checkpoint_of_other_images_in_the_same_place_is_not_gone_on_from(block_set, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "_CHECKPOINT_S", 0.0)
+    monkeypatch.setattr(training, "_REPORT_S", 0.0)
+    data = shutil.copytree(block_set, tmp_path / "set")
+    config = TrainField(data, tmp_path / "a.safetensors", iterations=40, device="cpu")
+
+    def begin():
+        for step in train_field(config, QUICK):
+            if step.progress.done >= 3:
+                return
+            if step.progress.note in ("Going on from a checkpoint", "Carving the silhouettes"):
+                yield step.progress.note
+
+    assert list(begin()) == ["Carving the silhouettes"]
+    assert list(begin()) == ["Going on from a checkpoint"]
+    anno = data / "train" / "anno.json"
+    entries = json.loads(anno.read_text())
+    entries[3]["light_pos"] = [0, 0, 1]
+    anno.write_text(json.dumps(entries))
+    assert list(begin()) == ["Carving the silhouettes"]
+    shutil.rmtree(data)
+    write_object_set(data, painted_ball(), seed=1)
+    assert list(begin()) == ["Carving the silhouettes"]
+
+
+def test_a_field_that_cannot_be_read_back_leaves_the_older_one(block_set, tmp_path, monkeypatch):
+    config = TrainField(block_set, tmp_path / "a.safetensors", iterations=10, device="cpu")
+    config.out.write_bytes(b"older")
+    monkeypatch.setattr(training, "field_bytes", lambda field: b"broken")
+    with pytest.raises(CorruptFile, match="The trained field cannot be used"):
+        run(config)
+    assert config.out.read_bytes() == b"older"
+    assert not config.out.with_suffix(".json").exists()
+
+
 def test_a_broken_checkpoint_is_passed_over(block_set, tmp_path):
     config = TrainField(block_set, tmp_path / "a.safetensors", iterations=10, device="cpu")
     config.out.with_suffix(".partial").write_bytes(b"PK\x03\x04 cut short")
@@ -151,7 +187,9 @@ def test_a_broken_checkpoint_is_passed_over(block_set, tmp_path):
         ({"minutes": 0.0}, "minutes is 0.0, but it must be between 0.05 and 1440"),
         ({"minutes": float("nan")}, "minutes is nan"),
         ({"minutes": 1e9}, "minutes"),
-        ({"seed": -1}, "seed is -1, but it must be 0 or more"),
+        ({"seed": -1}, "seed is -1, but it must be between 0 and"),
+        ({"seed": 2**63}, "seed is 9223372036854775808, but it must be between 0 and"),
+        ({"seed": 10**30}, "seed"),
         ({"iterations": 9}, "iterations is 9, but it must be between 10"),
         ({"iterations": 10**9}, "iterations"),
         ({"device": "tpu"}, "device is tpu, but it must be auto, cpu or cuda"),
@@ -167,6 +205,22 @@ def test_settings_out_of_range_are_told_before_anything_is_read(change, message,
 def test_an_output_of_another_kind_is_told(tmp_path):
     with pytest.raises(InvalidInput, match="output file is .*a.pt, but it must be a path that ends in .safetensors"):
         next(train_field(TrainField(tmp_path, tmp_path / "a.pt")))
+
+
+def test_places_are_tried_before_anything_is_read(tmp_path):
+    (tmp_path / "folder.safetensors").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "mine.json").write_text('{"people": ["Ada"]}')
+    for name, error, words in (
+        ("folder.safetensors", CannotWrite, "it is a folder"),
+        ("file/a.safetensors", CannotWrite, "Not a directory"),
+        (f"{'x' * 300}.safetensors", CannotWrite, "too long"),
+        ("mine.safetensors", InvalidInput, "mine.json beside it"),
+    ):
+        with pytest.raises(error, match=words):
+            next(train_field(TrainField(tmp_path / "nothing", tmp_path / name)))
+    assert (tmp_path / "mine.json").read_text() == '{"people": ["Ada"]}'
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_sets_that_are_not_there_or_show_no_object_are_told(tmp_path):

@@ -87,3 +87,27 @@ def test_a_place_that_cannot_be_written_is_told(table_set, tmp_path, monkeypatch
     (tmp_path / "file").write_text("")
     with pytest.raises(CannotWrite, match="file"):
         list(train_table(TrainTable(table_set, tmp_path / "file" / "a.safetensors", device="cpu")))
+
+
+def test_seeds_and_places_are_tried_before_anything_is_read(tmp_path):
+    (tmp_path / "folder.safetensors").mkdir()
+    (tmp_path / "mine.json").write_text('{"people": ["Ada"]}')
+    for config, error, words in (
+        (TrainTable(tmp_path, tmp_path / "a.safetensors", seed=-1), InvalidInput, "seed is -1"),
+        (TrainTable(tmp_path, tmp_path / "a.safetensors", seed=2**64), InvalidInput, "seed"),
+        (TrainTable(tmp_path, tmp_path / "folder.safetensors"), CannotWrite, "it is a folder"),
+        (TrainTable(tmp_path, tmp_path / "mine.safetensors"), InvalidInput, "mine.json beside it"),
+    ):
+        with pytest.raises(error, match=words):
+            next(train_table(config))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_table_that_cannot_be_read_back_leaves_the_older_one(table_set, tmp_path, monkeypatch):
+    monkeypatch.setattr(training_table, "_ITERATIONS", 2)
+    monkeypatch.setattr(training_table, "table_bytes", lambda table: b"broken")
+    out = tmp_path / "a.safetensors"
+    out.write_bytes(b"older")
+    with pytest.raises(CorruptFile, match="The trained table cannot be used"):
+        list(train_table(TrainTable(table_set, out, device="cpu")))
+    assert out.read_bytes() == b"older"
