@@ -6,6 +6,7 @@ job that was killed, so that the same order goes on from there. A finished field
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from osfcore.fields.library import FIELD_FILE, METRICS_FILE
 
 _ORDER = "order.json"
 _TEMPORARY_PREFIX = ".writing-"
+_ASIDE_PREFIX = ".replaced-"  # its folder holds an older field under its name, until the new one is in place
 
 
 def workshop(data_dir: Path, name: str) -> Path:
@@ -86,11 +88,38 @@ def uninstall(place: Path) -> None:
         raise CannotWrite(place, error.strerror or str(error)) from error
 
 
+def sweep(fields: Path) -> None:
+    """Remove what a killed service left in DATA_DIR/fields; a field that was put aside and has no successor returns."""
+    for aside in fields.glob(f"{_ASIDE_PREFIX}*"):
+        for older in aside.glob("*"):
+            if not (fields / older.name).exists():
+                with contextlib.suppress(OSError):  # then it stays aside, and the next start tries again
+                    older.rename(fields / older.name)
+        if all((fields / older.name).exists() for older in aside.glob("*")):
+            shutil.rmtree(aside, ignore_errors=True)
+    for folder in fields.glob(f"{_TEMPORARY_PREFIX}*"):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def _swap(folder: Path, place: Path) -> None:
-    if place.exists():
-        uninstall(place)
-    folder.rename(place)
-    _sync(place.parent)
+    """Rename a folder to its place; the older one is put aside first, and returns if that fails."""
+    if not place.exists():
+        folder.rename(place)
+        _sync(place.parent)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=_ASIDE_PREFIX, dir=place.parent))
+    older = aside / place.name
+    try:
+        place.rename(older)
+        try:
+            folder.rename(place)
+        except OSError:
+            older.rename(place)
+            raise
+        _sync(place.parent)
+    finally:
+        if place.exists():  # else the older one is all there is, and the next start puts it back
+            shutil.rmtree(aside, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:
