@@ -341,9 +341,12 @@ class Jobs:
         self._set(ended(job, "failed", note="Failed", error=_with_advice(job, STOPPED_NOTE)))
 
     def _forget_work(self, job: Job) -> None:
-        """Remove what a failed job would leave for its next try."""
-        if job.kind == "train_field":
-            clear_workshop(self._data_dir, job.params["name"])
+        """Remove what a failed job would leave for its next try, unless another job works there."""
+        if job.kind != "train_field":
+            return
+        name = job.params["name"]
+        if not any(other.id != job.id and other.params["name"] == name for other in self.live("train_field")):
+            clear_workshop(self._data_dir, name)
 
 
 def _with_advice(job: Job, text: str) -> str:

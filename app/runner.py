@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from app.field_files import sweep
 from app.hub import Hub
 from app.image_cache import ImageCache
 from app.image_sets import ImageSets
@@ -89,6 +90,7 @@ class Runner:
             on_lost=self._on_stage_lost,
         )
         self._lock = threading.RLock()
+        self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
         self._records: dict[str, SceneRecord] = {}
         self._current: str | None = None
         self._watchers = 0
@@ -105,6 +107,7 @@ class Runner:
         if self._current is None and records:
             self._current = records[-1].id
         self.sets.start()
+        sweep(self._settings.data_dir / "fields")
         self._stage.start()
         self.jobs.start()
         self.ensure_demo_scene()
@@ -314,11 +317,12 @@ class Runner:
         Raises:
             OsfError: if it could not succeed, or too many wait.
         """
-        if kind == "train_field":
-            self._check_training(params)
         fetches = kind == "fetch_assets"
-        check_params(kind, params, self.library.info if fetches else self._check_object, len(self.library.names()))
-        return self.jobs.submit(kind, params)
+        with self._ordering:
+            if kind == "train_field":
+                self._check_training(params)
+            check_params(kind, params, self.library.info if fetches else self._check_object, len(self.library.names()))
+            return self.jobs.submit(kind, params)
 
     def remove_set(self, set_id: str) -> None:
         """Delete an uploaded image set.
@@ -327,11 +331,12 @@ class Runner:
             UnknownName: if there is none.
             SetInUse: if a job needs it.
         """
-        self.sets.get(set_id)
-        for job in self.jobs.live("train_field"):
-            if job.params["source"]["set"] == set_id:
-                raise SetInUse(set_id, job.id)
-        self.sets.remove(set_id)
+        with self._ordering:
+            self.sets.get(set_id)
+            for job in self.jobs.live("train_field"):
+                if job.params["source"]["set"] == set_id:
+                    raise SetInUse(set_id, job.id)
+            self.sets.remove(set_id)
 
     def ensure_demo_scene(self) -> None:
         """Make the first scene as soon as there are objects, in the background; does nothing if there is a scene."""

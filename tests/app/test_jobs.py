@@ -179,6 +179,19 @@ def test_a_training_that_was_killed_says_that_it_can_go_on_and_a_cancelled_one_l
     assert jobs.live("train_field") == ()
 
 
+def test_cancelling_a_waiting_twin_leaves_the_workshop_of_the_running_one(open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    source = {"mesh": "009_gelatin_box", "set": None}
+    params = {"name": "box", "source": source, "minutes": 10, "seed": 0, "images": 5000}
+    running = jobs.submit("train_field", params)
+    until(lambda: "Image" in jobs.get(running.id).note)
+    twin = jobs.submit("train_field", params)
+    assert jobs.cancel(twin.id).state == "cancelled"
+    assert workshop(data_dir, "box").is_dir()
+    jobs.cancel(running.id)
+    assert not workshop(data_dir, "box").exists()
+
+
 def test_progress_that_comes_too_soon_is_told_when_nothing_follows(open_jobs):
     jobs, events = open_jobs()
     job = jobs.submit(*LONG)

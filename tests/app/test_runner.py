@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from app.job import JobChanged
+from app.job import JobChanged, TrainingAlready
 from app.messages import CurrentScene, Notice, SceneChanged, TakeImage
 from app.runner import Runner, SceneHeld, TooManyScenes
 from app.settings import Settings
@@ -193,3 +193,30 @@ def test_jobs_are_told_to_those_who_listen(open_runner):
     job = runner.submit_job(*TABLE)
     until(lambda: runner.jobs.get(job.id).state == "done", 60)
     until(lambda: any(isinstance(e, JobChanged) and e.job.state == "done" for e in runner.events))
+
+
+def test_one_field_is_ordered_once_however_many_ask_at_once(open_runner, monkeypatch):
+    runner = open_runner(demo_scene=False)
+    params = {"name": "box", "source": {"mesh": BOX, "set": None}, "minutes": 10, "seed": 0, "images": 5000}
+    submit = runner.jobs.submit
+    monkeypatch.setattr(runner.jobs, "submit", lambda *order: (time.sleep(0.05), submit(*order))[1])
+
+    def order(_):
+        try:
+            return runner.submit_job("train_field", dict(params))
+        except TrainingAlready:
+            return None
+
+    with ThreadPoolExecutor(6) as executor:
+        made = [job for job in executor.map(order, range(6)) if job is not None]
+    assert len(made) == len(runner.jobs.live("train_field")) == 1
+    runner.jobs.cancel(made[0].id)
+
+
+def test_a_field_that_was_put_aside_by_a_killed_service_is_back_after_the_next_start(open_runner, data_dir):
+    aside = data_dir / "fields" / ".replaced-x" / "mug"
+    aside.mkdir(parents=True)
+    (aside / "field.safetensors").write_bytes(b"weights")
+    open_runner(demo_scene=False)
+    assert (data_dir / "fields" / "mug" / "field.safetensors").read_bytes() == b"weights"
+    assert not aside.parent.exists()
