@@ -97,6 +97,7 @@ class ImageSets:
         self._root = root
         self._max_sets = max_sets
         self._one_at_a_time = asyncio.Lock()  # decoding takes much memory
+        self._keeping = threading.Lock()
         self._worker: SpawnProcess | None = None
         self._worker_lock = threading.Lock()
         self._is_stopped = False
@@ -164,8 +165,7 @@ class ImageSets:
             SetRefused: if it is no sound set of an object; nothing is kept.
             CannotStore: if the disk is full.
         """
-        if len(await run_in_threadpool(self.all)) >= self._max_sets:
-            raise TooManySets(self._max_sets)
+        await run_in_threadpool(self._check_room)
         set_id = uuid.uuid4().hex[:12]
         folder = self._root / f"{_TEMPORARY_PREFIX}{set_id}"
         try:
@@ -213,10 +213,16 @@ class ImageSets:
             raise SetRefused(outcome.kind, outcome.text)
         return outcome
 
+    def _check_room(self) -> None:
+        if len(self.all()) >= self._max_sets:
+            raise TooManySets(self._max_sets)
+
     def _keep(self, folder: Path, record: SetRecord) -> None:
         try:
             (folder / _FACTS).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
-            folder.rename(self._root / record.id)
+            with self._keeping:  # others may have come in since the upload began
+                self._check_room()
+                folder.rename(self._root / record.id)
         except OSError as error:
             raise CannotStore(self._root, error.strerror or str(error)) from error
 
@@ -273,6 +279,11 @@ def _plain(text: str, folder: Path) -> str:
 
 def _read(path: Path) -> SetRecord:
     try:
-        return SetRecord(**json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+        record = SetRecord(**json.loads(path.read_text(encoding="utf-8")))
+        "".join((record.id, record.file_name, record.created_at, record.summary)).encode()  # text, and whole characters
+        counts = (record.train, record.test)
+        if record.id != path.parent.name or not all(type(n) is int and 0 <= n < 1 << 31 for n in counts):
+            raise ValueError("of another place or kind")
+    except (ValueError, TypeError, RecursionError) as error:
         raise CorruptFile(path, "it does not describe an image set") from error
+    return record

@@ -1,4 +1,6 @@
 import asyncio
+import dataclasses
+import json
 import shutil
 import threading
 import time
@@ -117,6 +119,53 @@ def test_there_is_an_end_to_what_is_kept(sets, archive):
     receive(sets, archive)
     with pytest.raises(TooManySets, match="2 image sets"):
         receive(sets, archive)
+
+
+def test_uploads_at_the_same_time_do_not_overrun_the_limit(sets, archive, tmp_path, monkeypatch):
+    def look(folder):
+        (folder / "set.zip").unlink()
+        return app.image_sets.Examined(1, 1, "a set")
+
+    monkeypatch.setattr(sets, "_examine", look)
+
+    async def chunks():
+        yield archive
+        await asyncio.sleep(0.2)  # all have begun before the first is kept
+
+    async def together():
+        uploads = [sets.receive(chunks(), f"{i}.zip") for i in range(5)]
+        return await asyncio.gather(*uploads, return_exceptions=True)
+
+    outcomes = asyncio.run(together())
+    assert sum(isinstance(outcome, TooManySets) for outcome in outcomes) == 3
+    assert len(sets.all()) == len(list((tmp_path / "sets").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"train": "many"},
+        {"train": True},
+        {"test": -1},
+        {"test": 10**30},
+        {"created_at": 5},
+        {"summary": None},
+        {"summary": "\ud800"},
+        {"file_name": ["a"]},
+        {"id": "other"},
+        {"id": ["a"]},
+        {"further": 1},
+    ],
+)
+def test_a_set_whose_facts_are_damaged_does_not_hide_the_others(sets, archive, tmp_path, change):
+    record = receive(sets, archive, "")
+    for name, facts in (("odd", {**dataclasses.asdict(record), "id": "odd", **change}), ("deep", None)):
+        folder = tmp_path / "sets" / name
+        folder.mkdir()
+        (folder / "set.json").write_text('{"a":' * 100_000 if facts is None else json.dumps(facts))
+    assert sets.all() == (record,)
+    with pytest.raises(UnknownName):
+        sets.get("odd")
 
 
 def test_an_upload_that_breaks_off_leaves_nothing(sets, archive, tmp_path):
