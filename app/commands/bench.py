@@ -11,6 +11,8 @@ import tyro
 from app.commands.progress_bar import follow
 from app.paths import default_data_dir
 
+_FIGURES, _PICTURE = "render.json", "render.png"
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -36,18 +38,21 @@ class Bench:
         from osfcore.evaluate.bench_render import BenchRender, bench_render
         from osfcore.evaluate.images import contact_sheet, write_png
         from osfcore.fields.library import FieldLibrary
+        from osfcore.fields.outputs import check_place
         from osfcore.fields.weights import write_json
         from osfcore.objects.library import AssetLibrary
 
         config = BenchRender(scenes=self.scenes, repeats=self.repeats, seed=self.seed)
+        for path in (self.out / _FIGURES, self.out / _PICTURE) if self.out is not None else ():
+            check_place(path)
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         last = follow(bench_render(config, fields, assets))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
         result = last.report.to_json()
         if self.out is not None:
-            write_json(self.out / "render.json", result)
-            write_png(self.out / "render.png", contact_sheet(last.report.shown, truth="Tiny"))
+            write_json(self.out / _FIGURES, result)
+            write_png(self.out / _PICTURE, contact_sheet(last.report.shown, truth="Tiny"))
         if not self.json:
             _show(result)
         return result

@@ -31,6 +31,7 @@ from osfcore.scene import (
     Camera,
     Light,
     SceneState,
+    check_seed,
     default_cameras,
     goal_camera,
 )
@@ -163,8 +164,10 @@ def bench_render(config: BenchRender, fields: FieldLibrary, assets: AssetLibrary
         InvalidInput: if a number is out of range, or there is no field.
         MissingAssets: if no object has both a field and a mesh.
     """
-    if min(config.scenes, config.repeats) < 1:
-        raise InvalidInput("number of repeats", min(config.scenes, config.repeats), "1 or more")
+    for what, value in (("new scenes", config.scenes), ("repeats", config.repeats)):
+        if value < 1:
+            raise InvalidInput(f"number of {what}", value, "1 or more")
+    check_seed(config.seed)
     parts = ("new scenes", "planning", "the reference", "numbers of objects", "resolutions", "batches")
 
     def step(number: int) -> BenchStep:

@@ -43,6 +43,26 @@ def test_mistakes_are_one_sentence(fields_dir, tmp_path, capsys):
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("osf: ")
 
 
+def test_places_and_seeds_are_tried_first(fields_dir, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(bench, "_Stage", None)  # nothing may be measured
+    (tmp_path / "file").write_text("")
+    (tmp_path / "out" / "render.png").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    for arguments, words in (
+        (["--out", str(tmp_path / "file")], "Not a directory"),
+        (["--out", str(tmp_path / "out")], "it is a folder"),
+        (["--out", str(tmp_path / ("x" * 300))], "too long"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--seed", str(2**64)], "seed is"),
+        (["--scenes", "0"], "number of new scenes is 0"),
+    ):
+        assert main(["bench", "render", "--data-dir", str(fields_dir), *arguments]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("osf: ")
+        assert words in line
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_the_command_explains_itself(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["bench", "--help"])

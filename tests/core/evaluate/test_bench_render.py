@@ -82,7 +82,13 @@ def test_every_planning_image_has_moved_an_object(library):
 
 
 def test_what_cannot_be_measured_is_told(solids, library, tmp_path):
-    with pytest.raises(InvalidInput, match="repeats"):
-        next(bench_render(BenchRender(repeats=0), solids, library))
+    for config, words in (
+        (BenchRender(repeats=0), "number of repeats is 0"),
+        (BenchRender(scenes=0), "number of new scenes is 0"),
+        (BenchRender(seed=-1), "seed is -1, but it must be between 0"),
+        (BenchRender(seed=2**63), "seed"),
+    ):
+        with pytest.raises(InvalidInput, match=words):
+            next(bench_render(config, solids, library))
     with pytest.raises(MissingAssets, match=SOLIDS[0]):
         list(bench_render(TINY, solids, AssetLibrary(tmp_path)))
