@@ -44,6 +44,7 @@ FORMAT = 1  # of the kept results; rises when figures come to mean something els
 SET_SEED = 760_000  # image sets with this seed and the next ones are for evaluation: never train on them
 MAX_TASKS = 10_000
 MAX_SEED = 1_000_000
+_DIGEST_CHARACTERS = 12  # of an object's digest in the name of its set
 _SHOWN = 8  # images of an object on its sheet
 _ResultT = TypeVar("_ResultT")
 _Notes = Generator[str, None, _ResultT]  # work that tells what it is doing, and returns its result
@@ -55,7 +56,7 @@ class EvaluateFields:
 
     Attributes:
         out: folder for results; those of an earlier run of the same fields are taken over.
-        names: which objects, or None for all that have a field and a mesh.
+        names: which objects, at least one, or None for all that have a field and a mesh.
         tasks: number of scenes, each with its own objects, arrangement and harsh light.
         objects: in each scene.
         seed: of views, lights and scenes.
@@ -228,6 +229,8 @@ def _checked(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary)
     image_side(config.size)
     if config.names is None:
         return measurable(fields, assets)
+    if not config.names:
+        raise InvalidInput("number of names", 0, "1 or more, or --names left out for all")
     for name in config.names:
         fields.info(name)  # raises UnknownName
         if not assets.has(name):
@@ -240,10 +243,12 @@ def _object_alone(config: EvaluateFields, name: str, fields: FieldLibrary, asset
     """One object on a fresh set of images."""
     cache = TaskCache(config.out / "objects")
     weights = fields.info(name).path
-    data = config.out / "sets" / f"{name}-{config.size}px-{config.seed}"
+    asset = assets.digest(name)
+    data = config.out / "sets" / f"{name}-{asset[:_DIGEST_CHARACTERS]}-{config.size}px-{config.seed}"
     circumstances = {
         "format": FORMAT,
         "weights": _sha256(weights),
+        "asset": asset,
         "set": data.name,
         "quality": asdict(VIEW_QUALITY),
     }
@@ -262,6 +267,8 @@ def _object_alone(config: EvaluateFields, name: str, fields: FieldLibrary, asset
 def _measured(name: str, weights: Path, data: Path) -> _Notes[TaskResult]:
     """A field on the test images of a set."""
     field, images = read_field(weights), read_image_set(data, "test")
+    if images.is_opaque:
+        raise CorruptFile(data, "its images are opaque all over; an object before a transparent background is expected")
     count = len(images.cameras)
     views = []
     for view in compare_views(field, images):
@@ -290,6 +297,7 @@ class _Scenes:
         circumstances = {
             "format": FORMAT,
             "weights": {name: self._hash(name) for name in draw.names},
+            "assets": {name: self._assets.digest(name) for name in draw.names},
             "table": _table_sha256(table),
             "arrangement": draw.seed,
             "light": draw.light.direction.tolist(),
@@ -332,7 +340,14 @@ def _field_figures(result: TaskResult, weights: Path) -> FieldFigures:
     """Figures with size and training time, which are read anew each time."""
     try:
         minutes = float(json.loads(weights.with_suffix(".json").read_text())["minutes"])
-    except (OSError, ValueError, KeyError, TypeError):  # weights may come without metrics
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        OverflowError,
+        RecursionError,
+    ):  # weights may come without metrics
         minutes = None
     return FieldFigures(**result.figures, file_mb=weights.stat().st_size / 1e6, minutes=minutes)
 

@@ -8,6 +8,7 @@ beside its place, synced, and renamed, so that a kill or a full disk leaves eith
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import os
@@ -110,6 +111,19 @@ class AssetLibrary:
             parts = tuple(np.split(arrays["parts"], np.cumsum(arrays["part_sizes"])[:-1]))
             resting = RestingPoses(arrays["resting_quaternions"], arrays["resting_probabilities"])
             return ObjectAsset(self.info(name), mesh, parts, resting)
+
+    def digest(self, name: str) -> str:
+        """Tells an object from any other and from any earlier one of its name, without loading it.
+
+        Raises:
+            MissingAssets: if the object is in the catalogue but not on this machine.
+            UnknownName: if there is no such object.
+            CorruptFile: if its files are damaged.
+        """
+        facts = self._known_facts(name)
+        with self._as_corrupt(name):
+            checks = [facts["crc32"][file] for file in (_ARRAYS, _TEXTURE)]
+        return hashlib.sha256(json.dumps([checks, asdict(self.info(name))]).encode()).hexdigest()
 
     def viewer_glb(self, name: str) -> bytes:
         """The object as binary glTF with a small JPEG texture, in the object frame (z up) [m].

@@ -1,10 +1,12 @@
 import json
+import shutil
+from dataclasses import replace
 
 import cv2
 import pytest
 
 import osfcore.evaluate.fields as module
-from osfcore.errors import InvalidInput, MissingAssets, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
 from osfcore.evaluate.fields import (
     EvaluateFields,
     EvaluateSet,
@@ -16,6 +18,7 @@ from osfcore.evaluate.fields import (
 from osfcore.fields.library import FieldLibrary
 from osfcore.fields.weights import read_field, write_field
 from osfcore.objects.library import AssetLibrary
+from osfcore.world.collect_images import CollectTable, collect_table
 from tests.core.evaluate.solids import SOLIDS, write_fields
 
 KEYS = {
@@ -124,6 +127,30 @@ def test_a_killed_evaluation_goes_on_and_new_weights_are_measured_anew(library, 
     assert second.objects[SOLIDS[1]] == first.objects[SOLIDS[1]]
 
 
+def test_another_mesh_is_measured_anew_alone_and_in_scenes(solids, library, tmp_path, monkeypatch):
+    assets = AssetLibrary(shutil.copytree(library.root, tmp_path / "objects"))
+    config = EvaluateFields(tmp_path / "out", SOLIDS, tasks=1, size=32)
+    first = last(evaluate_fields(config, solids, assets)).report
+    asset = assets.load(SOLIDS[0])
+    assets.write(replace(asset, mesh=replace(asset.mesh, texture=asset.mesh.texture // 4)), "a test")
+    simulated = []
+    real = module.simulate
+    monkeypatch.setattr(module, "simulate", lambda *args: (simulated.append(args), real(*args))[1])
+    second = last(evaluate_fields(config, solids, assets)).report
+    assert second.objects[SOLIDS[0]].psnr_mask != first.objects[SOLIDS[0]].psnr_mask
+    assert second.objects[SOLIDS[1]] == first.objects[SOLIDS[1]]
+    assert len(simulated) == 1
+    assert second.scene_psnr_object != first.scene_psnr_object
+
+
+def test_a_set_of_the_table_measures_no_object(solids, tmp_path):
+    list(collect_table(CollectTable(tmp_path / "table", images=60, size=16)))
+    weights = solids.info(SOLIDS[0]).path
+    with pytest.raises(CorruptFile, match="opaque all over; an object before a transparent background is expected"):
+        last(evaluate_set(EvaluateSet(tmp_path / "table", weights, tmp_path / "out")))
+    assert not (tmp_path / "out").exists()
+
+
 def test_other_seeds_are_other_images(evaluated, solids, library):
     out, steps = evaluated
     other = last(evaluate_fields(EvaluateFields(out, SOLIDS[:1], tasks=0, seed=1, size=32), solids, library)).report
@@ -152,7 +179,7 @@ def test_any_set_and_weights_can_be_measured(evaluated, solids, tmp_path):
 def test_weights_may_come_without_metrics(solids, tmp_path):
     bare = tmp_path / "bare.safetensors"
     bare.write_bytes(solids.info(SOLIDS[2]).path.read_bytes())
-    for metrics in (None, "[]", '{"minutes": "many"}', "{"):
+    for metrics in (None, "[]", '{"minutes": "many"}', "{", f'{{"minutes": {10**400}}}', "[" * 100_000):
         if metrics is not None:
             bare.with_suffix(".json").write_text(metrics)
         figures = module._field_figures(module.TaskResult({**_figures(), "images": 1}, ()), bare)
@@ -179,6 +206,7 @@ def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library
     out = tmp_path / "out"
     cases = [
         (EvaluateFields(out, ("teapot",)), UnknownName, "teapot"),
+        (EvaluateFields(out, ()), InvalidInput, "number of names is 0, but it must be 1 or more"),
         (EvaluateFields(out, tasks=-1), InvalidInput, "scenes"),
         (EvaluateFields(out, objects=9), InvalidInput, "objects in a scene"),
         (EvaluateFields(out, seed=-1), InvalidInput, "seed"),

@@ -58,7 +58,7 @@ def test_info_of_the_catalogue_needs_no_files(tmp_path):
 
 
 def test_missing_and_unknown_are_told_apart(shelf):
-    for method in (shelf.load, shelf.size_m, shelf.viewer_glb, shelf.source):
+    for method in (shelf.load, shelf.size_m, shelf.viewer_glb, shelf.source, shelf.digest):
         with pytest.raises(MissingAssets, match=r"024_bowl.*osf assets fetch"):
             method("024_bowl")
         with pytest.raises(UnknownName, match="toy"):
@@ -95,7 +95,7 @@ def test_damage_is_told(shelf, file, damage):
 @pytest.mark.parametrize("facts", [[], {}, {"format_version": 1}, {"format_version": 1, "info": {}, "crc32": 3}])
 def test_facts_of_another_shape_are_told(shelf, facts):
     (shelf.root / "toy" / "object.json").write_text(json.dumps(facts))
-    for method in (shelf.load, shelf.info, shelf.size_m):
+    for method in (shelf.load, shelf.info, shelf.size_m, shelf.digest):
         with pytest.raises(CorruptFile):
             method("toy")
 
@@ -113,6 +113,22 @@ def test_writing_again_replaces_and_leaves_nothing_behind(shelf, asset):
     assert shelf.load("toy").info.mass_kg == 0.5
     assert [path.name for path in shelf.root.iterdir()] == ["toy"]
     assert sorted(path.name for path in (shelf.root / "toy").iterdir()) == sorted(FILES)
+
+
+def test_digests_tell_what_was_written_from_what_was_there_before(shelf, asset):
+    before = shelf.digest("toy")
+    shelf.write(asset, "another place")
+    assert shelf.digest("toy") == before
+    changed = [
+        replace(asset, mesh=replace(asset.mesh, vertices=asset.mesh.vertices * 1.01)),
+        replace(asset, mesh=replace(asset.mesh, texture=asset.mesh.texture // 2)),
+        replace(asset, info=replace(INFO, mass_kg=0.3)),
+    ]
+    digests = {before}
+    for other in changed:
+        shelf.write(other, "a test")
+        digests.add(shelf.digest("toy"))
+    assert len(digests) == 4
 
 
 def test_old_temporary_folders_are_removed_and_fresh_ones_kept(shelf, asset):
