@@ -18,6 +18,21 @@ TABLE_NAME = "table"
 FIELD_FILE = "field.safetensors"
 METRICS_FILE = "field.json"
 _SUFFIX = ".safetensors"
+_NUMBERS = (
+    "psnr_full",
+    "psnr_mask",
+    "psnr",
+    "test_images",
+    "train_images",
+    "bytes",
+    "minutes",
+    "iterations",
+    "seed",
+    "threads",
+)
+_WORDS = ("device", "data", "command", "machine")
+_LARGEST = 2**63
+_MOST_CHARACTERS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +44,7 @@ class FieldInfo:
         source: "shipped" with the package or "trained" on this machine.
         path: of its weights.
         bytes: size of its weights.
-        metrics: what was measured when it was trained; empty if that is not known.
+        metrics: what was measured when it was trained, as plain numbers and words; empty if that is not known.
     """
 
     name: str
@@ -68,7 +83,7 @@ class FieldLibrary:
         trained = set()
         if self._trained is not None and self._trained.is_dir():
             trained = {path.parent.name for path in self._trained.glob(f"*/{FIELD_FILE}")} - {TABLE_NAME}
-        return tuple(sorted(shipped | trained))
+        return tuple(sorted(name for name in shipped | trained if name.isprintable()))
 
     def has(self, name: str) -> bool:
         """Whether an object has a field."""
@@ -120,4 +135,13 @@ def _metrics(path: Path) -> Mapping[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return content if isinstance(content, dict) else {}
+    return {key: value for key, value in content.items() if _is_metric(key, value)} if isinstance(content, dict) else {}
+
+
+def _is_metric(key: str, value: object) -> bool:
+    """Whether it is a figure or a word that we know, and that can be told further as it is."""
+    if key in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
+        return -_LARGEST <= value < _LARGEST  # not for NaN either
+    if key in _WORDS and isinstance(value, str):
+        return value.isprintable() and len(value) <= _MOST_CHARACTERS
+    return key == "hollow" and isinstance(value, bool)

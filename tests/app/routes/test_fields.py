@@ -145,6 +145,31 @@ def test_missing_fields_and_previews_are_not_found(service):
     service.delete(f"/api/jobs/{job['id']}")
 
 
+@pytest.mark.parametrize(
+    "metrics", ['{"device": "\\ud800"}', '{"recipe": ' + "[" * 900 + "]" * 900 + "}", '{"psnr_full": NaN}']
+)
+def test_odd_metrics_do_not_hide_the_fields(service, services, metrics):
+    folder = services.settings.data_dir / "fields" / "odd"
+    folder.mkdir(parents=True)
+    (folder / "field.safetensors").write_bytes(b"weights")
+    (folder / "field.json").write_text(metrics)
+    answer = service.get("/api/fields")
+    assert answer.status_code == 200
+    (found,) = [field for field in answer.json()["fields"] if field["name"] == "odd"]
+    assert found["metrics"] == {}
+    assert service.delete("/api/fields/odd").status_code == 204
+
+
+def test_damaged_sets_do_not_hide_the_list(service, services):
+    folder = services.settings.data_dir / "sets" / "odd"
+    folder.mkdir(parents=True)
+    (folder / "set.json").write_text(
+        '{"id": 1, "file_name": 2, "created_at": 3, "train": "a", "test": [], "summary": {}}'
+    )
+    assert service.get("/api/fields/sets").status_code == 200
+    shutil.rmtree(folder)
+
+
 def test_what_lies_in_the_data_directory_is_listed(service, services, archive):
     made = upload(service, archive).json()
     job = finished(service, train(service, "one", {"set": made["id"]}).headers["location"], 240)

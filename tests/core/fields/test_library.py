@@ -75,6 +75,22 @@ def test_metrics_that_cannot_be_read_are_not_known(shipped, data_dir, text):
     assert FieldLibrary(data_dir, shipped=shipped).info("mug").metrics == {}
 
 
+def test_of_metrics_only_what_is_known_and_plain_is_told(shipped, data_dir):
+    good = {"psnr_full": 35.5, "minutes": 2, "device": "cpu", "hollow": True}
+    bad = {"psnr_mask": float("nan"), "bytes": 10**400, "seed": True, "threads": "1", "data": "a\ud800",
+           "machine": "x" * 5000, "command": ["osf"], "further": 1, "psnr": [[1]]}  # fmt: skip
+    place(data_dir, "mug", ball(), json.dumps(good | bad))
+    assert FieldLibrary(data_dir, shipped=shipped).info("mug").metrics == good
+    place(data_dir, "mug", ball(), f'{{"psnr_full": 35.5, "recipe": {"[" * 900}{"]" * 900}}}')
+    assert FieldLibrary(data_dir, shipped=shipped).info("mug").metrics == {"psnr_full": 35.5}
+
+
+def test_folders_with_unprintable_names_hold_no_fields(shipped, data_dir):
+    place(data_dir, "a\nb", ball())
+    place(data_dir, "\udc80", ball())
+    assert FieldLibrary(data_dir, shipped=shipped).names() == ("ball", "block")
+
+
 def test_unknown_names_are_told_with_the_known_ones(shipped, data_dir):
     place(data_dir, "mug", ball())
     library = FieldLibrary(data_dir, shipped=shipped)
