@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.paths import default_data_dir
-from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.errors import InvalidInput
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,17 @@ class Render:
     def run(self) -> dict[str, Any]:
         """Render with two by two rays a pixel; the result tells the file and its size."""
         import numpy as np
-        from PIL import Image
 
+        from osfcore.evaluate.images import write_png
         from osfcore.fields.devices import pick_device
         from osfcore.fields.library import FieldLibrary
+        from osfcore.fields.outputs import check_place
         from osfcore.render.scene_renderer import Quality, SceneBatch, SceneRenderer
         from osfcore.scenefile import read_scene
 
         if self.out.suffix.lower() != ".png":
             raise InvalidInput("output file", self.out, "a path that ends in .png")
+        check_place(self.out)
         scene = read_scene(self.scene)
         cameras = {camera.name: camera for camera in scene.cameras}
         if self.camera not in cameras:
@@ -49,10 +51,7 @@ class Render:
         quality = Quality(samples_per_side=2)
         image = renderer.render(SceneBatch.of(scene.state), (cameras[self.camera],), quality=quality).rgb[0, 0]
         pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-        try:
-            Image.fromarray(pixels).save(self.out, format="PNG")
-        except OSError as error:
-            raise CannotWrite(self.out, error.strerror or str(error)) from error
+        write_png(self.out, pixels)
         height, width = pixels.shape[:2]
         if not self.json:
             print(f"Wrote {self.out}, {width} x {height} px.")

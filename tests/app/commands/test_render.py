@@ -44,5 +44,22 @@ def test_mistakes_are_told_in_words(scene_file, tmp_path):
         Render(scene_file("spoon"), out, data_dir=tmp_path).run()
     with pytest.raises(CorruptFile):
         Render(tmp_path / "nothing.json", out, data_dir=tmp_path).run()
+    (tmp_path / "file").write_text("")
     with pytest.raises(CannotWrite):
-        Render(scene_file(MUSTARD), tmp_path / "no" / "folder.png", data_dir=tmp_path).run()
+        Render(scene_file(MUSTARD), tmp_path / "file" / "image.png", data_dir=tmp_path).run()
+
+
+def test_a_disk_that_is_full_leaves_the_older_picture(scene_file, tmp_path, monkeypatch):
+    out = tmp_path / "image.png"
+    out.write_bytes(b"older")
+
+    def full(self, data):
+        with self.open("wb") as file:
+            file.write(data[:100])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(CannotWrite, match="No space left"):
+        Render(scene_file(MUSTARD), out, data_dir=tmp_path).run()
+    assert out.read_bytes() == b"older"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["image.png", "scene.json"]
