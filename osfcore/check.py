@@ -15,10 +15,11 @@ import numpy as np
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.hull import carve, silhouette_box
 from osfcore.fields.image_set import read_image_set, read_splits
+from osfcore.fields.outputs import check_place
 from osfcore.fields.overlay import overlay_sheet
 from osfcore.fields.set_archive import unpack_set
 from osfcore.fields.table import TABLE_FORMAT, read_table
-from osfcore.fields.weights import read_field, tensor_format
+from osfcore.fields.weights import read_field, tensor_format, write_atomically
 from osfcore.scenefile import read_scene
 
 
@@ -112,7 +113,7 @@ def _check_image_set(folder: Path) -> Report:
 @contextlib.contextmanager
 def _unpacked(path: Path) -> Iterator[Path]:
     """The folder of an image set, or of a zipped one for as long as it is looked at."""
-    if path.suffix.lower() != ".zip":
+    if path.is_dir() or path.suffix.lower() != ".zip":
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="osf-check-") as place:
@@ -138,15 +139,25 @@ def draw_overlay(path: Path, out: Path) -> None:
 
     Raises:
         CorruptFile: if it is no image set.
-        InvalidInput: if the PNG cannot be written.
+        InvalidInput: if the PNG would have another suffix.
+        CannotWrite: if it cannot be written.
     """
+    check_overlay_place(out)
     with _unpacked(path) as folder:
         sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))
     has_box = not any(images.is_opaque for images in sets)
     sheet = overlay_sheet(sets, carve(*sets).box if has_box else None)
-    try:
-        is_written = cv2.imwrite(str(out), sheet)
-    except cv2.error:
-        is_written = False
-    if not is_written:
-        raise InvalidInput("overlay file", out, "a writable path that ends in .png")
+    _, data = cv2.imencode(".png", sheet)
+    write_atomically(out, data.tobytes())
+
+
+def check_overlay_place(out: Path) -> None:
+    """Refuse a place for an overlay that cannot take it.
+
+    Raises:
+        InvalidInput: if it has another suffix than .png.
+        CannotWrite: if it cannot be written.
+    """
+    if out.suffix.lower() != ".png":
+        raise InvalidInput("overlay file", out, "a path that ends in .png")
+    check_place(out)

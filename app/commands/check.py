@@ -25,8 +25,10 @@ class Check:
 
     def run(self) -> dict[str, Any]:
         """Check; the result tells what it is and how much is in it."""
-        from osfcore.check import check_path, draw_overlay
+        from osfcore.check import check_overlay_place, check_path, draw_overlay
 
+        if self.overlay is not None:
+            check_overlay_place(self.overlay)
         if not self.path.exists():
             raise CorruptFile(self.path, "there is no such file or folder")
         try:

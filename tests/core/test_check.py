@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from osfcore.check import check_path, draw_overlay
-from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.world.collect_images import CollectTable, collect_table
 from osfcore.world.push_file import EpisodeFolder, PushEpisode, save_episode
 from tests.core.fields.sets import edit, turn_cameras, write_set
@@ -101,8 +101,19 @@ def test_a_zipped_set_is_checked_like_a_folder(image_set, tmp_path):
 
 
 def test_an_unwritable_overlay_is_told(image_set, tmp_path):
-    with pytest.raises(InvalidInput, match="overlay"):
-        draw_overlay(image_set, tmp_path / "no" / "such" / "folder.png")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CannotWrite, match="overlay.png"):
+        draw_overlay(image_set, tmp_path / "file" / "overlay.png")
+    with pytest.raises(InvalidInput, match="overlay file is .*overlay.jpg, but it must be a path that ends in .png"):
+        draw_overlay(image_set, tmp_path / "overlay.jpg")
+    assert not (tmp_path / "overlay.jpg").exists()
+
+
+def test_a_folder_is_a_folder_whatever_it_is_called(image_set, tmp_path):
+    folder = image_set.rename(tmp_path / "folder.zip")
+    assert check_path(folder).kind == "image set"
+    draw_overlay(folder, tmp_path / "overlay.png")
+    assert (tmp_path / "overlay.png").stat().st_size > 1000
 
 
 def test_files_of_other_kinds_are_told(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.commands.check import Check
-from osfcore.errors import CorruptFile
+from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.world.collect_images import CollectTable, collect_table
 from tests.core.fields.sets import turn_cameras, write_set
 
@@ -33,6 +33,14 @@ def test_a_bad_set_is_drawn_before_it_is_refused(tmp_path, capsys):
         Check(folder, overlay=overlay).run()
     assert not overlay.exists()
     assert capsys.readouterr().out == ""
+
+
+def test_an_overlay_of_another_kind_is_refused_for_good_and_bad_sets(tmp_path):
+    good, bad = write_set(tmp_path / "good"), write_set(tmp_path / "bad")
+    turn_cameras(bad, lambda RT: np.diag([1, -1, -1]) @ RT)
+    for folder in (good, bad):
+        with pytest.raises(InvalidInput, match="overlay file is .*o.jpg, but it must be a path that ends in .png"):
+            Check(folder, overlay=tmp_path / "o.jpg").run()
 
 
 def test_with_json_nothing_else_is_printed(tmp_path, capsys):
