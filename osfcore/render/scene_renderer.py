@@ -74,8 +74,13 @@ class SceneBatch:
             wanted["pusher"] = (scenes, 3)
         for name, shape in wanted.items():
             array = getattr(self, name)
-            if array.shape != shape or not np.all(np.abs(array) < _FARTHEST_M):  # also false for NaN
+            if array.shape != shape:
                 raise InvalidInput(f"{name} of a batch", f"shape {array.shape}", f"finite numbers of shape {shape}")
+            if not np.all(np.abs(array) < _FARTHEST_M):  # also false for NaN
+                largest = f"{np.abs(array).max():g}"  # NaN where there is one
+                raise InvalidInput(
+                    f"largest of the {name} of a batch", largest, f"finite and below {_FARTHEST_M:g} in size"
+                )
         for name in ("quaternions", "lights"):
             norms = np.linalg.norm(getattr(self, name), axis=-1)
             if not np.all(np.abs(norms - 1) < QUATERNION_NORM_TOLERANCE):

@@ -14,7 +14,7 @@ import app.image_sets
 from app.image_sets import ImageSets, SetRefused, TooManySets, examine
 from osfcore.errors import CorruptFile, UnknownName
 from tests.app.conftest import until
-from tests.core.fields.sets import write_set
+from tests.core.fields.sets import edit, write_set
 
 
 def zipped(folder: Path) -> bytes:
@@ -70,6 +70,7 @@ def broken(tmp_path: Path, damage) -> bytes:
         (lambda folder: (folder / "train" / "r_3.png").write_bytes(b"\x89PNG"), "r_3.png"),
         (lambda folder: (folder / "test" / "anno.json").write_text("[]"), "test/anno.json"),
         (lambda folder: (folder / "train" / "anno.json").unlink(), "no train/anno.json"),
+        (lambda folder: edit(folder, lambda e: e.update(filename="\ud800.png")), "lacks or garbles filename"),
     ],
 )
 def test_an_unsound_set_is_refused_in_words_that_know_only_the_uploaders_names(sets, tmp_path, damage, words):

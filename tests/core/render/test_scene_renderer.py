@@ -288,7 +288,11 @@ def test_as_many_objects_as_allowed():
     ("change", "message"),
     [
         ({"positions": np.zeros((2, 3))}, "positions of a batch is shape"),
-        ({"positions": np.full((2, 1, 3), np.nan)}, "positions of a batch.*finite"),
+        (
+            {"positions": np.full((2, 1, 3), np.nan)},
+            "largest of the positions of a batch is nan, but it must be finite",
+        ),
+        ({"positions": np.full((2, 1, 3), 1e7)}, r"positions of a batch is 1e\+07, .* below 1e\+06 in size"),
         ({"positions": np.full((2, 1, 3), 1e300)}, "positions of a batch"),
         ({"quaternions": np.zeros((2, 1, 4))}, "norms of the quaternions of a batch"),
         ({"quaternions": np.zeros((2, 2, 4))}, "quaternions of a batch is shape"),
