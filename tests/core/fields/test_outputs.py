@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 
@@ -17,7 +18,7 @@ def test_places_that_can_be_written_are_left_as_they_were(tmp_path):
 
 def test_a_path_within_the_working_folder_needs_no_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    check_weights_place(type(tmp_path)("a.safetensors"), KEYS)
+    check_weights_place(Path("a.safetensors"), KEYS)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -41,8 +42,6 @@ def test_places_that_cannot_be_written_are_told(tmp_path, name, words):
 
 
 def test_a_file_system_that_refuses_is_told():
-    from pathlib import Path
-
     with pytest.raises(CannotWrite, match="/proc/a.png"):
         check_place(Path("/proc/a.png"))
 
