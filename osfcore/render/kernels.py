@@ -332,16 +332,17 @@ def _row_span(outlines, boxes, b, view, n, row):
 
 @numba.njit(**KERNEL)
 def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_distance, base_of, boxes, shadows,
-                 outlines, rules, rgb, opacity, distance) -> None:  # fmt: skip
+                 outlines, rules, only, rgb, opacity, distance) -> None:  # fmt: skip
     """Every image of a batch; what no object and no shadow can touch is copied from the empty table.
 
     fields: N; scene: see `launch.Scene`; cameras: V x 12; base_of: number of the base light of each scene; boxes,
-    shadows: B x V x N x 4 (columns from, to, rows from, to); outlines: see `launch.Outlines`; rgb: B x V x h x w x 3;
+    shadows: B x V x N x 4 (columns from, to, rows from, to); outlines: see `launch.Outlines`; only: V x h x w, 0 for
+    pixels that stay black, or empty; rgb: B x V x h x w x 3;
     opacity: B x V x N' x h x w or empty; distance: B x V x h x w or empty.
     """
     scenes, views, height, width = rgb.shape[0], rgb.shape[1], rgb.shape[2], rgb.shape[3]
     count = len(fields)
-    wants_opacity, wants_distance = opacity.size > 0, distance.size > 0
+    wants_opacity, wants_distance, wants_some = opacity.size > 0, distance.size > 0, only.size > 0
     samples = rules.samples
     share = _ONE / np.float32(samples * samples)
     bands = (height + BAND_ROWS - 1) // BAND_ROWS
@@ -360,6 +361,12 @@ def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_di
                 if spans[n, 2] < spans[n, 3]:
                     first, last = min(first, spans[n, 2]), max(last, spans[n, 3])
             for column in range(width):
+                if wants_some and only[view, row, column] == 0:
+                    for c in range(3):
+                        rgb[b, view, row, column, c] = _ZERO
+                    if wants_distance:
+                        distance[b, view, row, column] = _ZERO
+                    continue
                 touched = False
                 if first <= column < last:
                     for n in range(count):

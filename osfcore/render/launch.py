@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from osfcore.fields.marching import ONE_AT_A_TIME
 from osfcore.fields.table import TableField
@@ -86,6 +86,7 @@ def launch(
     size: tuple[int, int],
     quality: Quality,
     outputs: frozenset[str] | set[str],
+    only: Bool[np.ndarray, "V h w"] | None,
 ) -> Rendered:
     """Render a batch; `numbers` are the objects' fields in the pack, the pusher's last."""
     rotations, positions = poses_of(batch)
@@ -107,11 +108,12 @@ def launch(
     directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
     base = np.zeros((len(different), *shape[1:], 3), np.float32), np.zeros((len(different), *shape[1:]), np.float32)
     scene = _scene(pack, numbers, rotations, positions, batch.lights, lenses)
+    wanted = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
     with ONE_AT_A_TIME:
         if table is not None:  # the empty table, once per light
             render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
         render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows,
-                     Outlines(outline, shadow_outline), rules, rgb, opacity, distance)  # fmt: skip
+                     Outlines(outline, shadow_outline), rules, wanted, rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,

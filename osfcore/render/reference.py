@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from osfcore.fields.kiloosf import KiloOSF
@@ -84,10 +84,18 @@ def render_reference(
 
 def render_on_device(
     fields: Mapping[str, KiloOSF], table: TableField | None, batch: SceneBatch, cameras: Sequence[Camera], device: str,
-    quality: Quality, outputs: frozenset[str] | set[str],
+    quality: Quality, outputs: frozenset[str] | set[str], only: Bool[np.ndarray, "V h w"] | None = None,
 ) -> Rendered:  # fmt: skip
     """A batch in single precision on a PyTorch device."""
-    return _render(fields, table, batch, cameras, torch.device(device), torch.float32, quality, outputs)
+    rendered = _render(fields, table, batch, cameras, torch.device(device), torch.float32, quality, outputs)
+    if only is None:
+        return rendered
+    return Rendered(
+        rendered.rgb * only[None, ..., None],
+        None if rendered.opacity is None else rendered.opacity * only[None, :, None],
+        None if rendered.masks is None else rendered.masks & only[None, :, None],
+        None if rendered.depth is None else rendered.depth * only[None],
+    )
 
 
 @torch.no_grad()

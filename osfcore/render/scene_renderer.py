@@ -158,6 +158,7 @@ class SceneRenderer:
         *,
         quality: Quality = EXACT,
         outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
+        only: Bool[np.ndarray, "V h w"] | None = None,
     ) -> Rendered:
         """Images of every scene of a batch from every camera.
 
@@ -166,20 +167,23 @@ class SceneRenderer:
             cameras: V cameras of one image size.
             quality: `EXACT` or `PLANNING`, or anything between.
             outputs: which of "rgb", "opacity", "masks", "depth"; colours always come.
+            only: pixels to look at; all others stay black and empty.
 
         Raises:
             UnknownName: if an object has no field here.
-            InvalidInput: if cameras differ in size, or an output is unknown.
+            InvalidInput: if cameras differ in size, an output is unknown, or `only` is of another shape.
         """
         size = check_request(self._fields, batch, cameras, outputs)
+        if only is not None and only.shape != (len(cameras), *size):
+            raise InvalidInput("shape of the pixels to look at", only.shape, f"{(len(cameras), *size)}")
         if self._device != "cpu":
             from osfcore.render.reference import render_on_device
 
-            return render_on_device(self._fields, self._table, batch, cameras, self._device, quality, outputs)
+            return render_on_device(self._fields, self._table, batch, cameras, self._device, quality, outputs, only)
         from osfcore.render.launch import launch
 
         pack, numbers = self._packed(batch)
-        return launch(pack, numbers, self._table, batch, cameras, size, quality, outputs)
+        return launch(pack, numbers, self._table, batch, cameras, size, quality, outputs, only)
 
     def _packed(self, batch: SceneBatch) -> tuple[Packed, np.ndarray]:
         """The batch's fields, each packed once, and which of them each object has."""

@@ -1,0 +1,251 @@
+"""The first frame: all poses and the light from images with masks (paper section 4.2).
+
+In the paper's order: the light is held overhead and each object is searched inside its own masks (eq. 5); then poses
+and light together explain the whole images (eq. 6). Deviations: the first part begins with every way an object can
+lie on a table, not with one guess, since orientation has many local minima; the light is found by a search of the
+hemisphere before CMA refines it; Gauss-Newton finishes what CMA began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from osfcore.errors import InvalidInput
+from osfcore.estimate.evolution import Evolution
+from osfcore.estimate.lamp import find_light
+from osfcore.estimate.masked import look_at, masked_loss
+from osfcore.estimate.models import Models
+from osfcore.estimate.polish import Descent, polish
+from osfcore.estimate.rivals import challenged, turned
+from osfcore.estimate.starts import OVERHEAD, Starts, lying_starts, ranked
+from osfcore.estimate.steps import EstimateStep, Stage
+from osfcore.estimate.tangent import LIGHT, POSE, Guess
+from osfcore.estimate.trust import gather, judged
+from osfcore.estimate.views import FINE_SIDE, Part, Views, part_of, views_of
+from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.poses import Pose
+from osfcore.progress import Progress
+from osfcore.scene import Observation
+
+_COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
+_SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.12, 0.03
+_SHOWN = 24  # candidates of a ranking that are shown
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much work a first estimate is.
+
+    Attributes:
+        starts: orientations of each object that CMA refines.
+        population: candidates per generation and start, masked (eq. 5).
+        generations: masked.
+        joint_population: candidates per generation of the whole scene (eq. 6).
+        joint_generations: likewise.
+        coarse_iterations: of the final descent on half the resolution.
+        fine_iterations: at full resolution.
+        light: "search" for a search of the hemisphere before CMA, "cma" for CMA alone from overhead as in the paper,
+            "overhead" to hold it there (to measure what knowing the light is worth).
+    """
+
+    starts: int = 5
+    population: int = 10
+    generations: int = 10
+    joint_population: int = 16
+    joint_generations: int = 8
+    coarse_iterations: int = 4
+    fine_iterations: int = 3
+    light: Literal["search", "cma", "overhead"] = "search"
+
+
+def estimate_first(
+    models: Models, observation: Observation, rng: np.random.Generator, effort: Effort | None = None
+) -> Iterator[EstimateStep]:
+    """Find all poses and the light; the last step holds the estimate.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: one or more views with masks.
+        rng: of the searches.
+        effort: how much work to do.
+
+    Raises:
+        InvalidInput: without masks, or if an object's masks are all empty.
+        UnknownName: if an object has no field.
+    """
+    models.check(observation.names)
+    _check_masks(observation)
+    yield from _First(models, observation, rng, effort or Effort()).steps()
+
+
+def _check_masks(observation: Observation) -> None:
+    if observation.masks is None:
+        raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
+    for name, masks in zip(observation.names, np.moveaxis(observation.masks, 1, 0), strict=True):
+        if not masks.any():
+            raise InvalidInput(f"mask of {name}", "empty in every view", "not empty in at least one view")
+
+
+class _First:
+    """The state of one estimation between its steps."""
+
+    def __init__(self, models: Models, observation: Observation, rng: np.random.Generator, effort: Effort) -> None:
+        self._models, self._rng, self._effort = models, rng, effort
+        self._names, self._pusher = observation.names, observation.pusher
+        self._coarse = views_of(observation, _COARSE_SIDE)
+        self._middle = views_of(observation, _COARSE_SIDE, samples=2)
+        self._rough = views_of(observation, _ROUGH_SIDE)
+        self._fine = views_of(observation, FINE_SIDE, samples=2)
+        e = effort
+        count = len(self._names)
+        self._total = (2 * count + 1 + e.generations + e.joint_generations + e.coarse_iterations + e.fine_iterations
+                       + count + 1)  # fmt: skip
+        self._done = 0
+        self._rivals: dict[int, float] = {}
+
+    def steps(self) -> Iterator[EstimateStep]:
+        parts = [_visible_part(self._coarse, n) for n in range(len(self._names))]
+        better = [_visible_part(self._middle, n) for n in range(len(self._names))]
+        starts: list[Starts] = []
+        for name, part in zip(self._names, parts, strict=True):
+            starts.append(lying_starts(self._models, name, part))
+            yield self._ranking("orientations", f"{name}: how it may lie", starts, OVERHEAD)
+        light = OVERHEAD
+        if self._effort.light == "search":
+            light = find_light(self._models, self._rough, self._coarse, self._guess(starts, OVERHEAD))
+            yield self._ranking("light", "Shading and shadows", starts, light)
+            for n, (name, part) in enumerate(zip(self._names, better, strict=True)):
+                starts[n] = ranked(self._models, name, part, starts[n].positions, starts[n].quaternions, light)
+                yield self._ranking("orientations", f"{name}: under this light", starts, light)
+        starts = [found.distinct(self._effort.starts) for found in starts]
+        starts = yield from self._search_objects(better, starts, light)
+        guess = yield from self._search_together(self._guess(starts, light))
+        at = yield from self._descend(guess)
+        at = yield from self._compare(at, starts)
+        yield self._finish(at)
+
+    def _search_objects(
+        self, parts: list[Part], starts: list[Starts], light: np.ndarray
+    ) -> Iterator[EstimateStep]:  # returns the refined starts
+        scales = np.array([_SHIFT_M] * 3 + [_TURN_RAD] * 3 + [0.0] * LIGHT)
+        guesses = [
+            [Guess((name,), p[None], q[None], light, None) for p, q in zip(s.positions, s.quaternions, strict=True)]
+            for name, s in zip(self._names, starts, strict=True)
+        ]
+        searches = [[Evolution(scales, self._effort.population, self._rng) for _ in own] for own in guesses]
+        for _ in range(self._effort.generations):
+            shown, losses = [], []
+            for n, part in enumerate(parts):
+                batches = [g.moved(s.ask()) for g, s in zip(guesses[n], searches[n], strict=True)]
+                positions = np.concatenate([b.positions[:, 0] for b in batches])
+                quaternions = np.concatenate([b.quaternions[:, 0] for b in batches])
+                look = look_at(self._models, self._names[n], part, positions, quaternions, light)
+                found = masked_loss(look, part, any_brightness=self._effort.light == "cma")
+                for search, own in zip(searches[n], found.reshape(len(batches), -1), strict=True):
+                    search.tell(own)
+                shown.append(Pose(positions, quaternions))
+                losses.append(float(found.min()))
+            best = self._guess(starts, light)
+            yield self._step("objects", "Each object in its masks", best, shown, losses, searches[0][0].sigma)
+        refined = []
+        for n, name in enumerate(self._names):
+            ends = [g.changed(s.mean) for g, s in zip(guesses[n], searches[n], strict=True)]
+            positions = np.concatenate([starts[n].positions, *(g.positions for g in ends)])
+            quaternions = np.concatenate([starts[n].quaternions, *(g.quaternions for g in ends)])
+            part = _visible_part(self._fine, n)
+            brightness = self._effort.light == "cma"
+            found = ranked(self._models, name, part, positions, quaternions, light, any_brightness=brightness)
+            refined.append(found.distinct(3))
+        return refined
+
+    def _search_together(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the guess
+        e = self._effort
+        spread = {"search": _LIGHT_RAD, "cma": 0.6, "overhead": 0.0}[e.light]
+        scales = np.array([*([_SHIFT_M / 2] * 3 + [_TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
+        search = Evolution(scales, e.joint_population, self._rng)
+        best, least = guess, np.inf
+        for _ in range(e.joint_generations):
+            changes = search.ask()
+            changes[0] = 0 if least == np.inf else changes[0]
+            batch = guess.moved(changes)
+            losses = whole_loss(residuals(self._models, self._middle, batch))
+            search.tell(losses)
+            k = int(np.argmin(losses))
+            if losses[k] < least:
+                least = float(losses[k])
+                best = replace(guess, positions=batch.positions[k], quaternions=batch.quaternions[k], light=batch.lights[k])  # fmt: skip
+            poses = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(self._names))]
+            yield self._step("together", "All objects and the light", best, poses, [], search.sigma, batch.lights, least)
+        return best
+
+    def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
+        light = None if self._effort.light == "overhead" else self._middle
+        at = Descent.at(guess)
+        e = self._effort
+        rounds = (self._middle, e.coarse_iterations), (self._fine, e.fine_iterations)
+        for views, iterations in rounds:
+            for at in polish(self._models, views, at, iterations=iterations, light=light):
+                yield self._polishing("The last millimetres", at)
+        return at
+
+    def _compare(self, at: Descent, starts: list[Starts]) -> Iterator[EstimateStep]:  # returns the better Descent
+        """Put other orientations of each object into the scene and let the whole images decide."""
+        for n, found in enumerate(starts):
+            spun = turned(self._models, at.guess, n)
+            others = Pose(np.concatenate([found.positions, spun.position]),
+                          np.concatenate([found.quaternions, spun.quaternion]))  # fmt: skip
+            at, self._rivals[n] = challenged(self._models, self._fine, at, n, others)
+            yield self._polishing(f"{self._names[n]}: the other way round", at)
+        return at
+
+    def _finish(self, at: Descent) -> EstimateStep:
+        evidence = gather(self._models, self._fine, at.guess)
+        estimate = judged(at.guess, at.normals, evidence, self._rivals, light_held=self._effort.light == "overhead")
+        self._done = self._total - 1
+        step = self._polishing("Done" if estimate.trusted else estimate.reason, at)
+        return replace(step, stage="done", estimate=estimate)
+
+    def _polishing(self, note: str, at: Descent) -> EstimateStep:
+        return self._step("polish", note, at.guess, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
+
+    def _guess(self, starts: list[Starts], light: np.ndarray) -> Guess:
+        """The best of each object's poses; objects not looked at yet are put far below the table."""
+        count = len(self._names)
+        positions = np.tile([0.0, 0.0, -1.0], (count, 1))
+        quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        for n, found in enumerate(starts):
+            positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
+        return Guess(self._names, positions, quaternions, light, self._pusher)
+
+    def _ranking(self, stage: Stage, note: str, starts: list[Starts], light: np.ndarray) -> EstimateStep:
+        guess = self._guess(starts, light)
+        shown = [Pose(s.positions[:_SHOWN], s.quaternions[:_SHOWN]) for s in starts]
+        return self._step(stage, note, guess, shown, [float(s.losses[0]) for s in starts])
+
+    def _step(
+        self, stage: Stage, note: str, guess: Guess, shown: list[Pose] | None = None, losses: list[float] | None = None,
+        sigma: float = 1.0, lights: np.ndarray | None = None, loss: float = float("nan"),
+    ) -> EstimateStep:  # fmt: skip
+        self._done = min(self._done + 1, self._total)
+        candidates = None
+        if shown and len(shown) == len(self._names):
+            count = min(len(p.position) for p in shown)
+            candidates = Pose(np.stack([p.position[:count] for p in shown], 1),
+                              np.stack([p.quaternion[:count] for p in shown], 1))  # fmt: skip
+        progress = Progress(self._done, self._total, note)
+        return EstimateStep(progress, stage, guess.state(), candidates, lights, sigma, tuple(losses or ()), loss)
+
+
+def _visible_part(views: Views, number: int) -> Part:
+    """An object's part; where its masks are too thin for this resolution, their brightest pixel stands for them."""
+    assert views.masks is not None
+    own = views.masks[:, number]
+    if own.max() > 0.5:
+        return part_of(views, number)
+    masks = views.masks.copy()
+    masks[:, number] = own / own.max()
+    return part_of(replace(views, masks=masks), number)

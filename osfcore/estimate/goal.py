@@ -1,0 +1,183 @@
+"""Goal images: one view, no masks, objects known by name, perhaps under another light than the scene.
+
+Nothing says where the objects are, so templates are slid over the image (`sliding`), first of each object as it lies
+now, since goals are mostly reached by pushing. The scene is put together from the best sightings, one object after the
+other, each time the whole image deciding; then the light is searched and the poses are refined as in the first frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from osfcore.errors import InvalidInput
+from osfcore.estimate.lamp import find_light
+from osfcore.estimate.models import Models
+from osfcore.estimate.polish import PLANAR, Descent, polish
+from osfcore.estimate.resting import about_z
+from osfcore.estimate.rivals import challenged, turned
+from osfcore.estimate.sliding import Sightings, sight
+from osfcore.estimate.steps import EstimateStep, Stage
+from osfcore.estimate.tangent import Guess
+from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
+from osfcore.estimate.views import FINE_SIDE, views_of
+from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.poses import Pose, quaternion_multiply, rotate
+from osfcore.progress import Progress
+from osfcore.scene import Observation, SceneState
+
+_YAWS = 24
+_SIGHTINGS = 60
+_ROUNDS = 3
+_AWAY = np.array([0.0, 0.0, -1.0])  # below the table: not in the image
+_SHOWN = 24
+
+
+@dataclass(frozen=True, slots=True)
+class GoalEffort:
+    """How much work a goal estimate is.
+
+    Attributes:
+        side: of the image that templates are slid over [px].
+        planar_iterations: of the descent while objects stay flat on the table.
+        free_iterations: of the descent over whole poses.
+        widen_above: residual of an object [radiance] above which every way it can lie is tried.
+    """
+
+    side: int = FINE_SIDE // 2
+    planar_iterations: int = 5
+    free_iterations: int = 3
+    widen_above: float = 0.06
+
+
+def estimate_goal(
+    models: Models, observation: Observation, prior: SceneState, effort: GoalEffort | None = None
+) -> Iterator[EstimateStep]:
+    """Find poses and light of a goal image; the last step holds the estimate.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: one view without the pusher; masks play no part.
+        prior: how the objects lie now; where they lie plays no part.
+        effort: how much work to do.
+
+    Raises:
+        InvalidInput: if there is more than one view, or the prior is of other objects.
+        UnknownName: if an object has no field.
+    """
+    models.check(observation.names)
+    if len(observation.cameras) != 1:
+        raise InvalidInput("number of views of a goal", len(observation.cameras), "1")
+    if set(prior.names) != set(observation.names):
+        raise InvalidInput("objects of the prior", ", ".join(prior.names), ", ".join(observation.names))
+    yield from _Goal(models, observation, prior, effort or GoalEffort()).steps()
+
+
+class _Goal:
+    """The state of one estimation between its steps."""
+
+    def __init__(self, models: Models, observation: Observation, prior: SceneState, effort: GoalEffort) -> None:
+        self._models, self._effort, self._prior = models, effort, prior
+        self._names = observation.names
+        self._fine = views_of(observation, FINE_SIDE)
+        self._coarse = views_of(observation, FINE_SIDE // 2)
+        self._rough = views_of(observation, FINE_SIDE // 4)
+        self._slide = views_of(observation, effort.side)
+        self._done = 0
+        self._total = 2 * len(self._names) + _ROUNDS + 2 * (effort.planar_iterations + effort.free_iterations) + 1
+        self._rivals: dict[int, float] = {}
+
+    def steps(self) -> Iterator[EstimateStep]:
+        count = len(self._names)
+        sightings: list[Sightings] = []
+        for n, name in enumerate(self._names):
+            sightings.append(self._as_it_lies(n))
+            yield self._step("orientations", f"{name}: where it may be", self._first(sightings), sightings)
+        guess = yield from self._assemble(self._first(sightings), sightings)
+        at = yield from self._descend(guess)
+        evidence = gather(self._models, self._fine, at.guess)
+        bad = [n for n in range(count) if object_residuals(evidence)[n] > self._effort.widen_above]
+        if bad:
+            for n in bad:
+                sightings[n] = self._any_way(n)
+                yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
+            other = yield from self._assemble(at.guess, sightings)
+            other = yield from self._descend(other)
+            at = other if other.losses[-1] < at.losses[-1] else at
+            evidence = gather(self._models, self._fine, at.guess)
+        yield self._finish(at, evidence)
+
+    def _as_it_lies(self, n: int) -> Sightings:
+        pose = self._prior.pose(self._names[n])
+        turns = about_z(np.arange(_YAWS) * 2 * np.pi / _YAWS)
+        quaternions = quaternion_multiply(turns, pose.quaternion[None])
+        heights = np.full(_YAWS, pose.position[2])
+        return sight(self._models, self._slide, self._names[n], quaternions, heights, most=_SIGHTINGS)
+
+    def _any_way(self, n: int) -> Sightings:
+        resting = self._models.resting(self._names[n])
+        heights = resting.heights - rotate(resting.quaternions, resting.centre)[:, 2]
+        return sight(self._models, self._coarse, self._names[n], resting.quaternions, heights, most=2 * _SIGHTINGS)
+
+    def _first(self, sightings: list[Sightings]) -> Guess:
+        """The best sighting of each object; those not looked for yet are away."""
+        count = len(self._names)
+        positions, quaternions = np.tile(_AWAY, (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        for n, found in enumerate(sightings):
+            positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
+        return Guess(self._names, positions, quaternions, self._prior.light.direction, None)
+
+    def _assemble(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the guess
+        """Choose a sighting for each object in turn, by the whole image; the light is searched between the rounds."""
+        for _ in range(_ROUNDS):
+            light = find_light(self._models, self._rough, self._coarse, guess)
+            guess = replace(guess, light=light)
+            losses = []
+            for n, found in enumerate(sightings):
+                batch = guess.moved(np.zeros((1 + len(found.scores), guess.size)))
+                positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
+                positions[1:, n], quaternions[1:, n] = found.positions, found.quaternions
+                batch = replace(batch, positions=positions, quaternions=quaternions)
+                tried = whole_loss(residuals(self._models, self._coarse, batch))
+                best = int(tried.argmin())
+                losses.append(float(tried[best]))
+                guess = replace(guess, positions=positions[best], quaternions=quaternions[best])
+            yield self._step("together", "Which sightings explain the image together", guess, sightings, losses)
+        return guess
+
+    def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
+        e = self._effort
+        at = Descent.at(guess)
+        for views, numbers, iterations in ((self._coarse, PLANAR, e.planar_iterations), (self._fine, PLANAR, 2)):
+            for at in polish(self._models, views, at, iterations=iterations, numbers=numbers, light=self._coarse):
+                yield self._polishing("On the table", at)
+        for n, name in enumerate(self._names):
+            at, self._rivals[n] = challenged(self._models, self._fine, at, n, turned(self._models, at.guess, n))
+            yield self._polishing(f"{name}: the other way round", at)
+        for at in polish(self._models, self._fine, at, iterations=e.free_iterations, light=self._coarse):
+            yield self._polishing("The last millimetres", at)
+        return at
+
+    def _finish(self, at: Descent, evidence: Evidence) -> EstimateStep:
+        estimate = judged(at.guess, at.normals, evidence, self._rivals)
+        self._done = self._total - 1
+        step = self._polishing("Done" if estimate.trusted else estimate.reason, at)
+        return replace(step, stage="done", estimate=estimate)
+
+    def _polishing(self, note: str, at: Descent) -> EstimateStep:
+        return self._step("polish", note, at.guess, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
+
+    def _step(
+        self, stage: Stage, note: str, guess: Guess, shown: list[Sightings] | None = None,
+        losses: list[float] | None = None, loss: float = float("nan"),
+    ) -> EstimateStep:  # fmt: skip
+        self._done = min(self._done + 1, self._total)
+        candidates = None
+        if shown and len(shown) == len(self._names):
+            count = min(_SHOWN, *(len(s.scores) for s in shown))
+            candidates = Pose(np.stack([s.positions[:count] for s in shown], 1),
+                              np.stack([s.quaternions[:count] for s in shown], 1))  # fmt: skip
+        progress = Progress(self._done, self._total, note)
+        return EstimateStep(progress, stage, guess.state(), candidates, None, 1.0, tuple(losses or ()), loss)

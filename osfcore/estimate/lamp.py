@@ -1,0 +1,58 @@
+"""Where the light is, for objects whose poses are roughly known: shading of the table and cast shadows tell.
+
+A coarse grid over the hemisphere, then finer ones around the best directions. The table alone tells how high the light
+stands, shadows tell its side; neither needs poses that are right to the degree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.estimate.models import QUALITY, Models
+from osfcore.estimate.resting import sphere
+from osfcore.estimate.tangent import LIGHT, Guess
+from osfcore.estimate.views import Views
+from osfcore.scene import MIN_LIGHT_ELEVATION_DEG
+
+_DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
+_FIRST_STEP_RAD = np.deg2rad(8.0)
+_ROUNDS = 5  # each with half the step
+_MOST_ERROR = 0.25  # of radiance that counts: objects may still be turned the wrong way
+_SURVIVORS = 3
+_AROUND = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
+
+
+def find_light(models: Models, coarse: Views, fine: Views, guess: Guess) -> Float[np.ndarray, "3"]:
+    """Unit vector toward the light that explains the images best, the objects being where they are guessed.
+
+    Args:
+        models: fields.
+        coarse: images to try the whole hemisphere on.
+        fine: images to refine on.
+        guess: objects and pusher; its light plays no part.
+    """
+    directions = sphere(_DIRECTIONS)
+    directions = directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
+    best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_SURVIVORS]]
+    step = _FIRST_STEP_RAD
+    for number in range(_ROUNDS):
+        tried = np.concatenate([_around(guess, light, step) for light in best])
+        order = np.argsort(_losses(models, fine, guess, tried))
+        best = tried[order[: _SURVIVORS if number == 0 else 1]]
+        step /= 2
+    return best[0]
+
+
+def _around(guess: Guess, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
+    changes = np.zeros((len(_AROUND), guess.size))
+    changes[:, -LIGHT:] = step * _AROUND
+    return replace(guess, light=light).moved(changes).lights
+
+
+def _losses(models: Models, views: Views, guess: Guess, lights: np.ndarray) -> Float[np.ndarray, "B"]:
+    batch = replace(guess.moved(np.zeros((len(lights), guess.size))), lights=lights)
+    rendered = models.together.render(batch, views.cameras, quality=QUALITY)
+    return np.minimum(np.abs(rendered.rgb - views.images), _MOST_ERROR).mean(axis=(1, 2, 3, 4))

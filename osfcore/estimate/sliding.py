@@ -1,0 +1,137 @@
+"""Finding an object in one image without a mask: templates slid over the image, under every light at once.
+
+A matte object under any distant light looks nearly like a mixture of its images under four lights. A template is those
+four; where it is put, the best mixture is a small least-squares problem. What counts is how much better it explains
+its pixels than the bare table does, lit or in shadow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.estimate.models import QUALITY, Models
+from osfcore.estimate.views import Views, window
+from osfcore.poses import rotate
+from osfcore.render.scene_renderer import SceneBatch
+from osfcore.scene import WORKSPACE_HALF_M, Camera
+
+_BASIS = np.array([[0, 0, 1.0], [0.8, 0, 0.6], [-0.4, 0.48**0.5, 0.6], [-0.4, -(0.48**0.5), 0.6]])  # toward the lights
+_REACH_M = WORKSPACE_HALF_M + 0.06
+_ANCHORS = 5  # along each side of the workspace; templates are rendered there, and slid by half the way between two
+_RIDGE = 0.05
+_MOST_TABLE_ERROR = 0.3
+_NEAR_M, _NEAR_RAD = 0.02, np.deg2rad(20.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sightings:
+    """Where an object may be in an image, the most likely first.
+
+    Attributes:
+        positions: of the object's origin [m].
+        quaternions: unit.
+        scores: by how much each explains its pixels better than the table does.
+    """
+
+    positions: Float[np.ndarray, "K 3"]
+    quaternions: Float[np.ndarray, "K 4"]
+    scores: Float[np.ndarray, "K"]
+
+
+def table_errors(models: Models, views: Views) -> Float[np.ndarray, "h w"]:
+    """Squared error of the first view's pixels, the table being lit or shaded at will."""
+    view = views.cameras[:1]
+    nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), _BASIS[:1], None)
+    table = models.together.render(nothing, view, quality=QUALITY).rgb[0, 0]
+    image = views.images[0]
+    share = (image * table).sum(axis=-1) / np.maximum((table * table).sum(axis=-1), 1e-6)
+    errors = image - table * np.clip(share, 0.2, 1.05)[..., None]
+    return np.minimum((errors**2).sum(axis=-1), _MOST_TABLE_ERROR**2)
+
+
+def sight(models: Models, views: Views, name: str, quaternions: Float[np.ndarray, "K 4"],
+          heights: Float[np.ndarray, "K"], *, most: int) -> Sightings:  # fmt: skip
+    """Look for an object in the first view, in given orientations and at given heights of its origin [m]."""
+    camera, image, table = views.cameras[0], views.images[0], table_errors(models, views)
+    grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
+    found = [_around(models, camera, image, table, name, quaternions, heights, (x, y)) for x in grid for y in grid]
+    positions, turns, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return _thinned(positions, turns, scores, most)
+
+
+def _around(models: Models, camera: Camera, image: np.ndarray, table: np.ndarray, name: str, quaternions: np.ndarray,
+            heights: np.ndarray, anchor: tuple[float, float]) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """The best place of each orientation around an anchor: positions, orientations, scores."""
+    resting = models.resting(name)
+    positions = np.column_stack([np.tile(anchor, (len(heights), 1)), heights])
+    centre = positions[0] + rotate(quaternions[0], resting.centre)
+    middle = camera.project(centre)
+    depth = float(camera.T_world_camera.inverse().apply(centre)[2])
+    per_metre = camera.intrinsics[0, 0] / max(depth, 1e-3)
+    half = int(np.clip(np.ceil(1.15 * resting.radius * per_metre) + 1, 8, min(image.shape[:2]) // 2))
+    shift = int(np.ceil(_REACH_M / _ANCHORS * per_metre)) + 1
+    x, y = (int(v) for v in np.round(middle) - half)
+    height, width = image.shape[:2]
+    if not (-2 * half < x < width and -2 * half < y < height):
+        return np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)  # the camera does not look there
+    patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
+    scores = _scores(models, window(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, patches)
+    best = scores.argmax(axis=0)
+    pixels = camera.project(positions) + places[best]
+    directions = camera.ray_directions(pixels)
+    eye = camera.T_world_camera.position
+    far = (heights - eye[2]) / np.minimum(directions[:, 2], -1e-3)
+    return eye + far[:, None] * directions, quaternions, scores.max(axis=0)
+
+
+def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[np.ndarray, np.ndarray]:
+    """Windows of an image around one, S x side x side x c, and by how much each is shifted (x, y).
+
+    Beyond the image's border everything is black, and the table explains it.
+    """
+    border = side + shift
+    wide = np.pad(image, ((border, border), (border, border), (0, 0)))
+    top, left = y + border - shift, x + border - shift
+    part = wide[top : top + side + 2 * shift, left : left + side + 2 * shift]
+    windows = np.moveaxis(np.lib.stride_tricks.sliding_window_view(part, (side, side), axis=(0, 1)), 2, -1)
+    rows, columns = np.mgrid[: windows.shape[0], : windows.shape[1]] - shift
+    offsets = np.column_stack([columns.ravel(), rows.ravel()])
+    return windows.reshape(-1, side, side, image.shape[-1]), offsets
+
+
+def _scores(models: Models, camera: Camera, name: str, positions: np.ndarray, quaternions: np.ndarray,
+            patches: np.ndarray) -> Float[np.ndarray, "S K"]:  # fmt: skip
+    """How much better each of K templates explains each of S windows than the table does."""
+    count, lights = len(positions), len(_BASIS)
+    batch = SceneBatch((name,), np.repeat(positions, lights, axis=0)[:, None],
+                       np.repeat(quaternions, lights, axis=0)[:, None], np.tile(_BASIS, (count, 1)), None)  # fmt: skip
+    rendered = models.alone.render(batch, (camera,), quality=QUALITY, outputs={"rgb", "opacity"})
+    assert rendered.opacity is not None
+    mask = (rendered.opacity[::lights, 0, 0] > 0.5).reshape(count, -1).astype(np.float32)
+    basis = rendered.rgb[:, 0].reshape(count, lights, -1) * np.repeat(mask, 3, axis=-1)[:, None]
+    pixels = patches[..., :3].reshape(len(patches), -1).astype(np.float32)
+    gram = basis @ np.swapaxes(basis, 1, 2)
+    gram += _RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None] / lights * np.eye(lights) + 1e-6 * np.eye(lights)
+    seen = (pixels @ basis.reshape(count * lights, -1).T).reshape(len(patches), count, lights)
+    explained = np.einsum("skl,klm,skm->sk", seen, np.linalg.inv(gram), seen, optimize=True)
+    squares = (pixels**2).reshape(len(patches), -1, 3).sum(axis=-1) @ mask.T
+    of_table = patches[..., 3].reshape(len(patches), -1) @ mask.T
+    return of_table - (squares - explained)
+
+
+def _thinned(positions: np.ndarray, quaternions: np.ndarray, scores: np.ndarray, most: int) -> Sightings:
+    """The best ones that differ in place or orientation."""
+    kept: list[int] = []
+    for k in np.argsort(-scores):
+        if all(
+            np.linalg.norm(positions[k] - positions[o]) > _NEAR_M
+            or abs(quaternions[k] @ quaternions[o]) < np.cos(_NEAR_RAD / 2)
+            for o in kept
+        ):
+            kept.append(int(k))
+        if len(kept) == most:
+            break
+    return Sightings(positions[kept], quaternions[kept], scores[kept])
