@@ -23,7 +23,7 @@ from osfcore.estimate.polish import Descent, polish
 from osfcore.estimate.rivals import challenged, turned
 from osfcore.estimate.starts import OVERHEAD, Starts, lying_starts, ranked
 from osfcore.estimate.steps import EstimateStep, Stage
-from osfcore.estimate.tangent import LIGHT, POSE, Guess
+from osfcore.estimate.tangent import LIGHT, Guess
 from osfcore.estimate.trust import gather, judged
 from osfcore.estimate.views import FINE_SIDE, Part, Views, part_of, views_of
 from osfcore.estimate.whole import residuals, whole_loss
@@ -33,6 +33,7 @@ from osfcore.scene import Observation
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
 _SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.12, 0.03
+_RANKED_SHARP = 100
 _SHOWN = 24  # candidates of a ranking that are shown
 
 
@@ -99,6 +100,7 @@ class _First:
         self._coarse = views_of(observation, _COARSE_SIDE)
         self._middle = views_of(observation, _COARSE_SIDE, samples=2)
         self._rough = views_of(observation, _ROUGH_SIDE)
+        self._sharp = views_of(observation, FINE_SIDE)
         self._fine = views_of(observation, FINE_SIDE, samples=2)
         e = effort
         count = len(self._names)
@@ -118,8 +120,8 @@ class _First:
         if self._effort.light == "search":
             light = find_light(self._models, self._rough, self._coarse, self._guess(starts, OVERHEAD))
             yield self._ranking("light", "Shading and shadows", starts, light)
-            for n, (name, part) in enumerate(zip(self._names, better, strict=True)):
-                starts[n] = ranked(self._models, name, part, starts[n].positions, starts[n].quaternions, light)
+            for n, name in enumerate(self._names):
+                starts[n] = self._ranked_again(n, starts[n], light)
                 yield self._ranking("orientations", f"{name}: under this light", starts, light)
         starts = [found.distinct(self._effort.starts) for found in starts]
         starts = yield from self._search_objects(better, starts, light)
@@ -127,6 +129,13 @@ class _First:
         at = yield from self._descend(guess)
         at = yield from self._compare(at, starts)
         yield self._finish(at)
+
+    def _ranked_again(self, n: int, starts: Starts, light: np.ndarray) -> Starts:
+        """In the order that the light gives, the best of them in full resolution: labels tell sides apart."""
+        for views, count in ((self._coarse, len(starts.losses)), (self._sharp, _RANKED_SHARP)):
+            part, best = _visible_part(views, n), starts.best(count)
+            starts = ranked(self._models, self._names[n], part, best.positions, best.quaternions, light)
+        return starts
 
     def _search_objects(
         self, parts: list[Part], starts: list[Starts], light: np.ndarray
@@ -177,9 +186,11 @@ class _First:
             k = int(np.argmin(losses))
             if losses[k] < least:
                 least = float(losses[k])
-                best = replace(guess, positions=batch.positions[k], quaternions=batch.quaternions[k], light=batch.lights[k])  # fmt: skip
+                found = batch.positions[k], batch.quaternions[k], batch.lights[k]
+                best = replace(guess, positions=found[0], quaternions=found[1], light=found[2])
             poses = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(self._names))]
-            yield self._step("together", "All objects and the light", best, poses, [], search.sigma, batch.lights, least)
+            note = "All objects and the light"
+            yield self._step("together", note, best, poses, [], search.sigma, batch.lights, least)
         return best
 
     def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
@@ -188,7 +199,8 @@ class _First:
         e = self._effort
         rounds = (self._middle, e.coarse_iterations), (self._fine, e.fine_iterations)
         for views, iterations in rounds:
-            for at in polish(self._models, views, at, iterations=iterations, light=light):
+            for step in polish(self._models, views, at, iterations=iterations, light=light):
+                at = step
                 yield self._polishing("The last millimetres", at)
         return at
 
@@ -198,7 +210,7 @@ class _First:
             spun = turned(self._models, at.guess, n)
             others = Pose(np.concatenate([found.positions, spun.position]),
                           np.concatenate([found.quaternions, spun.quaternion]))  # fmt: skip
-            at, self._rivals[n] = challenged(self._models, self._fine, at, n, others)
+            at, self._rivals[n] = challenged(self._models, self._middle, self._fine, at, n, others)
             yield self._polishing(f"{self._names[n]}: the other way round", at)
         return at
 

@@ -81,7 +81,8 @@ class _Goal:
     def __init__(self, models: Models, observation: Observation, prior: SceneState, effort: GoalEffort) -> None:
         self._models, self._effort, self._prior = models, effort, prior
         self._names = observation.names
-        self._fine = views_of(observation, FINE_SIDE)
+        self._fine = views_of(observation, FINE_SIDE, samples=2)
+        self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, effort.side)
@@ -150,13 +151,17 @@ class _Goal:
     def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
         e = self._effort
         at = Descent.at(guess)
-        for views, numbers, iterations in ((self._coarse, PLANAR, e.planar_iterations), (self._fine, PLANAR, 2)):
-            for at in polish(self._models, views, at, iterations=iterations, numbers=numbers, light=self._coarse):
+        for views, numbers, iterations in ((self._middle, PLANAR, e.planar_iterations), (self._fine, PLANAR, 2)):
+            for step in polish(self._models, views, at, iterations=iterations, numbers=numbers, light=self._middle):
+                at = step
                 yield self._polishing("On the table", at)
         for n, name in enumerate(self._names):
-            at, self._rivals[n] = challenged(self._models, self._fine, at, n, turned(self._models, at.guess, n))
+            at, self._rivals[n] = challenged(
+                self._models, self._middle, self._fine, at, n, turned(self._models, at.guess, n)
+            )
             yield self._polishing(f"{name}: the other way round", at)
-        for at in polish(self._models, self._fine, at, iterations=e.free_iterations, light=self._coarse):
+        for step in polish(self._models, self._fine, at, iterations=e.free_iterations, light=self._middle):
+            at = step
             yield self._polishing("The last millimetres", at)
         return at
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from osfcore.estimate.models import QUALITY, Models
+from osfcore.estimate.models import Models
 from osfcore.estimate.views import Part
 from osfcore.render.scene_renderer import SceneBatch
 
@@ -40,7 +40,7 @@ def look_at(
     """Render one object in B poses under one light."""
     lights = np.tile(light, (len(positions), 1))
     batch = SceneBatch((name,), positions[:, None], quaternions[:, None], lights, None)
-    rendered = models.alone.render(batch, part.cameras, quality=QUALITY, outputs={"rgb", "opacity"})
+    rendered = models.alone.render(batch, part.cameras, quality=part.quality, outputs={"rgb", "opacity"})
     assert rendered.opacity is not None
     return Look(rendered.rgb, rendered.opacity[:, :, 0])
 

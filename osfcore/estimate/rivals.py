@@ -17,7 +17,8 @@ from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
 _TRIED = 3  # rivals that are refined
-_ITERATIONS = 3
+_ITERATIONS, _FINE_ITERATIONS = 3, 2
+_CLOSE = 1.5  # a rival's loss, over that of the pose, up to which it is refined on fine images
 _SAME_RAD = np.deg2rad(12.0)
 
 
@@ -30,38 +31,40 @@ def turned(models: Models, guess: Guess, number: int) -> Pose:
     return Pose(middle - rotate(quaternions, centre), quaternions)
 
 
-def challenged(models: Models, views: Views, at: Descent, number: int, others: Pose) -> tuple[Descent, float]:
+def challenged(
+    models: Models, coarse: Views, fine: Views, at: Descent, number: int, others: Pose
+) -> tuple[Descent, float]:
     """The better of a descent's pose of one object and its best rival, and by which factor the loser's loss is larger.
 
     Args:
         models: fields.
-        views: what was observed.
+        coarse: images in which rivals are tried and refined.
+        fine: images in which the best of them is compared.
         at: the scene so far.
         number: of the object.
         others: poses that it might have instead, a batch.
     """
-    own = around(views, models, at.guess, number)
-    here = float(_losses(models, own, at.guess, number, Pose(at.guess.positions[[number]], at.guess.quaternions[[number]]))[0])  # fmt: skip
-    order = np.argsort(_losses(models, own, at.guess, number, others))
+    order = np.argsort(_losses(models, around(coarse, models, at.guess, number), at.guess, number, others))
     far = [k for k in order if rotation_angle(others.quaternion[k], at.guess.quaternions[number]) > _SAME_RAD]
-    best, least = at, np.inf
-    for k in _distinct(far, others):
-        guess = _with(at.guess, number, others[k])
-        rival = replace(Descent.at(guess), normals=at.normals)
-        for rival in polish(models, views, rival, iterations=_ITERATIONS, objects=(number,)):
-            pass
-        pose = Pose(rival.guess.positions[[number]], rival.guess.quaternions[[number]])
-        loss = float(_losses(models, own, rival.guess, number, pose)[0])
-        if rotation_angle(pose.quaternion[0], at.guess.quaternions[number]) < _SAME_RAD:  # it fell back
-            if loss < here:
-                at, here = replace(rival, losses=at.losses), loss
-        elif loss < least:
-            best, least = rival, loss
-    if least < here:
-        losses = at.losses.copy()
-        losses[number] = least
-        return replace(best, losses=losses, dampings=at.dampings), here / max(least, 1e-12)
-    return at, least / max(here, 1e-12)
+    refined = [_refined(models, coarse, at, number, others[k], _ITERATIONS) for k in _distinct(far, others)]
+    if not refined:
+        return at, np.inf
+    own = around(coarse, models, at.guess, number)
+    ends = [_loss(models, own, descent.guess, number) for descent in refined]
+    rival = refined[int(np.argmin(ends))]
+    if min(ends) < _CLOSE * _loss(models, own, at.guess, number):
+        rival = _refined(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
+    own = around(fine, models, at.guess, number)
+    here, there = (_loss(models, own, guess, number) for guess in (at.guess, rival.guess))
+    angle = rotation_angle(rival.guess.quaternions[number], at.guess.quaternions[number])
+    ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
+    return (replace(rival, losses=at.losses) if there < here else at), float(ratio)
+
+
+def _refined(models: Models, views: Views, at: Descent, number: int, pose: Pose, iterations: int) -> Descent:
+    """A descent of one object, begun in a pose; curvatures stay those of before until it moves."""
+    rival = replace(at, guess=_with(at.guess, number, pose), dampings=Descent.at(at.guess).dampings)
+    return list(polish(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
 def _distinct(order: list[int], poses: Pose) -> list[int]:
@@ -78,6 +81,14 @@ def _with(guess: Guess, number: int, pose: Pose) -> Guess:
     positions, quaternions = guess.positions.copy(), guess.quaternions.copy()
     positions[number], quaternions[number] = pose.position, pose.quaternion
     return replace(guess, positions=positions, quaternions=quaternions)
+
+
+def _pose(guess: Guess, number: int) -> Pose:
+    return Pose(guess.positions[number], guess.quaternions[number])
+
+
+def _loss(models: Models, views: Views, guess: Guess, number: int) -> float:
+    return float(_losses(models, views, guess, number, _pose(guess, number)[None])[0])
 
 
 def _losses(models: Models, views: Views, guess: Guess, number: int, poses: Pose) -> Float[np.ndarray, "K"]:

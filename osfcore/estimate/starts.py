@@ -36,6 +36,10 @@ class Starts:
     quaternions: Float[np.ndarray, "K 4"]
     losses: Float[np.ndarray, "K"]
 
+    def best(self, count: int) -> Starts:
+        """The best `count`."""
+        return Starts(self.positions[:count], self.quaternions[:count], self.losses[:count])
+
     def distinct(self, count: int) -> Starts:
         """The best `count` whose orientations differ by more than 25 degrees from better ones."""
         kept: list[int] = []

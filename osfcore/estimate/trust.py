@@ -1,4 +1,4 @@
-"""How sure an estimate is: standard deviations from the curvature of the loss, and doubts from what stays unexplained."""
+"""How sure an estimate is: deviations from the curvature of the loss, doubts from what stays unexplained."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Views:
 
 
 def views_of(observation: Observation, side: int, *, samples: int = 1) -> Views:
-    """An observation whose longer side has at most `side` pixels, to be compared with `samples` squared rays a pixel."""
+    """An observation of at most `side` pixels a side, to be compared with `samples` squared rays a pixel."""
     height, width = observation.images.shape[1:3]
     scale = min(1.0, side / max(height, width))
     size = (max(MIN_IMAGE_SIDE, round(width * scale)), max(MIN_IMAGE_SIDE, round(height * scale)))
@@ -70,6 +70,7 @@ class Part:
         mask: share of each pixel that shows it.
         valid: pixels in which no other object hides it.
         area: of the mask [px]; at least 1.
+        quality: of what is rendered to compare with.
     """
 
     cameras: tuple[Camera, ...]
@@ -77,6 +78,7 @@ class Part:
     mask: Float32[np.ndarray, "V h w"]
     valid: Bool[np.ndarray, "V h w"]
     area: Float32[np.ndarray, "V"]
+    quality: Quality
 
 
 def part_of(views: Views, number: int, *, margin: int = 3) -> Part:
@@ -97,7 +99,7 @@ def part_of(views: Views, number: int, *, margin: int = 3) -> Part:
     cameras = tuple(window(views.cameras[v], x, y, width, height) for v, (x, y) in zip(shown, corners, strict=True))
     mask, valid = cut(own), cut(covered) < _OTHER_SHARE
     area = np.maximum((mask * valid).sum(axis=(1, 2)), 1)
-    return Part(cameras, cut(views.images[shown]) * mask[..., None], mask, valid, area)
+    return Part(cameras, cut(views.images[shown]) * mask[..., None], mask, valid, area, views.quality)
 
 
 def around(views: Views, models: Models, guess: Guess, number: int) -> Views:
