@@ -49,7 +49,7 @@ class GoalEffort:
     side: int = FINE_SIDE // 2
     planar_iterations: int = 5
     free_iterations: int = 3
-    widen_above: float = 0.06
+    widen_above: float = 0.045
 
 
 def estimate_goal(

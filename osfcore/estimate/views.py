@@ -102,8 +102,11 @@ def part_of(views: Views, number: int, *, margin: int = 3) -> Part:
     return Part(cameras, cut(views.images[shown]) * mask[..., None], mask, valid, area, views.quality)
 
 
-def around(views: Views, models: Models, guess: Guess, number: int) -> Views:
-    """The windows around one object of a guess, without masks; as they are where it shows in none of them."""
+def around(views: Views, models: Models, guess: Guess, number: int, *, reach: float = 0.0) -> Views:
+    """The windows around one object of a guess, and `reach` [m] more, without masks.
+
+    Whole images where it shows in none of them.
+    """
     resting = models.resting(guess.names[number])
     centre = guess.positions[number] + rotate(guess.quaternions[number], resting.centre)
     height, width = views.images.shape[1:3]
@@ -113,12 +116,12 @@ def around(views: Views, models: Models, guess: Guess, number: int) -> Views:
         if depth < resting.radius:
             continue
         x, y = camera.project(centre)
-        reach = camera.intrinsics[0, 0] / depth * resting.radius + _MARGIN_PX
-        if -reach < x < width + reach and -reach < y < height + reach:
-            boxes.append((view, x, y, reach))
+        half = camera.intrinsics[0, 0] / depth * (resting.radius + reach) + _MARGIN_PX
+        if -half < x < width + half and -half < y < height + half:
+            boxes.append((view, x, y, half))
     if not boxes:
         return replace(views, masks=None)
-    side = int(np.ceil(2 * max(reach for *_, reach in boxes)))
+    side = int(np.ceil(2 * max(half for *_, half in boxes)))
     w, h = min(max(side, MIN_IMAGE_SIDE), width), min(max(side, MIN_IMAGE_SIDE), height)
     corners = [(int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))) for _, x, y, _ in boxes]
     cameras = tuple(window(views.cameras[v], x, y, w, h) for (v, *_), (x, y) in zip(boxes, corners, strict=True))

@@ -1,0 +1,182 @@
+"""Later frames: no masks, started from the last estimate or from a predicted state (paper section 4.2, last part).
+
+Most objects stand where they were expected; the residual of each tells. What fits is only polished. What does not is
+searched by CMA with a small spread around where it was expected, and then polished. The light is held until the bare
+table stops looking as it should: then somebody moved the lamp, and it is searched anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool
+
+from osfcore.errors import InvalidInput
+from osfcore.estimate.evolution import Evolution
+from osfcore.estimate.lamp import find_light
+from osfcore.estimate.models import Models
+from osfcore.estimate.polish import Descent, polish
+from osfcore.estimate.steps import EstimateStep, Stage
+from osfcore.estimate.tangent import POSE, Guess
+from osfcore.estimate.trust import gather, judged, object_residuals
+from osfcore.estimate.views import FINE_SIDE, Views, around, views_of
+from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.poses import Pose
+from osfcore.progress import Progress
+from osfcore.scene import Observation, SceneState
+
+_LOWEST_CENTRE_M = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class TrackEffort:
+    """How a later frame is estimated.
+
+    Attributes:
+        fits_below: residual of an object [radiance] up to which it counts as standing where it was expected.
+        lamp_above: residual of everything but the objects [radiance] from which the lamp counts as moved.
+        sweeps: of the descent over objects that moved.
+        population: candidates per generation of the search for objects that do not fit.
+        generations: of that search.
+        shift: its spread [m].
+        turn: its spread about the vertical [rad]; a quarter of it about other axes.
+        reach: how far around an object's expected place images are looked at [m].
+    """
+
+    fits_below: float = 0.045
+    lamp_above: float = 0.03
+    sweeps: int = 3
+    population: int = 20
+    generations: int = 8
+    shift: float = 0.03
+    turn: float = 0.4
+    reach: float = 0.06
+
+
+def estimate_next(
+    models: Models, observation: Observation, expected: SceneState, rng: np.random.Generator,
+    effort: TrackEffort | None = None,
+) -> Iterator[EstimateStep]:  # fmt: skip
+    """Find poses again; the last step holds the estimate.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: one or more views; masks play no part.
+        expected: the last estimate, or what was predicted from it, with the light as last estimated.
+        rng: of the search.
+        effort: how much work to do.
+
+    Raises:
+        InvalidInput: if the expected state is of other objects.
+        UnknownName: if an object has no field.
+    """
+    models.check(observation.names)
+    if expected.names != observation.names:
+        raise InvalidInput("objects of the expected state", ", ".join(expected.names), ", ".join(observation.names))
+    yield from _Track(models, observation, expected, rng, effort or TrackEffort()).steps()
+
+
+class _Track:
+    """The state of one estimation between its steps."""
+
+    def __init__(
+        self, models: Models, observation: Observation, expected: SceneState, rng: np.random.Generator,
+        effort: TrackEffort,
+    ) -> None:  # fmt: skip
+        self._models, self._rng, self._effort = models, rng, effort
+        self._guess = Guess.of(expected, observation.pusher)
+        self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
+        self._coarse = views_of(observation, FINE_SIDE // 2)
+        self._rough = views_of(observation, FINE_SIDE // 4)
+        self._done, self._total = 0, 4
+
+    def steps(self) -> Iterator[EstimateStep]:
+        at = Descent.at(self._guess)
+        misfit, lamp = self._misfits(at.guess)
+        if lamp and not misfit.any():  # objects alone cannot have changed the table far from them
+            at = yield from self._search_light(at)
+            misfit, lamp = self._misfits(at.guess)
+        at = yield from self._descend(at, misfit, 1)
+        if misfit.any():
+            misfit, _ = self._misfits(at.guess)
+            if misfit.any():
+                at = yield from self._search(at, misfit)
+            at = yield from self._descend(at, np.ones_like(misfit), self._effort.sweeps)
+            misfit, lamp = self._misfits(at.guess)
+            if lamp:
+                at = yield from self._search_light(at)
+                at = yield from self._descend(at, np.ones_like(misfit), self._effort.sweeps)
+        yield self._finish(at)
+
+    def _misfits(self, guess: Guess) -> tuple[Bool[np.ndarray, "N"], bool]:
+        """Which objects do not stand where they are guessed, and whether the light is not where it is guessed."""
+        evidence = gather(self._models, self._middle, guess)
+        misfit = object_residuals(evidence) > self._effort.fits_below
+        return misfit, evidence.surroundings > self._effort.lamp_above
+
+    def _search_light(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
+        light = find_light(self._models, self._rough, self._coarse, at.guess)
+        at = replace(at, guess=replace(at.guess, light=light))
+        yield self._step("light", "Shading and shadows", at)
+        return at
+
+    def _descend(
+        self, at: Descent, moving: Bool[np.ndarray, "N"], sweeps: int
+    ) -> Iterator[EstimateStep]:  # returns the Descent
+        objects = np.flatnonzero(moving).tolist() if moving.any() else list(range(len(moving)))
+        for step in polish(self._models, self._middle, at, iterations=sweeps, objects=objects):
+            at = step
+            yield self._step("polish", "The last millimetres", at)
+        return at
+
+    def _search(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """CMA over each object that does not fit: as if it had slid, and as if it had rolled."""
+        for n in np.flatnonzero(misfit):
+            views = around(self._coarse, self._models, at.guess, int(n), reach=self._effort.reach)
+            ends = []
+            for rolls in (False, True):
+                guess, loss = yield from self._search_one(at, int(n), views, rolls=rolls)
+                ends.append((loss, guess))
+            at = replace(at, guess=min(ends, key=lambda end: end[0])[1])
+        return at
+
+    def _search_one(self, at: Descent, n: int, views: Views, *, rolls: bool) -> Iterator[EstimateStep]:
+        """One CMA over an object's pose; returns the best guess and its loss."""
+        e, start = self._effort, at.guess
+        spread = np.array([e.shift, e.shift, e.shift / 4, e.turn / 4, e.turn / 4, e.turn])
+        search = Evolution(spread, e.population, self._rng)
+        height = max(float(start.positions[n, 2]), _LOWEST_CENTRE_M)
+        best, least = start, np.inf
+        for generation in range(e.generations):
+            asked = search.ask()
+            if generation == 0:
+                asked[0] = 0
+            changes = np.zeros((len(asked), start.size))
+            changes[:, POSE * n : POSE * (n + 1)] = asked
+            if rolls:
+                changes[:, POSE * n + 3] -= asked[:, 1] / height
+                changes[:, POSE * n + 4] += asked[:, 0] / height
+            batch = start.moved(changes)
+            losses = whole_loss(residuals(self._models, views, batch))
+            search.tell(losses)
+            k = int(np.argmin(losses))
+            if losses[k] < least:
+                least, best = float(losses[k]), start.changed(changes[k])
+            step = self._step("together", f"{start.names[n]}: where it went", replace(at, guess=best))
+            yield replace(step, candidates=Pose(batch.positions, batch.quaternions), sigma=search.sigma, loss=least)
+        return best, least
+
+    def _finish(self, at: Descent) -> EstimateStep:
+        evidence = gather(self._models, self._middle, at.guess)
+        estimate = judged(at.guess, at.normals, evidence, {}, light_held=True)
+        self._done = self._total - 1
+        step = self._step("done", "Done" if estimate.trusted else estimate.reason, at)
+        return replace(step, estimate=estimate)
+
+    def _step(self, stage: Stage, note: str, at: Descent) -> EstimateStep:
+        self._done = min(self._done + 1, self._total)
+        progress = Progress(self._done, self._total, note)
+        losses = tuple(at.losses[:-1].tolist())
+        return EstimateStep(progress, stage, at.guess.state(), losses=losses, loss=float(at.losses[-1]))
