@@ -46,7 +46,7 @@ class GoalEffort:
         widen_above: residual of an object [radiance] above which every way it can lie is tried.
     """
 
-    side: int = FINE_SIDE // 2
+    side: int = FINE_SIDE
     planar_iterations: int = 5
     free_iterations: int = 3
     widen_above: float = 0.045
