@@ -17,12 +17,12 @@ import numpy as np
 from osfcore.errors import InvalidInput
 from osfcore.estimate.evolution import Evolution
 from osfcore.estimate.lamp import find_light
-from osfcore.estimate.masked import look_at, masked_loss
 from osfcore.estimate.models import Models
 from osfcore.estimate.polish import Descent, polish
 from osfcore.estimate.rivals import challenged, turned
 from osfcore.estimate.starts import OVERHEAD, Starts, lying_starts, ranked
 from osfcore.estimate.steps import EstimateStep, Stage
+from osfcore.estimate.swarm import SHIFT_M, TURN_RAD, Swarm
 from osfcore.estimate.tangent import LIGHT, Guess
 from osfcore.estimate.trust import gather, judged
 from osfcore.estimate.views import FINE_SIDE, Part, Views, part_of, views_of
@@ -32,7 +32,8 @@ from osfcore.progress import Progress
 from osfcore.scene import Observation
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
-_SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.12, 0.03
+_LIGHT_RAD = 0.03  # the first spread of the light, where it was searched before
+_RIVALS = 3  # orientations of each object that the whole images choose from
 _RANKED_SHARP = 100
 _SHOWN = 24  # candidates of a ranking that are shown
 
@@ -140,49 +141,34 @@ class _First:
     def _search_objects(
         self, parts: list[Part], starts: list[Starts], light: np.ndarray
     ) -> Iterator[EstimateStep]:  # returns the refined starts
-        scales = np.array([_SHIFT_M] * 3 + [_TURN_RAD] * 3 + [0.0] * LIGHT)
-        guesses = [
-            [Guess((name,), p[None], q[None], light, None) for p, q in zip(s.positions, s.quaternions, strict=True)]
-            for name, s in zip(self._names, starts, strict=True)
-        ]
-        searches = [[Evolution(scales, self._effort.population, self._rng) for _ in own] for own in guesses]
-        for _ in range(self._effort.generations):
-            shown, losses = [], []
-            for n, part in enumerate(parts):
-                batches = [g.moved(s.ask()) for g, s in zip(guesses[n], searches[n], strict=True)]
-                positions = np.concatenate([b.positions[:, 0] for b in batches])
-                quaternions = np.concatenate([b.quaternions[:, 0] for b in batches])
-                look = look_at(self._models, self._names[n], part, positions, quaternions, light)
-                found = masked_loss(look, part, any_brightness=self._effort.light == "cma")
-                for search, own in zip(searches[n], found.reshape(len(batches), -1), strict=True):
-                    search.tell(own)
-                shown.append(Pose(positions, quaternions))
-                losses.append(float(found.min()))
+        e, brightness = self._effort, self._effort.light == "cma"
+        swarms = [
+            Swarm(self._models, name, part, own, light, population=e.population, rng=self._rng,
+                  any_brightness=brightness)
+            for name, part, own in zip(self._names, parts, starts, strict=True)
+        ]  # fmt: skip
+        for _ in range(e.generations):
+            tried = [swarm.advance() for swarm in swarms]
+            shown, losses = [t.candidates for t in tried], [t.loss for t in tried]
             best = self._guess(starts, light)
-            yield self._step("objects", "Each object in its masks", best, shown, losses, searches[0][0].sigma)
+            yield self._step("objects", "Each object in its masks", best, shown, losses, tried[0].sigma)
         refined = []
-        for n, name in enumerate(self._names):
-            ends = [g.changed(s.mean) for g, s in zip(guesses[n], searches[n], strict=True)]
-            positions = np.concatenate([starts[n].positions, *(g.positions for g in ends)])
-            quaternions = np.concatenate([starts[n].quaternions, *(g.quaternions for g in ends)])
-            part = _visible_part(self._fine, n)
-            brightness = self._effort.light == "cma"
-            found = ranked(self._models, name, part, positions, quaternions, light, any_brightness=brightness)
-            refined.append(found.distinct(3))
+        for n, (name, swarm) in enumerate(zip(self._names, swarms, strict=True)):
+            part, ends = _visible_part(self._fine, n), swarm.ends()
+            found = ranked(self._models, name, part, ends.position, ends.quaternion, light, any_brightness=brightness)
+            refined.append(found.distinct(_RIVALS))
         return refined
 
     def _search_together(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the guess
         e = self._effort
         spread = {"search": _LIGHT_RAD, "cma": 0.6, "overhead": 0.0}[e.light]
-        scales = np.array([*([_SHIFT_M / 2] * 3 + [_TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
+        scales = np.array([*([SHIFT_M / 2] * 3 + [TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
         search = Evolution(scales, e.joint_population, self._rng)
         best, least = guess, np.inf
         for _ in range(e.joint_generations):
-            changes = search.ask()
-            changes[0] = 0 if least == np.inf else changes[0]
-            batch = guess.moved(changes)
+            batch = guess.moved(np.concatenate([np.zeros((1, guess.size)), search.ask()]))
             losses = whole_loss(residuals(self._models, self._middle, batch))
-            search.tell(losses)
+            search.tell(losses[1:])
             k = int(np.argmin(losses))
             if losses[k] < least:
                 least = float(losses[k])

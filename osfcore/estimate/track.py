@@ -149,10 +149,8 @@ class _Track:
         search = Evolution(spread, e.population, self._rng)
         height = max(float(start.positions[n, 2]), _LOWEST_CENTRE_M)
         best, least = start, np.inf
-        for generation in range(e.generations):
-            asked = search.ask()
-            if generation == 0:
-                asked[0] = 0
+        for _ in range(e.generations):
+            asked = np.concatenate([np.zeros((1, POSE)), search.ask()])
             changes = np.zeros((len(asked), start.size))
             changes[:, POSE * n : POSE * (n + 1)] = asked
             if rolls:
@@ -160,7 +158,7 @@ class _Track:
                 changes[:, POSE * n + 4] += asked[:, 0] / height
             batch = start.moved(changes)
             losses = whole_loss(residuals(self._models, views, batch))
-            search.tell(losses)
+            search.tell(losses[1:])
             k = int(np.argmin(losses))
             if losses[k] < least:
                 least, best = float(losses[k]), start.changed(changes[k])
