@@ -19,7 +19,8 @@ from osfcore.fields.outputs import check_place
 from osfcore.fields.overlay import overlay_sheet
 from osfcore.fields.set_archive import unpack_set
 from osfcore.fields.table import TABLE_FORMAT, read_table
-from osfcore.fields.weights import read_field, tensor_format, write_atomically
+from osfcore.fields.weights import read_field, tensor_format
+from osfcore.files import write_atomically
 from osfcore.scenefile import read_scene
 
 
