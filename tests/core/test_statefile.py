@@ -98,7 +98,7 @@ def test_a_plain_scene_is_a_trusted_state_without_uncertainty(tmp_path):
         (("light", "position"), [0, 0, -1], "light"),
         (("trusted",), "yes", "trusted is 'yes', but it must be true or false"),
         (("trusted",), True, "reason is 'it hides', but it must be empty where trusted is true"),
-        (("reason",), "", "reason is '', but it must be .*, a sentence where it is false"),
+        (("reason",), "", "reason is '', but it must be .*a sentence where it is false"),
         (("reason",), 7, "reason of state is 7"),
     ],
 )
