@@ -30,6 +30,7 @@ ROOMS = (
     "estimate",
     "objects",
     "world",
+    "observation_overlay",
     "check",
     "evaluate",
 )
