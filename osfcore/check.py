@@ -11,16 +11,23 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.errors import CorruptFile, InvalidInput, shown
 from osfcore.fields.hull import carve, silhouette_box
 from osfcore.fields.image_set import read_image_set, read_splits
 from osfcore.fields.outputs import check_place
 from osfcore.fields.overlay import overlay_sheet
 from osfcore.fields.set_archive import unpack_set
 from osfcore.fields.table import TABLE_FORMAT, read_table
-from osfcore.fields.weights import read_field, tensor_format, write_atomically
-from osfcore.scenefile import read_scene
+from osfcore.fields.weights import read_field, tensor_format
+from osfcore.files import read_json, write_atomically
+from osfcore.observation_overlay import observation_sheet
+from osfcore.observationfile import OBSERVATION_FILE, is_observation, read_observation
+from osfcore.scenefile import scene_from_json
+from osfcore.statefile import estimated_from_json, is_estimated
+
+_REASON_CHARACTERS = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +35,7 @@ class Report:
     """What a file turned out to be.
 
     Attributes:
-        kind: "scene", "image set", "push file" or "field".
+        kind: "scene", "state", "observation", "image set", "push file" or "field".
         summary: its contents in words.
         facts: its contents in numbers.
     """
@@ -44,19 +51,44 @@ def check_path(path: Path) -> Report:
     Raises:
         CorruptFile: if it is of no known kind or broken; the message says where.
     """
+    if is_observation(path):
+        return _check_observation(path)
     if path.is_dir() or path.suffix.lower() == ".zip":
         with _unpacked(path) as folder:
             return _check_image_set(folder)
     if path.suffix.lower() == ".json":
-        scene = read_scene(path)
-        counts = {"objects": len(scene.state.names), "cameras": len(scene.cameras)}
-        return Report("scene", f"{counts['objects']} objects, {counts['cameras']} cameras", counts)
+        if path.name == OBSERVATION_FILE:
+            raise CorruptFile(path, "it is one file of an observation; check the folder that holds it")
+        return read_json(path, _scene_or_state)
     if path.suffix.lower() in (".h5", ".hdf5"):
         return _check_pushes(path)
     if path.suffix.lower() == ".safetensors":
         return _check_field(path)
-    kinds = "a .json scene, a .h5 push file, a .safetensors field nor the folder or .zip of an image set"
+    kinds = (
+        "a .json scene or state, a .h5 push file, a .safetensors field nor the folder of an observation or image set"
+    )
     raise CorruptFile(path, f"it is neither {kinds}")
+
+
+def _scene_or_state(data: object) -> Report:
+    if not is_estimated(data):
+        scene = scene_from_json(data)
+        counts = {"objects": len(scene.state.names), "cameras": len(scene.cameras)}
+        return Report("scene", f"{counts['objects']} objects, {counts['cameras']} cameras", counts)
+    estimate = estimated_from_json(data)
+    count = len(estimate.state.names)
+    facts = {"objects": count, "trusted": estimate.trusted, "reason": estimate.reason}
+    trust = "trusted" if estimate.trusted else f"not trusted: {shown(estimate.reason, _REASON_CHARACTERS)}"
+    return Report("state", f"{count} objects, {trust}", facts)
+
+
+def _check_observation(folder: Path) -> Report:
+    observation = read_observation(folder)
+    height, width = observation.images.shape[1:3]
+    facts = {"cameras": len(observation.cameras), "objects": len(observation.names), "width": width, "height": height}
+    facts["masks"] = 0 if observation.masks is None else int(observation.masks.any(axis=(2, 3)).sum())
+    views = f"{facts['cameras']} view{'s' * (facts['cameras'] != 1)} of {width} x {height} px"
+    return Report("observation", f"{views}, {facts['objects']} objects, {facts['masks']} masks", facts)
 
 
 def _check_field(path: Path) -> Report:
@@ -127,28 +159,34 @@ def _unpacked(path: Path) -> Iterator[Path]:
 
 
 def draw_overlay(path: Path, out: Path) -> None:
-    """Draw what was understood of a set into some of its images, as one PNG.
+    """Draw what was understood of a set or an observation into its images, as one PNG.
 
-    That is the world's axes (x red, y green, z blue), the direction of the light (yellow) and the box that holds every
-    silhouette (magenta). Where cameras and silhouettes contradict each other there is no such box; one of about the
-    object's size is drawn where most cameras look, and lies beside the silhouettes.
+    For some images of a set that is the world's axes (x red, y green, z blue), the direction of the light (yellow) and
+    the box that holds every silhouette (magenta). Where cameras and silhouettes contradict each other there is no such
+    box; one of about the object's size is drawn where most cameras look, and lies beside the silhouettes. For an
+    observation see `observation_sheet`.
 
     Args:
-        path: folder or zip of an image set; it may be one in which `check_path` found contradicting silhouettes.
+        path: folder of an observation, or folder or zip of an image set; it may be a set in which `check_path` found
+            contradicting silhouettes.
         out: PNG to write.
 
     Raises:
-        CorruptFile: if it is no image set.
+        CorruptFile: if it is neither.
         InvalidInput: if the PNG would have another suffix.
         CannotWrite: if it cannot be written.
     """
     check_overlay_place(out)
+    sheet = observation_sheet(read_observation(path)) if is_observation(path) else _set_sheet(path)
+    _, data = cv2.imencode(".png", sheet)
+    write_atomically(out, data.tobytes())
+
+
+def _set_sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     with _unpacked(path) as folder:
         sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))
     has_box = not any(images.is_opaque for images in sets)
-    sheet = overlay_sheet(sets, carve(*sets).box if has_box else None)
-    _, data = cv2.imencode(".png", sheet)
-    write_atomically(out, data.tobytes())
+    return overlay_sheet(sets, carve(*sets).box if has_box else None)
 
 
 def check_overlay_place(out: Path) -> None:

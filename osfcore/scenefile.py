@@ -8,14 +8,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
 
-from osfcore.errors import CorruptFile, InvalidInput, OsfError
+from osfcore.errors import InvalidInput
+from osfcore.files import as_mapping, entry_of, list_of, read_json
 from osfcore.poses import Pose
 from osfcore.scene import Camera, Light, SceneState, finite_vector
 
@@ -61,25 +61,27 @@ def scene_from_json(data: object) -> Scene:
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
     """
-    root = _mapping(data, "scene")
-    objects = [_mapping(entry, "entry of objects") for entry in _sequence(root, "objects")]
-    names = tuple(str(_entry(entry, "name", "object")) for entry in objects)
+    root = as_mapping(data, "scene")
+    objects = [as_mapping(entry, "entry of objects") for entry in list_of(root, "objects", "scene")]
+    names = tuple(str(entry_of(entry, "name", "object")) for entry in objects)
     positions = [
-        finite_vector(_entry(o, "position", n), 3, f"position of {n} [m]") for n, o in zip(names, objects, strict=True)
+        finite_vector(entry_of(o, "position", n), 3, f"position of {n} [m]")
+        for n, o in zip(names, objects, strict=True)
     ]
     turns = [
-        finite_vector(_entry(o, "quaternion", n), 4, f"quaternion of {n}") for n, o in zip(names, objects, strict=True)
+        finite_vector(entry_of(o, "quaternion", n), 4, f"quaternion of {n}")
+        for n, o in zip(names, objects, strict=True)
     ]
     poses = Pose(np.array(positions).reshape(-1, 3), np.array(turns).reshape(-1, 4))
     light = Light(
-        finite_vector(_entry(_mapping(_entry(root, "light", "scene"), "light"), "position", "light"), 3, "light")
+        finite_vector(entry_of(as_mapping(entry_of(root, "light", "scene"), "light"), "position", "light"), 3, "light")
     )
     pusher = None
     if root.get("pusher") is not None:
         pusher = finite_vector(
-            _entry(_mapping(root["pusher"], "pusher"), "position", "pusher"), 3, "pusher position [m]"
+            entry_of(as_mapping(root["pusher"], "pusher"), "position", "pusher"), 3, "pusher position [m]"
         )
-    cameras = tuple(camera_from_json(c) for c in _sequence(root, "cameras")) if "cameras" in root else ()
+    cameras = tuple(camera_from_json(c) for c in list_of(root, "cameras", "scene")) if "cameras" in root else ()
     if len({camera.name for camera in cameras}) != len(cameras):
         raise InvalidInput("names of the cameras", [camera.name for camera in cameras], "all different")
     return Scene(SceneState(names, poses, light, pusher), cameras)
@@ -91,17 +93,17 @@ def camera_from_json(data: object) -> Camera:
     Raises:
         InvalidInput: if something is missing or out of range.
     """
-    entry = _mapping(data, "camera")
-    name = str(_entry(entry, "name", "camera"))
+    entry = as_mapping(data, "camera")
+    name = str(entry_of(entry, "name", "camera"))
     pose = finite_vector(
-        _flat(_entry(entry, "T_world_camera", f"camera {name}")), 16, f"T_world_camera of camera {name}"
+        _flat(entry_of(entry, "T_world_camera", f"camera {name}")), 16, f"T_world_camera of camera {name}"
     )
-    K = finite_vector(_flat(_entry(entry, "K", f"camera {name}")), 9, f"K of camera {name}")
+    K = finite_vector(_flat(entry_of(entry, "K", f"camera {name}")), 9, f"K of camera {name}")
     rotation = pose.reshape(4, 4)[:3, :3]
     is_rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
     if not is_rigid or not np.allclose(pose[12:], (0, 0, 0, 1)):
         raise InvalidInput(f"T_world_camera of camera {name}", pose.tolist(), "a rotation and a translation, 4 x 4")
-    sizes = [_entry(entry, key, f"camera {name}") for key in ("width", "height")]
+    sizes = [entry_of(entry, key, f"camera {name}") for key in ("width", "height")]
     if not all(isinstance(size, int) for size in sizes):
         raise InvalidInput(f"size of camera {name} [px]", sizes, "two whole numbers")
     return Camera(name, Pose.from_matrix(pose.reshape(4, 4)), K.reshape(3, 3), *sizes)
@@ -122,36 +124,4 @@ def read_scene(path: Path) -> Scene:
     Raises:
         CorruptFile: if it cannot be read or is not a scene; the message says why.
     """
-    try:
-        return scene_from_json(json.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise CorruptFile(path, error.strerror or str(error)) from error
-    except UnicodeDecodeError as error:
-        raise CorruptFile(path, "it is not a text file") from error
-    except json.JSONDecodeError as error:
-        raise CorruptFile(path, f"it is not valid JSON (line {error.lineno}: {error.msg})") from error
-    except RecursionError as error:
-        raise CorruptFile(path, "it is nested too deeply") from error
-    except OsfError as error:
-        raise CorruptFile(path, str(error).rstrip(".")) from error
-    except ValueError as error:  # a number with thousands of digits
-        raise CorruptFile(path, f"it is not valid JSON ({error})") from error
-
-
-def _mapping(value: object, what: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise InvalidInput(what, repr(value)[:60], "a JSON object")
-    return value
-
-
-def _entry(mapping: dict[str, Any], key: str, what: str) -> Any:  # noqa: ANN401
-    if key not in mapping:
-        raise InvalidInput(f"{key!r} of {what}", "missing", "given")
-    return mapping[key]
-
-
-def _sequence(mapping: dict[str, Any], key: str) -> list[Any]:
-    value = _entry(mapping, key, "scene")
-    if not isinstance(value, list):
-        raise InvalidInput(key, repr(value)[:60], "a list")
-    return value
+    return read_json(path, scene_from_json)

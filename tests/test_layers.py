@@ -17,16 +17,20 @@ ROOT = Path(__file__).parents[1]
 # A module may import from rooms to its left (and its own), never from rooms to its right.
 ROOMS = (
     "errors",
+    "files",
     "poses",
     "progress",
     "scene",
     "estimated",
     "scenefile",
+    "statefile",
+    "observationfile",
     "fields",
     "render",
     "estimate",
     "objects",
     "world",
+    "observation_overlay",
     "check",
     "evaluate",
 )

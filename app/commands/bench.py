@@ -39,7 +39,7 @@ class Bench:
         from osfcore.evaluate.images import contact_sheet, write_png
         from osfcore.fields.library import FieldLibrary
         from osfcore.fields.outputs import check_place
-        from osfcore.fields.weights import write_json
+        from osfcore.files import write_json
         from osfcore.objects.library import AssetLibrary
 
         config = BenchRender(scenes=self.scenes, repeats=self.repeats, seed=self.seed)

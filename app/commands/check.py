@@ -1,4 +1,4 @@
-"""`osf check`: validates what people bring: scenes, image sets, push files."""
+"""`osf check`: validates what people bring: scenes, states, observations, image sets, push files, fields."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from osfcore.errors import CorruptFile, OsfError
 
 @dataclass(frozen=True)
 class Check:
-    """Validate a scene.json, an image set folder or a push file, and draw an overlay if asked to."""
+    """Validate a scene.json or state.json, a folder with an observation or image set, a push file or a field."""
 
     path: tyro.conf.Positional[Path]
     """File or folder to check; an image set may be zipped."""
     overlay: Path | None = None
-    """For an image set: PNG to write, with axes, light and the silhouettes' box drawn into some of its images."""
+    """For an image set: PNG to write, with axes, light and the silhouettes' box drawn into some of its images; for an
+    observation with axes, workspace and masks."""
     json: bool = False
     """Print the result as one JSON object in the last line."""
 

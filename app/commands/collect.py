@@ -1,4 +1,4 @@
-"""`osf collect`: image sets and pushes from the simulator."""
+"""`osf collect`: image sets, pushes and observations from the simulator."""
 
 from __future__ import annotations
 
@@ -112,9 +112,46 @@ class CollectPushesCommand:
         return result
 
 
+@dataclass(frozen=True)
+class CollectObservationCommand:
+    """One observation of a random scene, to try 'osf estimate' with; truth.json in it tells what was there."""
+
+    out: Path
+    """Folder to write; must be new or empty."""
+    names: tuple[str, ...] | None = None
+    """Names of the objects; by default a random choice among those with a field."""
+    objects: int = 3
+    """How many objects, where no names are given."""
+    seed: int = 0
+    """Of objects, places and light."""
+    size: int = 128
+    """Side of the square images [px]."""
+    goal: bool = False
+    """Only the goal camera's view, without pusher and masks."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects, and fields trained on this machine, are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result names the folder and what is to be seen."""
+        from osfcore.fields.library import FieldLibrary
+        from osfcore.objects.library import AssetLibrary
+        from osfcore.world.collect_observation import CollectObservation, collect_observation
+
+        config = CollectObservation(self.out, self.names, self.objects, self.seed, self.size, self.goal)
+        known = FieldLibrary(self.data_dir).names()
+        made = collect_observation(config, AssetLibrary(self.data_dir / "objects"), known)
+        if not self.json:
+            views = "1 view" if len(made.cameras) == 1 else f"{len(made.cameras)} views"
+            print(f"Wrote {self.out}: {views} of {', '.join(made.names)}.")
+        return {"out": str(self.out), "objects": list(made.names), "cameras": [c.name for c in made.cameras]}
+
+
 Collect = Annotated[
     Annotated[CollectObjectCommand, tyro.conf.subcommand("object")]
     | Annotated[CollectTableCommand, tyro.conf.subcommand("table")]
-    | Annotated[CollectPushesCommand, tyro.conf.subcommand("pushes")],
+    | Annotated[CollectPushesCommand, tyro.conf.subcommand("pushes")]
+    | Annotated[CollectObservationCommand, tyro.conf.subcommand("observation")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from osfcore.evaluate.images import Comparison
-from osfcore.fields.weights import write_atomically, write_json
+from osfcore.files import write_atomically, write_json
 
 
 @dataclass(frozen=True, eq=False, slots=True)

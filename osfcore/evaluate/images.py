@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from osfcore.errors import CannotWrite, InvalidInput
-from osfcore.fields.weights import write_atomically
+from osfcore.files import write_atomically
 
 MASK_MARGIN_PX = 2
 MOST_DB = 100.0

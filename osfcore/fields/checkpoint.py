@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.weights import write_atomically
+from osfcore.files import write_atomically
 
 _ARRAYS = ("origin", "index", "rows", "cells", "networks", "ambient")
 

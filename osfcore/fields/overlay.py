@@ -44,14 +44,14 @@ def _tile(images: ImageSet, index: int, box: Float[np.ndarray, "2 3"] | None) ->
     middle = np.zeros(3) if box is None else box.mean(axis=0)
     if box is not None:
         for a, b in _edges(box):
-            _line(bgr, camera, a, b, _MAGENTA, 1)
+            draw_line(bgr, camera, a, b, _MAGENTA, 1)
     length = 0.25 * float(np.linalg.norm(camera.T_world_camera.position - middle))
     for axis, colour, letter in zip(np.eye(3), (_RED, _GREEN, _BLUE), "xyz", strict=True):
-        _line(bgr, camera, np.zeros(3), length * axis, colour, 2, letter)
-    _line(bgr, camera, middle, middle + length * images.light_directions[index], _YELLOW, 2, "light")
-    _write(bgr, camera.name, (6, 16), _WHITE)
+        draw_line(bgr, camera, np.zeros(3), length * axis, colour, 2, letter)
+    draw_line(bgr, camera, middle, middle + length * images.light_directions[index], _YELLOW, 2, "light")
+    draw_text(bgr, camera.name, (6, 16), _WHITE)
     if camera.T_world_camera.inverse().apply(middle)[2] <= 0:
-        _write(bgr, "object is BEHIND the camera", (6, _SIDE - 10), _RED)
+        draw_text(bgr, "object is BEHIND the camera", (6, _SIDE - 10), _RED)
     return bgr
 
 
@@ -62,7 +62,7 @@ def _edges(box: Float[np.ndarray, "2 3"]) -> list[tuple[np.ndarray, np.ndarray]]
     return [(box[a, (0, 1, 2)], box[b, (0, 1, 2)]) for a, b in pairs]
 
 
-def _line(
+def draw_line(
     bgr: UInt8[np.ndarray, "h w 3"],
     camera: Camera,
     a: Float[np.ndarray, "3"],
@@ -84,9 +84,10 @@ def _line(
         cv2.line(bgr, ends[0], ends[1], colour, width, cv2.LINE_AA)
         return
     cv2.arrowedLine(bgr, ends[0], ends[1], colour, width, cv2.LINE_AA, tipLength=0.15)
-    _write(bgr, label, (ends[1][0] + 4, ends[1][1] - 4), colour)
+    draw_text(bgr, label, (ends[1][0] + 4, ends[1][1] - 4), colour)
 
 
-def _write(bgr: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
+def draw_text(bgr: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    """Write small letters with a shadow, their lower left corner at a pixel."""
     for x, y, shade in ((place[0] + 1, place[1] + 1, (0, 0, 0)), (*place, colour)):
         cv2.putText(bgr, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, shade, 1, cv2.LINE_AA)

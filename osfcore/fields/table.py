@@ -16,7 +16,8 @@ from jaxtyping import Float, Float32
 from safetensors.numpy import save
 
 from osfcore.errors import CorruptFile, shown
-from osfcore.fields.weights import Tensors, read_tensors, tensors_from_bytes, write_atomically
+from osfcore.fields.weights import Tensors, read_tensors, tensors_from_bytes
+from osfcore.files import write_atomically
 
 TABLE_FORMAT = "table-1"
 _ARRAYS = ("albedo", "ambient", "background", "w1", "b1", "w2", "b2")

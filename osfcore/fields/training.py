@@ -32,7 +32,8 @@ from osfcore.fields.outputs import check_weights_place
 from osfcore.fields.rays import RaySource
 from osfcore.fields.shell import first_shell, refine, trim
 from osfcore.fields.teacher import Teacher, TeacherHoldout, TeacherRecipe
-from osfcore.fields.weights import field_bytes, field_from_bytes, write_atomically, write_json
+from osfcore.fields.weights import field_bytes, field_from_bytes
+from osfcore.files import write_atomically, write_json
 from osfcore.progress import Progress
 from osfcore.scene import check_seed
 

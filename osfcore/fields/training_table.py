@@ -19,7 +19,7 @@ from osfcore.fields.image_set import ImageSet, read_splits
 from osfcore.fields.outputs import check_weights_place
 from osfcore.fields.rays import RayBatch, RaySource
 from osfcore.fields.table import TableField, table_bytes, table_from_bytes
-from osfcore.fields.weights import write_atomically, write_json
+from osfcore.files import write_atomically, write_json
 from osfcore.progress import Progress
 from osfcore.scene import TABLE_SIDE_M, check_seed
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from osfcore.errors import CannotWrite, CorruptFile, shown
+from osfcore.errors import CorruptFile, shown
 from osfcore.fields.kiloosf import EMPTY_G, FEATURES, MOST_HIDDEN, KiloOSF, network_size
+from osfcore.files import write_atomically
 
 FORMAT = "kiloosf-1"
 MAX_FILE_BYTES = 64_000_000
@@ -182,34 +180,3 @@ def _parsed(data: bytes, where: Path | str) -> Tensors:
     except (SafetensorError, ValueError, TypeError, AttributeError, struct.error, KeyError, RecursionError) as error:
         raise CorruptFile(where, "it is not a whole safetensors file") from error
     return meta, tensors
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write bytes to a file that takes its name only when it is whole.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    _replace(path, lambda partial: partial.write_bytes(data))
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file in the same way.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
-
-
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(partial)
-        partial.replace(path)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
-    finally:
-        with contextlib.suppress(OSError):  # where nothing could be written, there may be no folder either
-            partial.unlink(missing_ok=True)

@@ -13,7 +13,8 @@ def osf(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    "command", [(), ("assets",), ("collect",), ("collect", "pushes"), ("check",), ("serve",), ("train", "field")]
+    "command",
+    [(), ("assets",), ("collect",), ("collect", "pushes"), ("check",), ("serve",), ("train", "field"), ("estimate",)],
 )
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stop:
@@ -40,6 +41,8 @@ def test_json_is_the_last_line_and_keys_are_stable(data_dir):
         (("collect", "pushes", "--out", "{tmp}/a", "--objects", "9"), "between 1 and 8"),
         (("collect", "pushes", "--out", "/proc/pushes.h5", "--episodes", "1"), "/proc"),
         (("train", "field", "--data", "{tmp}", "--out", "{tmp}/a.safetensors"), "anno.json"),
+        (("collect", "observation", "--out", "{tmp}/a", "--names", "teapot"), "no object named 'teapot'"),
+        (("estimate", "--observation", "{tmp}", "--out", "{tmp}/a.json"), "no folder with an observation.json"),
         (("check", "{tmp}/nothing"), "no such file"),
         (("assets", "fetch", "teapot"), "teapot"),
         (("assets", "fetch", "--source", "{tmp}/nowhere"), "nowhere"),

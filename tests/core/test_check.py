@@ -7,6 +7,11 @@ import pytest
 
 from osfcore.check import check_path, draw_overlay
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
+from osfcore.estimated import EstimatedState
+from osfcore.observationfile import write_observation
+from osfcore.poses import Pose
+from osfcore.scene import Light, Observation, SceneState, default_cameras
+from osfcore.statefile import write_estimated
 from osfcore.world.collect_images import CollectTable, collect_table
 from osfcore.world.push_file import EpisodeFolder, PushEpisode, save_episode
 from tests.core.fields.sets import edit, turn_cameras, write_set
@@ -149,3 +154,39 @@ def test_push_files_are_checked(tmp_path):
         check_path(push_file(tmp_path, actions=np.zeros(3)))
     with pytest.raises(CorruptFile, match="shape"):
         check_path(push_file(tmp_path, actions=np.zeros((4, 3))))
+
+
+def seen(tmp_path):
+    cameras = default_cameras(16)
+    masks = np.zeros((4, 2, 16, 16), bool)
+    masks[:3, 0, 4:9, 4:9] = True
+    write_observation(tmp_path / "scene", Observation(cameras, np.zeros((4, 16, 16, 3)), ("a", "b"), masks, None, 0.0))
+    return tmp_path / "scene"
+
+
+def test_observations_are_described_and_drawn(tmp_path):
+    folder = seen(tmp_path)
+    report = check_path(folder)
+    assert (report.kind, report.summary) == ("observation", "4 views of 16 x 16 px, 2 objects, 3 masks")
+    assert dict(report.facts) == {"cameras": 4, "objects": 2, "width": 16, "height": 16, "masks": 3}
+    draw_overlay(folder, tmp_path / "overlay.png")
+    assert cv2.imread(str(tmp_path / "overlay.png")).shape == (384, 4 * 384, 3)
+    assert count(tmp_path / "overlay.png", (0, 0, 255)) > 50
+    with pytest.raises(CorruptFile, match="check the folder that holds it"):
+        check_path(folder / "observation.json")
+    (folder / "mask_1_0.png").unlink()
+    with pytest.raises(CorruptFile, match="mask_1_0.png cannot be used: there is no such file"):
+        check_path(folder)
+
+
+def test_states_are_told_from_scenes(tmp_path):
+    state = SceneState(("a",), Pose.identity(1), Light(np.array([0, 0, 1.0])), None)
+    path = tmp_path / "state.json"
+    for reason, words in (("", "1 objects, trusted"), ("a: it hides", "1 objects, not trusted: a: it hides")):
+        write_estimated(path, EstimatedState(state, np.zeros(1), np.zeros(1), 0.0, (reason,), reason))
+        report = check_path(path)
+        assert (report.kind, report.summary) == ("state", words)
+        assert dict(report.facts) == {"objects": 1, "trusted": not reason, "reason": reason}
+    path.write_text(path.read_text().replace('"doubt": "', '"doubt": 3, "x": "'))
+    with pytest.raises(CorruptFile, match="doubt of a is 3"):
+        check_path(path)

@@ -1,6 +1,13 @@
+import shutil
+
 import pytest
 
-from app.commands.collect import CollectObjectCommand, CollectPushesCommand, CollectTableCommand
+from app.commands.collect import (
+    CollectObjectCommand,
+    CollectObservationCommand,
+    CollectPushesCommand,
+    CollectTableCommand,
+)
 from osfcore.check import check_path
 from osfcore.errors import InvalidInput, UnknownName
 
@@ -32,3 +39,19 @@ def test_mistakes_are_errors_of_ours(data_dir, tmp_path):
         CollectObjectCommand("teapot", tmp_path / "set", data_dir=data_dir).run()
     with pytest.raises(InvalidInput, match="workers"):
         CollectPushesCommand(tmp_path / "a.h5", workers=0, data_dir=data_dir).run()
+
+
+def test_an_observation_is_of_objects_with_fields(data_dir, tmp_path, capsys):
+    shutil.copytree(data_dir / "objects" / "009_gelatin_box", data_dir / "objects" / "box_without_field")
+    for seed in range(4):
+        out = tmp_path / str(seed)
+        result = CollectObservationCommand(out, objects=2, seed=seed, size=16, data_dir=data_dir).run()
+        assert result["cameras"] == ["0", "1", "2", "3"]
+        assert "box_without_field" not in result["objects"]
+        assert f"4 views of {', '.join(result['objects'])}." in capsys.readouterr().out
+        assert check_path(out).kind == "observation"
+        assert check_path(out / "truth.json").kind == "scene"
+    names = ("009_gelatin_box",)
+    goal = CollectObservationCommand(tmp_path / "goal", names, goal=True, json=True, data_dir=data_dir).run()
+    assert goal == {"out": str(tmp_path / "goal"), "objects": list(names), "cameras": ["goal"]}
+    assert capsys.readouterr().out == ""

@@ -1,4 +1,3 @@
-import json
 import struct
 from dataclasses import replace
 
@@ -17,9 +16,7 @@ from osfcore.fields.weights import (
     field_from_bytes,
     read_field,
     read_tensors,
-    write_atomically,
     write_field,
-    write_json,
 )
 from tests.core.render.scenes import HIDDEN, ball, random_field
 
@@ -284,15 +281,3 @@ def test_a_disk_that_refuses_leaves_the_old_file(tmp_path, field, monkeypatch):
         write_field(path, ball())
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_place_that_is_a_file_is_told(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CannotWrite, match="file"):
-        write_atomically(tmp_path / "file" / "a.safetensors", b"")
-
-
-def test_json_is_written_whole(tmp_path):
-    write_json(tmp_path / "a.json", {"psnr": 30.5})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"psnr": 30.5}
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]

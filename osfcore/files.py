@@ -1,0 +1,104 @@
+"""Files that are whole or not there, and JSON that is told apart from what it should be."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError
+
+MAX_JSON_BYTES = 16_000_000
+T = TypeVar("T")
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write bytes to a file that takes its name only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        raise CannotWrite(path, error.strerror or str(error)) from error
+    finally:
+        with contextlib.suppress(OSError):  # where nothing could be written, there may be no folder either
+            partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file in the same way.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def read_json(path: Path, parse: Callable[[object], T]) -> T:
+    """What `parse` makes of a JSON file.
+
+    Raises:
+        CorruptFile: if it cannot be read, is not JSON, or `parse` raises an OsfError; the message says why.
+    """
+    try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise CorruptFile(path, f"it is larger than {MAX_JSON_BYTES // 1_000_000} MB")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise CorruptFile(path, error.strerror or str(error)) from error
+    except UnicodeDecodeError as error:
+        raise CorruptFile(path, "it is not a text file") from error
+    try:
+        return parse(json.loads(text))
+    except json.JSONDecodeError as error:
+        raise CorruptFile(path, f"it is not valid JSON (line {error.lineno}: {error.msg})") from error
+    except RecursionError as error:
+        raise CorruptFile(path, "it is nested too deeply") from error
+    except CorruptFile:  # of a file that this one names
+        raise
+    except OsfError as error:
+        raise CorruptFile(path, str(error).rstrip(".")) from error
+    except ValueError as error:  # a number with thousands of digits
+        raise CorruptFile(path, f"it is not valid JSON ({error})") from error
+
+
+def as_mapping(value: object, what: str) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        InvalidInput: if it is something else.
+    """
+    if not isinstance(value, dict):
+        raise InvalidInput(what, repr(value)[:60], "a JSON object")
+    return value
+
+
+def entry_of(mapping: Mapping[str, Any], key: str, what: str) -> Any:  # noqa: ANN401
+    """An entry that must be there.
+
+    Raises:
+        InvalidInput: if it is missing.
+    """
+    if key not in mapping:
+        raise InvalidInput(f"{key!r} of {what}", "missing", "given")
+    return mapping[key]
+
+
+def list_of(mapping: Mapping[str, Any], key: str, what: str) -> list[Any]:
+    """An entry that must be there and be a list.
+
+    Raises:
+        InvalidInput: if it is not.
+    """
+    value = entry_of(mapping, key, what)
+    if not isinstance(value, list):
+        raise InvalidInput(key, repr(value)[:60], "a list")
+    return value
