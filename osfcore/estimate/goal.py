@@ -123,11 +123,12 @@ class _Goal:
         return sight(self._models, self._coarse, self._names[n], resting.quaternions, heights, most=2 * _SIGHTINGS)
 
     def _first(self, sightings: list[Sightings]) -> Guess:
-        """The best sighting of each object; those not looked for yet are away."""
+        """The best sighting of each object; those not seen, or not looked for yet, are away."""
         count = len(self._names)
         positions, quaternions = np.tile(_AWAY, (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         for n, found in enumerate(sightings):
-            positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
+            if len(found.scores):
+                positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
         return Guess(self._names, positions, quaternions, self._prior.light.direction, None)
 
     def _assemble(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the guess
