@@ -159,7 +159,8 @@ class _First:
                 shown.append(Pose(positions, quaternions))
                 losses.append(float(found.min()))
             best = self._guess(starts, light)
-            yield self._step("objects", "Each object in its masks", best, shown, losses, searches[0][0].sigma)
+            sigma = searches[0][0].sigma if searches else 1.0
+            yield self._step("objects", "Each object in its masks", best, shown, losses, sigma)
         refined = []
         for n, name in enumerate(self._names):
             ends = [g.changed(s.mean) for g, s in zip(guesses[n], searches[n], strict=True)]
