@@ -151,7 +151,8 @@ class _First:
             tried = [swarm.advance() for swarm in swarms]
             shown, losses = [t.candidates for t in tried], [t.loss for t in tried]
             best = self._guess(starts, light)
-            yield self._step("objects", "Each object in its masks", best, shown, losses, tried[0].sigma)
+            sigma = tried[0].sigma if tried else 1.0
+            yield self._step("objects", "Each object in its masks", best, shown, losses, sigma)
         refined = []
         for n, (name, swarm) in enumerate(zip(self._names, swarms, strict=True)):
             part, ends = _visible_part(self._fine, n), swarm.ends()

@@ -31,6 +31,7 @@ from osfcore.scene import Observation, SceneState
 _YAWS = 24
 _SIGHTINGS = 60
 _ROUNDS = 3
+_FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
 _AWAY = np.array([0.0, 0.0, -1.0])  # below the table: not in the image
 _SHOWN = 24
 
@@ -87,7 +88,8 @@ class _Goal:
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, effort.side)
         self._done = 0
-        self._total = 2 * len(self._names) + _ROUNDS + 2 * (effort.planar_iterations + effort.free_iterations) + 1
+        self._pass = _ROUNDS + effort.planar_iterations + _FINE_PLANAR + len(self._names) + effort.free_iterations
+        self._total = len(self._names) + self._pass + 1
         self._rivals: dict[int, float] = {}
 
     def steps(self) -> Iterator[EstimateStep]:
@@ -101,6 +103,7 @@ class _Goal:
         evidence = gather(self._models, self._fine, at.guess)
         bad = [n for n in range(count) if object_residuals(evidence)[n] > self._effort.widen_above]
         if bad:
+            self._total += len(bad) + self._pass
             for n in bad:
                 sightings[n] = self._any_way(n)
                 yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
@@ -123,11 +126,12 @@ class _Goal:
         return sight(self._models, self._coarse, self._names[n], resting.quaternions, heights, most=2 * _SIGHTINGS)
 
     def _first(self, sightings: list[Sightings]) -> Guess:
-        """The best sighting of each object; those not looked for yet are away."""
+        """The best sighting of each object; those not seen, or not looked for yet, are away."""
         count = len(self._names)
         positions, quaternions = np.tile(_AWAY, (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         for n, found in enumerate(sightings):
-            positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
+            if len(found.scores):
+                positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
         return Guess(self._names, positions, quaternions, self._prior.light.direction, None)
 
     def _assemble(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the guess
@@ -151,7 +155,10 @@ class _Goal:
     def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
         e = self._effort
         at = Descent.at(guess)
-        for views, numbers, iterations in ((self._middle, PLANAR, e.planar_iterations), (self._fine, PLANAR, 2)):
+        for views, numbers, iterations in (
+            (self._middle, PLANAR, e.planar_iterations),
+            (self._fine, PLANAR, _FINE_PLANAR),
+        ):
             for step in polish(self._models, views, at, iterations=iterations, numbers=numbers, light=self._middle):
                 at = step
                 yield self._polishing("On the table", at)

@@ -19,9 +19,9 @@ from osfcore.scene import MIN_LIGHT_ELEVATION_DEG
 
 _DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
 _FIRST_STEP_RAD = np.deg2rad(8.0)
-_ROUNDS = 5  # each with half the step
+_ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
 _MOST_ERROR = 0.25  # of radiance that counts: objects may still be turned the wrong way
-_SURVIVORS = 3
+_FIRST_SURVIVORS, _SURVIVORS = 6, 3  # a shadow that leaves one object and meets another makes a minimum of its own
 _AROUND = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
 
 
@@ -36,13 +36,12 @@ def find_light(models: Models, coarse: Views, fine: Views, guess: Guess) -> Floa
     """
     directions = sphere(_DIRECTIONS)
     directions = directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
-    best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_SURVIVORS]]
+    best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_FIRST_SURVIVORS]]
     step = _FIRST_STEP_RAD
-    for number in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         tried = np.concatenate([_around(guess, light, step) for light in best])
-        order = np.argsort(_losses(models, fine, guess, tried))
-        best = tried[order[: _SURVIVORS if number == 0 else 1]]
-        step /= 2
+        best = tried[np.argsort(_losses(models, fine, guess, tried))[:_SURVIVORS]]
+        step *= _SHRINKING
     return best[0]
 
 

@@ -16,7 +16,7 @@ from osfcore.estimate.models import QUALITY, Models
 from osfcore.estimate.views import Views, window
 from osfcore.poses import rotate
 from osfcore.render.scene_renderer import SceneBatch
-from osfcore.scene import WORKSPACE_HALF_M, Camera
+from osfcore.scene import TABLE_SIDE_M, WORKSPACE_HALF_M, Camera
 
 _BASIS = np.array([[0, 0, 1.0], [0.8, 0, 0.6], [-0.4, 0.48**0.5, 0.6], [-0.4, -(0.48**0.5), 0.6]])  # toward the lights
 _REACH_M = WORKSPACE_HALF_M + 0.06
@@ -68,15 +68,17 @@ def _around(models: Models, camera: Camera, image: np.ndarray, table: np.ndarray
     resting = models.resting(name)
     positions = np.column_stack([np.tile(anchor, (len(heights), 1)), heights])
     centre = positions[0] + rotate(quaternions[0], resting.centre)
-    middle = camera.project(centre)
+    nothing = np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
     depth = float(camera.T_world_camera.inverse().apply(centre)[2])
-    per_metre = camera.intrinsics[0, 0] / max(depth, 1e-3)
-    half = int(np.clip(np.ceil(1.15 * resting.radius * per_metre) + 1, 8, min(image.shape[:2]) // 2))
-    shift = int(np.ceil(_REACH_M / _ANCHORS * per_metre)) + 1
-    x, y = (int(v) for v in np.round(middle) - half)
+    if depth < resting.radius:
+        return nothing  # behind the camera, or around it
     height, width = image.shape[:2]
+    per_metre = camera.intrinsics[0, 0] / depth
+    half = int(np.clip(np.ceil(1.15 * resting.radius * per_metre) + 1, 8, min(height, width) // 2))
+    shift = min(int(np.ceil(_REACH_M / _ANCHORS * per_metre)) + 1, max(height, width) // 2)
+    x, y = (int(v) for v in np.round(camera.project(centre)) - half)
     if not (-2 * half < x < width and -2 * half < y < height):
-        return np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)  # the camera does not look there
+        return nothing  # the camera does not look there
     patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
     scores = _scores(models, window(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, patches)
     best = scores.argmax(axis=0)
@@ -84,7 +86,9 @@ def _around(models: Models, camera: Camera, image: np.ndarray, table: np.ndarray
     directions = camera.ray_directions(pixels)
     eye = camera.T_world_camera.position
     far = (heights - eye[2]) / np.minimum(directions[:, 2], -1e-3)
-    return eye + far[:, None] * directions, quaternions, scores.max(axis=0)
+    found = eye + far[:, None] * directions
+    on_table = np.abs(found[:, :2]).max(axis=1) < TABLE_SIDE_M / 2  # toward the horizon a pixel is many metres
+    return found[on_table], quaternions[on_table], scores.max(axis=0)[on_table]
 
 
 def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[np.ndarray, np.ndarray]:

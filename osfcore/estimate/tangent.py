@@ -18,7 +18,7 @@ from osfcore.scene import MIN_LIGHT_ELEVATION_DEG, Light, SceneState
 
 POSE = 6  # numbers per object
 LIGHT = 2
-_LOWEST_Z = np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG + 1e-3))
+_LOWEST_SLOPE = np.tan(np.deg2rad(MIN_LIGHT_ELEVATION_DEG + 1e-3))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,7 +62,7 @@ class Guess:
         quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)
         first, second = across(self.light)
         lights = self.light + changes[:, -2:-1] * first + changes[:, -1:] * second
-        lights[:, 2] = np.maximum(lights[:, 2], _LOWEST_Z * np.linalg.norm(lights, axis=1))
+        lights[:, 2] = np.maximum(lights[:, 2], _LOWEST_SLOPE * np.hypot(lights[:, 0], lights[:, 1]))
         lights /= np.linalg.norm(lights, axis=1, keepdims=True)
         pusher = None if self.pusher is None else np.tile(self.pusher, (len(changes), 1))
         return SceneBatch(self.names, positions, quaternions, lights, pusher)

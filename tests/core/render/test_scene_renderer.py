@@ -344,3 +344,35 @@ def test_what_was_not_asked_for_is_none_and_asking_changes_no_colour():
             assert (getattr(rendered, name) is not None) == (name in names)
             if name in names:
                 np.testing.assert_array_equal(getattr(rendered, name), getattr(everything, name))
+
+
+@pytest.mark.parametrize("quality", [EXACT, PLANNING, Quality(samples_per_side=2)])
+def test_only_some_pixels_are_those_of_the_whole_image_and_the_rest_is_empty(quality):
+    fields, scene = random_scene(2)
+    renderer, batch = SceneRenderer(fields, wooden_table()), batch_of(scene.names, 2)
+    cameras = [CAMERAS["usual"], CAMERAS["close"]]
+    only = np.random.default_rng(0).random((2, 24, 24)) < 0.3
+    whole = renderer.render(batch, cameras, quality=quality, outputs=OUTPUTS)
+    some = renderer.render(batch, cameras, quality=quality, outputs=OUTPUTS, only=only)
+    for name in ("rgb", "depth", "opacity", "masks"):
+        a, b = getattr(some, name), getattr(whole, name)
+        if name in ("opacity", "masks"):
+            a, b = np.moveaxis(a, 2, -1), np.moveaxis(b, 2, -1)
+        assert b[:, ~only].any()
+        np.testing.assert_array_equal(a[:, only], b[:, only], err_msg=name)
+        assert not a[:, ~only].any()
+
+
+def test_no_pixels_at_all_and_all_of_them():
+    fields, scene = random_scene(2)
+    renderer, batch = SceneRenderer(fields, wooden_table()), SceneBatch.of(scene)
+    nothing, everything = (renderer.render(batch, [view()], only=np.full((1, 32, 32), some)) for some in (False, True))
+    assert not nothing.rgb.any()
+    np.testing.assert_array_equal(everything.rgb, renderer.render(batch, [view()]).rgb)
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (2, 32, 32), (1, 24, 32), (1, 32, 32, 3)])
+def test_pixels_of_another_shape_are_refused(shape):
+    fields, scene = random_scene(2)
+    with pytest.raises(InvalidInput, match="shape of the pixels to look at"):
+        SceneRenderer(fields, None).render(SceneBatch.of(scene), [view()], only=np.ones(shape, bool))

@@ -1,0 +1,34 @@
+import numpy as np
+import pytest
+
+from osfcore.estimate.lamp import find_light
+from osfcore.estimate.views import views_of
+from osfcore.scene import Light, default_cameras
+from tests.core.estimate.scenes import BOTTLE, BOX, angle, guess_of, lying, observe, scene
+
+
+def found(models, state, guess):
+    seen = observe(models, state, default_cameras(96)[:2], masks=False)
+    return find_light(models, views_of(seen, 32), views_of(seen, 64), guess)
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(30, 15), (-120, 25), (140, 45), (-100, 70), (0, 89)])
+def test_the_light_of_a_scene_is_found(models, azimuth_deg, elevation_deg):
+    light = Light.from_angles(*np.deg2rad([azimuth_deg, elevation_deg])).direction
+    state = scene({BOX: lying(models, BOX, 30, 0.05, -0.08), BOTTLE: lying(models, BOTTLE, 50, -0.06, 0.09)}, light)
+    assert np.rad2deg(angle(found(models, state, guess_of(state)), light)) < 2
+
+
+def test_poses_need_not_be_right_to_the_degree(models, truth):
+    guess = guess_of(truth)
+    change = np.array([0.008, -0.005, 0.002, 0.05, 0, 0.1, -0.006, 0.007, 0, 0, 0.05, -0.12, 0, 0])
+    wrong = guess.changed(change)
+    assert np.rad2deg(angle(found(models, truth, wrong), truth.light.direction)) < 6
+
+
+def test_where_the_guess_has_its_light_plays_no_part(models, truth):
+    guess = guess_of(truth)
+    other = guess.changed(np.array([0] * 12 + [0.6, -0.4]))
+    a, b = found(models, truth, guess), found(models, truth, other)
+    np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(np.linalg.norm(a), 1)
