@@ -1,8 +1,8 @@
 """Later frames: no masks, started from the last estimate or from a predicted state (paper section 4.2, last part).
 
 Most objects stand where they were expected; the residual of each tells. What fits is only polished. What does not is
-searched by CMA with a small spread around where it was expected, and then polished. The light is held until the bare
-table stops looking as it should: then somebody moved the lamp, and it is searched anew.
+searched by CMA with a small spread around where it was expected, and then polished. The light is held unless the bare
+table stops looking as it should and another light mends that: then somebody moved the lamp.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class TrackEffort:
 
     Attributes:
         fits_below: residual of an object [radiance] up to which it counts as standing where it was expected.
-        lamp_above: residual of everything but the objects [radiance] from which the lamp counts as moved.
+        lamp_above: residual of everything but the objects [radiance] from which the lamp may have moved.
+        lamp_gain: share of the loss to which another light must lower it to be believed.
         sweeps: of the descent over objects that moved.
         population: candidates per generation of the search for objects that do not fit.
         generations: of that search.
@@ -47,6 +48,7 @@ class TrackEffort:
 
     fits_below: float = 0.045
     lamp_above: float = 0.03
+    lamp_gain: float = 0.7
     sweeps: int = 3
     population: int = 20
     generations: int = 8
@@ -95,7 +97,7 @@ class _Track:
     def steps(self) -> Iterator[EstimateStep]:
         at = Descent.at(self._guess)
         misfit, lamp = self._misfits(at.guess)
-        if lamp and not misfit.any():  # objects alone cannot have changed the table far from them
+        if lamp:
             at = yield from self._search_light(at)
             misfit, lamp = self._misfits(at.guess)
         at = yield from self._descend(at, misfit, 1)
@@ -104,10 +106,6 @@ class _Track:
             if misfit.any():
                 at = yield from self._search(at, misfit)
             at = yield from self._descend(at, np.ones_like(misfit), self._effort.sweeps)
-            misfit, lamp = self._misfits(at.guess)
-            if lamp:
-                at = yield from self._search_light(at)
-                at = yield from self._descend(at, np.ones_like(misfit), self._effort.sweeps)
         yield self._finish(at)
 
     def _misfits(self, guess: Guess) -> tuple[Bool[np.ndarray, "N"], bool]:
@@ -117,10 +115,17 @@ class _Track:
         return misfit, evidence.surroundings > self._effort.lamp_above
 
     def _search_light(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
-        light = find_light(self._models, self._rough, self._coarse, at.guess)
-        at = replace(at, guess=replace(at.guess, light=light))
+        """The light that explains the images with the objects as expected, if it does so far better than the last."""
+        guess = replace(at.guess, light=find_light(self._models, self._rough, self._coarse, at.guess))
+        here, there = (self._loss(one) for one in (at.guess, guess))
+        if there < self._effort.lamp_gain * here:
+            at = replace(at, guess=guess)
         yield self._step("light", "Shading and shadows", at)
         return at
+
+    def _loss(self, guess: Guess) -> float:
+        batch = guess.moved(np.zeros((1, guess.size)))
+        return float(whole_loss(residuals(self._models, self._coarse, batch))[0])
 
     def _descend(
         self, at: Descent, moving: Bool[np.ndarray, "N"], sweeps: int

@@ -1,0 +1,81 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.estimate.resting import about_z
+from osfcore.estimate.track import TrackEffort, estimate_next
+from osfcore.poses import Pose, quaternion_multiply
+from osfcore.scene import Light, default_cameras
+from tests.core.estimate.scenes import apart, observe
+
+CAMERAS = default_cameras(96)[:3]
+
+
+def followed(models, state, expected, effort=None, seed=0):
+    seen = observe(models, state, CAMERAS, masks=False)
+    steps = list(estimate_next(models, seen, expected, np.random.default_rng(seed), effort))
+    assert [step.estimate is None for step in steps] == [True] * (len(steps) - 1) + [False]
+    return steps
+
+
+def pushed(truth, shift, yaw):
+    """The first object pushed and turned."""
+    position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
+    position[0, :2] += shift
+    quaternion[0] = quaternion_multiply(about_z(np.array([yaw]))[0], quaternion[0])
+    return replace(truth, poses=Pose(position, quaternion))
+
+
+def test_what_stands_still_stays_where_it_is(models, truth):
+    steps = followed(models, truth, truth)
+    shift, turn, light = apart(steps[-1].estimate.state, truth)
+    assert shift.max() < 0.001
+    assert np.rad2deg(turn).max() < 1
+    assert light == 0  # held
+    assert steps[-1].estimate.trusted
+    assert all(step.candidates is None for step in steps)  # nothing to search
+
+
+@pytest.mark.parametrize(("shift", "yaw"), [((0.008, -0.006), 0.08), ((-0.03, 0.03), 0.3)])
+def test_a_pushed_object_is_followed(models, truth, shift, yaw):
+    moved = pushed(truth, shift, yaw)
+    shift, turn, _ = apart(followed(models, moved, truth)[-1].estimate.state, moved)
+    assert shift.max() < 0.004
+    assert np.rad2deg(turn).max() < 4
+
+
+def test_a_moved_lamp_is_noticed(models, truth):
+    moved = replace(truth, light=Light(np.array([-0.6, 0.2, 0.5])))
+    steps = followed(models, moved, truth)
+    shift, turn, light = apart(steps[-1].estimate.state, moved)
+    assert "light" in [step.stage for step in steps]
+    assert np.rad2deg(light) < 3
+    assert shift.max() < 0.002
+    assert np.rad2deg(turn).max() < 2
+
+
+def test_a_vanished_object_is_doubted(models, truth):
+    away = truth.poses.position.copy()
+    away[0] = 3.0, 0.0, 0.0
+    gone = replace(truth, poses=Pose(away, truth.poses.quaternion))
+    effort = TrackEffort(generations=2, sweeps=1)
+    assert followed(models, gone, truth, effort)[-1].estimate.doubts[0]
+
+
+def test_the_same_generator_gives_the_same_estimate(models, truth):
+    moved, effort = pushed(truth, (0.02, 0.01), 0.2), TrackEffort(generations=2, sweeps=1)
+    first, second = (followed(models, moved, truth, effort, seed=5)[-1].estimate.state for _ in range(2))
+    np.testing.assert_array_equal(first.poses.position, second.poses.position)
+    np.testing.assert_array_equal(first.poses.quaternion, second.poses.quaternion)
+
+
+def test_other_objects_than_expected_are_refused(models, truth):
+    seen = observe(models, truth, CAMERAS, masks=False)
+    other = replace(truth, names=truth.names[::-1])
+    with pytest.raises(InvalidInput, match="expected state"):
+        next(estimate_next(models, seen, other, np.random.default_rng(0)))
+    unheard = replace(seen, names=("unheard", truth.names[1]))
+    with pytest.raises(UnknownName, match="unheard"):
+        next(estimate_next(models, unheard, truth, np.random.default_rng(0)))
