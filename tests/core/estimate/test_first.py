@@ -57,7 +57,7 @@ def test_the_stages_are_those_of_the_method(steps):
     assert objects.candidates.quaternion.shape == (12, 2, 4)
     together = next(step for step in steps if step.stage == "together")
     assert together.candidates.position.shape == (9, 2, 3)
-    assert together.lights.shape == (8, 3)
+    assert together.lights.shape == (9, 3)
     assert np.isfinite(together.loss)
 
 
