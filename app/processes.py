@@ -6,12 +6,14 @@ import importlib
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Callable
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
 _SPAWN = multiprocessing.get_context("spawn")
+_NOTING_TRIES, _NOTING_S = 200, 0.005
 
 
 def launch(target: Callable[..., None], name: str, *arguments: object) -> tuple[SpawnProcess, Connection]:
@@ -74,3 +76,7 @@ def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
             pass
         process.kill()
     process.join()
+    for _ in range(_NOTING_TRIES):  # another thread may have taken the exit code, and be about to note it
+        if not process.is_alive():
+            return
+        time.sleep(_NOTING_S)
