@@ -48,9 +48,17 @@ def rotate(q: Float[np.ndarray, "*batch 4"], v: Float[np.ndarray, "*batch 3"]) -
 
 
 def quaternion_to_matrix(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices of unit quaternions."""
-    q = np.array(q, float)  # a copy: SciPy refuses arrays that must not be written, such as broadcast ones
-    return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
+    """Rotation matrices of quaternions of any length but 0. Written out: rendering asks for them all the time."""
+    q = np.asarray(q, float)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    s = 2 / (q * q).sum(axis=-1)
+    matrix = np.empty((*q.shape[:-1], 3, 3))
+    matrix[..., 0, 0], matrix[..., 1, 1] = 1 - s * (y * y + z * z), 1 - s * (x * x + z * z)
+    matrix[..., 2, 2] = 1 - s * (x * x + y * y)
+    matrix[..., 0, 1], matrix[..., 1, 0] = s * (x * y - w * z), s * (x * y + w * z)
+    matrix[..., 0, 2], matrix[..., 2, 0] = s * (x * z + w * y), s * (x * z - w * y)
+    matrix[..., 1, 2], matrix[..., 2, 1] = s * (y * z - w * x), s * (y * z + w * x)
+    return matrix
 
 
 def quaternion_from_matrix(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from osfcore.fields.marching import ONE_AT_A_TIME
 from osfcore.fields.table import TableField
+from osfcore.poses import quaternion_to_matrix
 from osfcore.render.kernels import NO_OUTLINE, render_batch
 from osfcore.render.packing import Packed
 from osfcore.render.scene_renderer import (
@@ -93,10 +94,12 @@ def launch(
     scenes, views, count = len(batch.lights), len(cameras), len(batch.names)
     lenses = np.array([camera_numbers(camera) for camera in cameras])
     corners = _corners_world(pack.extents[numbers], rotations, positions)
-    boxes, outline = _on_screen(corners, cameras)
-    shadows, shadow_outline = np.zeros_like(boxes), np.zeros_like(outline)
-    if table is not None:
-        shadows, shadow_outline = _on_screen(_on_table(corners, batch.lights), cameras)
+    if table is None:
+        boxes, outline = _on_screen(corners, cameras)
+        shadows, shadow_outline = np.zeros_like(boxes), np.zeros_like(outline)
+    else:
+        both = _on_screen(np.concatenate([corners, _on_table(corners, batch.lights)], axis=1), cameras)
+        (boxes, shadows), (outline, shadow_outline) = (_halves(part) for part in both)
     shape = (scenes, views, *size)
     rgb = np.empty((*shape, 3), np.float32)
     wants_opacity = bool({"opacity", "masks"} & set(outputs))
@@ -180,6 +183,12 @@ def _on_screen(
     return np.stack(boxes, axis=1), np.stack(outlines, axis=1)
 
 
+def _halves(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first and the second half along the third axis, each in one piece."""
+    count = array.shape[2] // 2
+    return np.ascontiguousarray(array[:, :, :count]), np.ascontiguousarray(array[:, :, count:])
+
+
 def screen_boxes(
     points: Float[np.ndarray, "B N 8 3"], camera: Camera
 ) -> tuple[Int[np.ndarray, "B N 4"], Float32[np.ndarray, "B N 8 2"]]:
@@ -187,8 +196,8 @@ def screen_boxes(
 
     And the projections themselves [px]; `NO_OUTLINE` where a box reaches behind the camera.
     """
-    inverse = camera.T_world_camera.inverse().matrix()
-    local = points @ inverse[:3, :3].T + inverse[:3, 3]
+    pose = camera.T_world_camera
+    local = (points - pose.position) @ quaternion_to_matrix(pose.quaternion)
     depth = local[..., 2]
     projected = local @ camera.intrinsics.T
     pixels = projected[..., :2] / np.maximum(depth, _NEAREST_M)[..., None]

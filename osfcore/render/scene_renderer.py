@@ -240,5 +240,5 @@ def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
 def camera_numbers(camera: Camera) -> Float[np.ndarray, "12"]:
     """Position and the matrix from pixel coordinates to directions in the world."""
     pose: Pose = camera.T_world_camera
-    matrix = pose.matrix()[:3, :3] @ np.linalg.inv(camera.intrinsics)
+    matrix = quaternion_to_matrix(pose.quaternion) @ np.linalg.inv(camera.intrinsics)
     return np.concatenate([pose.position, matrix.reshape(-1)])
