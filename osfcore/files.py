@@ -5,13 +5,18 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Mapping
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+
+from PIL import Image
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError
 
 MAX_JSON_BYTES = 16_000_000
+_PNG_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 T = TypeVar("T")
 
 
@@ -102,3 +107,35 @@ def list_of(mapping: Mapping[str, Any], key: str, what: str) -> list[Any]:
     if not isinstance(value, list):
         raise InvalidInput(key, repr(value)[:60], "a list")
     return value
+
+
+def is_text(name: str) -> bool:
+    """Whether a name can be written at all: JSON may hold halves of characters."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def reading_png(path: Path, reason: str) -> Iterator[None]:
+    """Whatever an image library makes of a damaged PNG becomes one sentence.
+
+    Raises:
+        CorruptFile: with the reason, for all that reading raises, other than a `CorruptFile` itself.
+    """
+    try:
+        yield
+    except CorruptFile:
+        raise
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        struct.error,
+        zlib.error,
+        Image.DecompressionBombError,
+    ) as error:
+        raise CorruptFile(path, reason) from error

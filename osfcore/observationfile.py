@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName, shown
-from osfcore.files import as_mapping, entry_of, list_of, read_json, write_atomically, write_json
+from osfcore.files import as_mapping, entry_of, is_text, list_of, read_json, reading_png, write_atomically, write_json
 from osfcore.scene import MAX_OBJECTS, Camera, Observation, finite_vector
 from osfcore.scenefile import camera_from_json, camera_to_json
 
@@ -195,7 +194,7 @@ def _read_masks(
 def _inside(folder: Path, file: object, what: str) -> Path:
     """Where a file that observation.json names lies: inside the folder, whatever the name says."""
     allowed = "a file name without '..', relative to the folder"
-    if not isinstance(file, str) or not file or "\0" in file or not _is_text(file):
+    if not isinstance(file, str) or not file or "\0" in file or not is_text(file):
         raise InvalidInput(what, shown(repr(file)), allowed)
     if Path(file).is_absolute() or ".." in Path(file).parts or "\\" in file:
         raise InvalidInput(what, shown(repr(file)), allowed)
@@ -212,15 +211,6 @@ def _inside(folder: Path, file: object, what: str) -> Path:
     return path
 
 
-def _is_text(name: str) -> bool:
-    """Whether a name can be written at all: JSON may hold halves of characters."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _read_png(
     path: Path, camera: Camera, kinds: Mapping[int, tuple[int, ...]], expected: str
 ) -> UInt8[np.ndarray, "h w *c"]:
@@ -228,7 +218,7 @@ def _read_png(
 
     Pillow would turn 16 bits into 8 and hand out a palette's indices without a word, so the header itself is asked.
     """
-    try:
+    with reading_png(path, "it is no readable PNG: truncated or damaged"):
         with path.open("rb") as file:
             head = file.read(26)
         if len(head) < 26 or not head.startswith(_PNG_SIGNATURE) or head[12:16] != b"IHDR":
@@ -241,15 +231,3 @@ def _read_png(
             raise CorruptFile(path, f"it has {depth} bits and colour type {colour} of PNG; {expected} is expected")
         with Image.open(path, formats=["PNG"]) as image:
             return np.array(image.convert("L") if colour == _GREY else image, np.uint8)
-    except CorruptFile:
-        raise
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        struct.error,
-        zlib.error,
-        Image.DecompressionBombError,
-    ) as error:
-        raise CorruptFile(path, "it is no readable PNG: truncated or damaged") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from osfcore.errors import UnknownName
 from osfcore.estimate.resting import Resting, resting_orientations
@@ -11,7 +10,7 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
 from osfcore.render.scene_renderer import PLANNING, Quality, SceneRenderer
 
-QUALITY: Quality = replace(PLANNING)
+QUALITY: Quality = PLANNING
 
 
 class Models:

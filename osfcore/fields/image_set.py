@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput, shown
+from osfcore.files import is_text, reading_png
 from osfcore.poses import Pose
 from osfcore.scene import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, Camera
 
@@ -172,7 +172,7 @@ def _entries(folder: Path, split: str, path: Path) -> list[Any]:
 def _image_path(folder: Path, path: Path, number: int, entry: Mapping[str, Any]) -> Path:
     """Where the image of an entry lies, which is inside the set, whatever the name says."""
     name = entry.get("filename")
-    if not isinstance(name, str) or not name or "\0" in name or not _is_text(name):
+    if not isinstance(name, str) or not name or "\0" in name or not is_text(name):
         raise CorruptFile(path, f"entry {number} lacks or garbles filename, the name of its PNG")
     place = f"entry {number} names {shown(repr(name))}"
     if Path(name).is_absolute() or ".." in Path(name).parts:
@@ -191,18 +191,9 @@ def _image_path(folder: Path, path: Path, number: int, entry: Mapping[str, Any])
     return image
 
 
-def _is_text(name: str) -> bool:
-    """Whether a name can be written at all: JSON may hold halves of characters."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
     """The pixels of a PNG; its header is judged before anything is decoded."""
-    try:
+    with reading_png(path, "it is no readable PNG: truncated, damaged or of another kind"):
         with path.open("rb") as file:
             head = file.read(24)
         if head.startswith(_PNG_SIGNATURE) and head[12:16] == b"IHDR":  # Pillow names no size when it refuses one
@@ -212,18 +203,6 @@ def _read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
             if image.mode != "RGBA":
                 raise CorruptFile(path, f"it is {image.mode} without transparency; 8-bit RGBA is expected")
             return np.array(image, np.uint8)
-    except CorruptFile:
-        raise
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        struct.error,
-        zlib.error,
-        Image.DecompressionBombError,
-    ) as error:
-        raise CorruptFile(path, "it is no readable PNG: truncated, damaged or of another kind") from error
 
 
 def _check_sides(path: Path, size: tuple[int, int]) -> None:

@@ -1,9 +1,21 @@
 import json
+import struct
+from pathlib import Path
 
 import pytest
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.files import MAX_JSON_BYTES, as_mapping, entry_of, list_of, read_json, write_atomically, write_json
+from osfcore.files import (
+    MAX_JSON_BYTES,
+    as_mapping,
+    entry_of,
+    is_text,
+    list_of,
+    read_json,
+    reading_png,
+    write_atomically,
+    write_json,
+)
 
 
 def test_a_place_that_is_a_file_is_told(tmp_path):
@@ -78,3 +90,16 @@ def test_shapes_of_json_are_checked():
         entry_of({}, "a", "it")
     with pytest.raises(InvalidInput, match="a is {}, but it must be a list"):
         list_of({"a": {}}, "a", "it")
+
+
+def test_halves_of_characters_are_no_text():
+    assert is_text("Dose Käse 食")
+    assert not is_text("\ud800.png")
+
+
+@pytest.mark.parametrize("error", [OSError("x"), SyntaxError("x"), ValueError("x"), EOFError("x"), struct.error("x")])
+def test_whatever_a_png_raises_becomes_one_sentence(error):
+    with pytest.raises(CorruptFile, match="it is damaged"), reading_png(Path("a.png"), "it is damaged"):
+        raise error
+    with pytest.raises(CorruptFile, match="16 bits"), reading_png(Path("a.png"), "it is damaged"):
+        raise CorruptFile("a.png", "16 bits")
