@@ -34,8 +34,7 @@ def find_light(models: Models, coarse: Views, fine: Views, guess: Guess) -> Floa
         fine: images to refine on.
         guess: objects and pusher; its light plays no part.
     """
-    directions = sphere(_DIRECTIONS)
-    directions = directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
+    directions = _hemisphere()
     best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_FIRST_SURVIVORS]]
     step = _FIRST_STEP_RAD
     for _ in range(_ROUNDS):
@@ -43,6 +42,18 @@ def find_light(models: Models, coarse: Views, fine: Views, guess: Guess) -> Floa
         best = tried[np.argsort(_losses(models, fine, guess, tried))[:_SURVIVORS]]
         step *= _SHRINKING
     return best[0]
+
+
+def elsewhere(models: Models, views: Views, guess: Guess) -> float:
+    """Loss under the best of directions all over the hemisphere, over that under the light of a guess."""
+    directions = np.concatenate([guess.light[None], _hemisphere()])
+    losses = _losses(models, views, guess, directions)
+    return float(losses[1:].min() / max(losses[0], 1e-12))
+
+
+def _hemisphere() -> Float[np.ndarray, "K 3"]:
+    directions = sphere(_DIRECTIONS)
+    return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
 
 
 def _around(guess: Guess, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:

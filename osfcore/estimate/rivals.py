@@ -44,7 +44,7 @@ def challenged(
         number: of the object.
         others: poses that it might have instead, a batch.
     """
-    order = np.argsort(_losses(models, around(coarse, models, at.guess, number), at.guess, number, others))
+    order = np.argsort(pose_losses(models, around(coarse, models, at.guess, number), at.guess, number, others))
     far = [k for k in order if rotation_angle(others.quaternion[k], at.guess.quaternions[number]) > _SAME_RAD]
     refined = [_refined(models, coarse, at, number, others[k], _ITERATIONS) for k in _distinct(far, others)]
     if not refined:
@@ -63,7 +63,7 @@ def challenged(
 
 def _refined(models: Models, views: Views, at: Descent, number: int, pose: Pose, iterations: int) -> Descent:
     """A descent of one object, begun in a pose; curvatures stay those of before until it moves."""
-    rival = replace(at, guess=_with(at.guess, number, pose), dampings=Descent.at(at.guess).dampings)
+    rival = replace(at, guess=with_pose(at.guess, number, pose), dampings=Descent.at(at.guess).dampings)
     return list(polish(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
@@ -77,7 +77,8 @@ def _distinct(order: list[int], poses: Pose) -> list[int]:
     return kept
 
 
-def _with(guess: Guess, number: int, pose: Pose) -> Guess:
+def with_pose(guess: Guess, number: int, pose: Pose) -> Guess:
+    """A guess with one object in another pose."""
     positions, quaternions = guess.positions.copy(), guess.quaternions.copy()
     positions[number], quaternions[number] = pose.position, pose.quaternion
     return replace(guess, positions=positions, quaternions=quaternions)
@@ -88,10 +89,10 @@ def _pose(guess: Guess, number: int) -> Pose:
 
 
 def _loss(models: Models, views: Views, guess: Guess, number: int) -> float:
-    return float(_losses(models, views, guess, number, _pose(guess, number)[None])[0])
+    return float(pose_losses(models, views, guess, number, _pose(guess, number)[None])[0])
 
 
-def _losses(models: Models, views: Views, guess: Guess, number: int, poses: Pose) -> Float[np.ndarray, "K"]:
+def pose_losses(models: Models, views: Views, guess: Guess, number: int, poses: Pose) -> Float[np.ndarray, "K"]:
     """Loss of a scene with one object in K poses."""
     batch = guess.moved(np.zeros((len(poses.position), guess.size)))
     positions, quaternions = batch.positions.copy(), batch.quaternions.copy()

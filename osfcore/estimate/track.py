@@ -11,13 +11,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from osfcore.errors import InvalidInput
 from osfcore.estimate.evolution import Evolution
-from osfcore.estimate.lamp import find_light
+from osfcore.estimate.lamp import elsewhere, find_light
 from osfcore.estimate.models import Models
+from osfcore.estimate.moves import lying_there, shoved, shoved_together
 from osfcore.estimate.polish import Descent, polish
+from osfcore.estimate.rivals import challenged, pose_losses, with_pose
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import POSE, Guess
 from osfcore.estimate.trust import gather, judged, object_residuals
@@ -27,7 +29,7 @@ from osfcore.poses import Pose
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
-_LOWEST_CENTRE_M = 0.01
+_SETTLED = 0.97  # share of its loss before a sweep from which more sweeps promise little
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,7 @@ class TrackEffort:
     Attributes:
         fits_below: residual of an object [radiance] up to which it counts as standing where it was expected.
         lamp_above: residual of everything but the objects [radiance] from which the lamp may have moved.
+        lamp_hint: share of the loss to which the best of few other lights must lower it before more are tried.
         lamp_gain: share of the loss to which another light must lower it to be believed.
         sweeps: of the descent over objects that moved.
         population: candidates per generation of the search for objects that do not fit.
@@ -48,13 +51,15 @@ class TrackEffort:
 
     fits_below: float = 0.045
     lamp_above: float = 0.03
+    lamp_hint: float = 0.9
     lamp_gain: float = 0.7
-    sweeps: int = 3
-    population: int = 20
-    generations: int = 8
-    shift: float = 0.03
-    turn: float = 0.4
-    reach: float = 0.06
+    sweeps: int = 8
+    fine_sweeps: int = 4
+    population: int = 14
+    generations: int = 5
+    shift: float = 0.01
+    turn: float = 0.2
+    reach: float = 0.03
 
 
 def estimate_next(
@@ -92,6 +97,8 @@ class _Track:
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
+        self._push = _push(expected.pusher, observation.pusher)
+        self._rivals: dict[int, float] = {}
         self._done, self._total = 0, 4
 
     def steps(self) -> Iterator[EstimateStep]:
@@ -100,12 +107,15 @@ class _Track:
         if lamp:
             at = yield from self._search_light(at)
             misfit, lamp = self._misfits(at.guess)
-        at = yield from self._descend(at, misfit, 1)
         if misfit.any():
+            at = yield from self._descend(at, misfit, self._coarse, 1)
             misfit, _ = self._misfits(at.guess)
+        for look in (self._search, self._recover):
             if misfit.any():
-                at = yield from self._search(at, misfit)
-            at = yield from self._descend(at, np.ones_like(misfit), self._effort.sweeps)
+                at = yield from look(at, misfit)
+                at = yield from self._settle(at, misfit)
+                misfit, _ = self._misfits(at.guess)
+        at = yield from self._descend(at, np.ones_like(misfit), self._middle, 1)
         yield self._finish(at)
 
     def _misfits(self, guess: Guess) -> tuple[Bool[np.ndarray, "N"], bool]:
@@ -116,6 +126,8 @@ class _Track:
 
     def _search_light(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
         """The light that explains the images with the objects as expected, if it does so far better than the last."""
+        if elsewhere(self._models, self._rough, at.guess) > self._effort.lamp_hint:
+            return at  # objects that moved are no reason to search on
         guess = replace(at.guess, light=find_light(self._models, self._rough, self._coarse, at.guess))
         here, there = (self._loss(one) for one in (at.guess, guess))
         if there < self._effort.lamp_gain * here:
@@ -128,39 +140,53 @@ class _Track:
         return float(whole_loss(residuals(self._models, self._coarse, batch))[0])
 
     def _descend(
-        self, at: Descent, moving: Bool[np.ndarray, "N"], sweeps: int
+        self, at: Descent, moving: Bool[np.ndarray, "N"], views: Views, sweeps: int
     ) -> Iterator[EstimateStep]:  # returns the Descent
-        objects = np.flatnonzero(moving).tolist() if moving.any() else list(range(len(moving)))
-        for step in polish(self._models, self._middle, at, iterations=sweeps, objects=objects):
-            at = step
+        objects, before = np.flatnonzero(moving).tolist(), np.inf
+        for step in polish(self._models, views, at, iterations=sweeps, objects=objects):
+            at, loss = step, step.losses[objects].sum()
             yield self._step("polish", "The last millimetres", at)
+            if loss > _SETTLED * before:
+                break
+            before = loss
+        return at
+
+    def _settle(self, at: Descent, moving: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """Descend as far as it goes; coarse images lead near, finer ones decide."""
+        for views, sweeps in ((self._coarse, self._effort.sweeps), (self._middle, self._effort.fine_sweeps)):
+            at = replace(at, dampings=Descent.at(at.guess).dampings)  # old ones tell nothing of where it is now
+            at = yield from self._descend(at, moving, views, sweeps)
         return at
 
     def _search(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
-        """CMA over each object that does not fit: as if it had slid, and as if it had rolled."""
-        for n in np.flatnonzero(misfit):
-            views = around(self._coarse, self._models, at.guess, int(n), reach=self._effort.reach)
-            ends = []
-            for rolls in (False, True):
-                guess, loss = yield from self._search_one(at, int(n), views, rolls=rolls)
-                ends.append((loss, guess))
-            at = replace(at, guess=min(ends, key=lambda end: end[0])[1])
+        """How the push moved them together, then each by CMA."""
+        numbers = np.flatnonzero(misfit).tolist()
+        at = replace(at, guess=self._together(at.guess, numbers))
+        for n in numbers:
+            views = around(self._coarse, self._models, at.guess, n, reach=self._effort.reach)
+            tried = shoved(self._models, at.guess, n, self._push)
+            losses = pose_losses(self._models, views, at.guess, n, tried)
+            k = int(losses.argmin())
+            guess = with_pose(at.guess, n, tried[k])
+            at = yield from self._search_one(replace(at, guess=guess), n, views)
         return at
 
-    def _search_one(self, at: Descent, n: int, views: Views, *, rolls: bool) -> Iterator[EstimateStep]:
-        """One CMA over an object's pose; returns the best guess and its loss."""
+    def _together(self, guess: Guess, numbers: list[int]) -> Guess:
+        """The guess with objects shoved along by the shares of the push that explain the whole images best."""
+        positions = shoved_together(guess, numbers, self._push)
+        batch = replace(guess.moved(np.zeros((len(positions), guess.size))), positions=positions)
+        best = int(whole_loss(residuals(self._models, self._coarse, batch)).argmin())
+        return replace(guess, positions=positions[best])
+
+    def _search_one(self, at: Descent, n: int, views: Views) -> Iterator[EstimateStep]:  # returns the Descent
+        """CMA over one object's pose."""
         e, start = self._effort, at.guess
-        spread = np.array([e.shift, e.shift, e.shift / 4, e.turn / 4, e.turn / 4, e.turn])
+        spread = np.array([e.shift, e.shift, e.shift / 3, e.turn / 2, e.turn / 2, e.turn])
         search = Evolution(spread, e.population, self._rng)
-        height = max(float(start.positions[n, 2]), _LOWEST_CENTRE_M)
         best, least = start, np.inf
         for _ in range(e.generations):
-            asked = np.concatenate([np.zeros((1, POSE)), search.ask()])
-            changes = np.zeros((len(asked), start.size))
-            changes[:, POSE * n : POSE * (n + 1)] = asked
-            if rolls:
-                changes[:, POSE * n + 3] -= asked[:, 1] / height
-                changes[:, POSE * n + 4] += asked[:, 0] / height
+            changes = np.zeros((1 + e.population, start.size))
+            changes[1:, POSE * n : POSE * (n + 1)] = search.ask()
             batch = start.moved(changes)
             losses = whole_loss(residuals(self._models, views, batch))
             search.tell(losses[1:])
@@ -169,11 +195,20 @@ class _Track:
                 least, best = float(losses[k]), start.changed(changes[k])
             step = self._step("together", f"{start.names[n]}: where it went", replace(at, guess=best))
             yield replace(step, candidates=Pose(batch.positions, batch.quaternions), sigma=search.sigma, loss=least)
-        return best, least
+        return replace(at, guess=best)
+
+    def _recover(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """What still does not fit may lie in quite another way where it is."""
+        for n in np.flatnonzero(misfit):
+            at, self._rivals[int(n)] = challenged(
+                self._models, self._middle, self._middle, at, int(n), lying_there(self._models, at.guess, int(n))
+            )
+            yield self._step("together", f"{at.guess.names[n]}: lying in another way", at)
+        return at
 
     def _finish(self, at: Descent) -> EstimateStep:
         evidence = gather(self._models, self._middle, at.guess)
-        estimate = judged(at.guess, at.normals, evidence, {}, light_held=True)
+        estimate = judged(at.guess, at.normals, evidence, self._rivals, light_held=True)
         self._done = self._total - 1
         step = self._step("done", "Done" if estimate.trusted else estimate.reason, at)
         return replace(step, estimate=estimate)
@@ -183,3 +218,10 @@ class _Track:
         progress = Progress(self._done, self._total, note)
         losses = tuple(at.losses[:-1].tolist())
         return EstimateStep(progress, stage, at.guess.state(), losses=losses, loss=float(at.losses[-1]))
+
+
+def _push(before: Float[np.ndarray, "3"] | None, after: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, "3"]:
+    """How far the pusher went along the table; nothing if it was not there before or is not there now."""
+    if before is None or after is None:
+        return np.zeros(3)
+    return np.array([*(after - before)[:2], 0.0])

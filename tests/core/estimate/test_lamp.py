@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.estimate.lamp import find_light
+from osfcore.estimate.lamp import elsewhere, find_light
 from osfcore.estimate.views import views_of
 from osfcore.scene import Light, default_cameras
 from tests.core.estimate.scenes import BOTTLE, BOX, angle, guess_of, lying, observe, scene
@@ -32,3 +32,11 @@ def test_where_the_guess_has_its_light_plays_no_part(models, truth):
     a, b = found(models, truth, guess), found(models, truth, other)
     np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(np.linalg.norm(a), 1)
+
+
+def test_the_right_light_is_hardly_beaten_and_a_wrong_one_clearly(models, truth):
+    seen = observe(models, truth, default_cameras(96)[:2], masks=False)
+    guess = guess_of(truth)
+    wrong = guess.changed(np.array([0] * 12 + [0.6, -0.4]))
+    assert elsewhere(models, views_of(seen, 32), guess) > 1
+    assert elsewhere(models, views_of(seen, 32), wrong) < 0.5

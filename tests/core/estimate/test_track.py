@@ -6,9 +6,9 @@ import pytest
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.estimate.resting import about_z
 from osfcore.estimate.track import TrackEffort, estimate_next
-from osfcore.poses import Pose, quaternion_multiply
+from osfcore.poses import Pose, quaternion_multiply, rotation_angle
 from osfcore.scene import Light, default_cameras
-from tests.core.estimate.scenes import apart, observe
+from tests.core.estimate.scenes import apart, lying, observe
 
 CAMERAS = default_cameras(96)[:3]
 
@@ -44,6 +44,33 @@ def test_a_pushed_object_is_followed(models, truth, shift, yaw):
     shift, turn, _ = apart(followed(models, moved, truth)[-1].estimate.state, moved)
     assert shift.max() < 0.004
     assert np.rad2deg(turn).max() < 4
+
+
+def test_what_a_push_moved_far_is_followed(models, truth):
+    push = np.array([0.07, -0.04, 0.0])
+    moved = replace(pushed(truth, push[:2], 0.0), pusher=np.array([0.0, 0.0, 0.062]) + push)
+    before = replace(truth, pusher=np.array([0.0, 0.0, 0.062]))
+    estimate = followed(models, moved, before)[-1].estimate
+    shift, turn, _ = apart(estimate.state, moved)
+    assert shift.max() < 0.004
+    assert np.rad2deg(turn).max() < 4
+    assert estimate.trusted
+
+
+def test_what_fell_over_is_found_lying_in_another_way(models, truth):
+    fallen = lying(models, truth.names[0], 0, 0.05, -0.08)
+    position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
+    position[0], quaternion[0] = fallen.position, fallen.quaternion
+    other = replace(truth, poses=Pose(position, quaternion))
+    assert rotation_angle(fallen.quaternion, truth.poses.quaternion[0]) > 1
+    shift, turn, _ = apart(followed(models, other, truth)[-1].estimate.state, other)
+    assert shift.max() < 0.004
+    assert np.rad2deg(turn).max() < 4
+
+
+def test_objects_that_moved_are_no_moved_lamp(models, truth):
+    steps = followed(models, pushed(truth, (0.05, 0.05), 0.5), truth)
+    assert "light" not in [step.stage for step in steps]
 
 
 def test_a_moved_lamp_is_noticed(models, truth):
