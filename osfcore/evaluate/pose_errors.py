@@ -53,9 +53,7 @@ def rotation_components(
     return quaternion_log(quaternion_multiply(estimated, quaternion_conjugate(nearest)))
 
 
-def direction_components(
-    estimated: Float[np.ndarray, "3"], true: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "2"]:
+def direction_components(estimated: Float[np.ndarray, "3"], true: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
     """The shortest rotation between two unit vectors [rad], along two directions across the true one."""
     basis = np.stack(across(np.asarray(true, float)))
     turn = basis @ np.cross(true, estimated)
