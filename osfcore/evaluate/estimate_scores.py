@@ -136,7 +136,7 @@ class TrackScore:
         """What `asdict` made plain."""
         nested = ("position_mm", "rotation_deg", "absent", "doubted")
         flat = ("names", "right_at_start", "seconds", "moved_m")
-        rows = {key: tuple(tuple(row) for row in data[key]) for key in nested}
+        rows: dict[str, Any] = {key: tuple(tuple(row) for row in data[key]) for key in nested}
         return TrackScore(**rows, **{key: tuple(data[key]) for key in flat}, refused=data["refused"])
 
     def to_json(self) -> dict[str, Any]:
@@ -202,7 +202,8 @@ def score_frame(
     """
     state = estimate.state
     apart = direction_components(state.light.direction, truth.light.direction)
-    unseen = dict(zip(truth.names, absent or [""] * len(truth.names), strict=True))
+    nowhere: Sequence[Absence] = ("",) * len(truth.names)
+    unseen = dict(zip(truth.names, absent or nowhere, strict=True))
     objects = tuple(_object(estimate, n, truth, assets[name], unseen[name]) for n, name in enumerate(state.names))
     ratios = _ratios(apart, estimate.light_std) if estimate.light_std > 0 else ()
     light_deg = float(np.rad2deg(np.linalg.norm(apart)))

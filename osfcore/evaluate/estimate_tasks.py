@@ -151,8 +151,9 @@ def seen(world: Tabletop, cameras: tuple[Camera, ...], *, masks: bool, with_push
     observation = world.render(cameras, masks=True, with_pusher=with_pusher)
     truth = world.truth() if with_pusher else replace(world.truth(), pusher=None)
     assert observation.masks is not None
-    visible = observation.masks.any(axis=(0, 2, 3))
-    absent = tuple(_absence(place, is_seen=bool(v)) for place, v in zip(truth.poses.position, visible, strict=True))
+    pixels = observation.masks.sum(axis=(0, 2, 3)).tolist()
+    places = zip(truth.poses.position, pixels, strict=True)
+    absent: tuple[Absence, ...] = tuple(_absence(place, is_seen=count > 0) for place, count in places)
     return Frame(observation if masks else replace(observation, masks=None), truth, absent)
 
 
