@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -57,7 +58,9 @@ class Axis:
             raise InvalidInput(f"range of axis {self.label}", (self.low, self.high), "increasing")
 
 
-def chart(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> UInt8[np.ndarray, "h w 3"]:
+def chart(
+    title: str, x: Axis, y: Axis, curves: Sequence[Curve], *, legend: Literal["top", "bottom"] = "bottom"
+) -> UInt8[np.ndarray, "h w 3"]:
     """Curves over a grid; what lies outside the axes is cut off. Without any curve, empty axes."""
     sheet = np.full((_HEIGHT, _WIDTH, 3), _PAPER, np.uint8)
     _axes(sheet, title, x, y)
@@ -67,7 +70,8 @@ def chart(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> UInt8[np.nda
         _draw(inside_part, curve, x, y, COLOURS[number % len(COLOURS)])
     inside[:] = inside_part
     for number, curve in enumerate(curves):
-        place = (_WIDTH - _RIGHT - 190, _HEIGHT - _BOTTOM - 10 - 16 * (len(curves) - 1 - number))
+        last = _HEIGHT - _BOTTOM - 10 if legend == "bottom" else _TOP + 4 + 16 * len(curves)
+        place = (_WIDTH - _RIGHT - 190, last - 16 * (len(curves) - 1 - number))
         colour = COLOURS[number % len(COLOURS)]
         cv2.line(sheet, (place[0] - 24, place[1] - 4), (place[0] - 6, place[1] - 4), colour, 2, cv2.LINE_AA)
         _text(sheet, curve.name, place)
@@ -77,6 +81,12 @@ def chart(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> UInt8[np.nda
 def side_by_side(charts: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h W 3"]:
     """Charts in a row."""
     return np.hstack(charts)
+
+
+def round_limit(most: float) -> float:
+    """The first of 1, 2, 2.5, 5, 10 times a power of ten that is not below a positive number."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(next(step * power for step in (1, 2, 2.5, 5, 10) if step * power >= most * (1 - 1e-9)))
 
 
 def cumulative(name: str, values: Sequence[float], axis: Axis, total: int | None = None) -> Curve:

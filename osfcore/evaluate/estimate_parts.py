@@ -67,6 +67,7 @@ class EvaluateEstimate:
         parts: what to measure; first frames are measured in any case, since everything else begins with them.
         bad: number of spoiled inputs.
         names: objects to draw from, or None for the ten default ones.
+        steps: of an episode.
         size: side of the images [px].
         effort: of first frames.
         track: of later frames.
@@ -80,6 +81,7 @@ class EvaluateEstimate:
     parts: tuple[Part, ...] = PARTS
     bad: int = 0
     names: tuple[str, ...] | None = None
+    steps: int = STEPS
     size: int = DEFAULT_IMAGE_SIDE
     effort: Effort = field(default_factory=Effort)
     track: TrackEffort = field(default_factory=TrackEffort)
@@ -126,7 +128,11 @@ class Bench:
     def track(self, number: int, first: TaskResult) -> TaskResult:
         """Later frames of a task, from its first estimate on."""
         draw, effort = self._draw(number), self._config.track
-        given = {**self._circumstances(draw, asdict(effort)), "first": digest(first.figures), "steps": STEPS}
+        given = {
+            **self._circumstances(draw, asdict(effort)),
+            "first": digest(first.figures),
+            "steps": self._config.steps,
+        }
         cache = TaskCache(self._config.folder / "track")
         kept = cache.read(_file(number), given)
         if kept is None:
@@ -180,13 +186,18 @@ class Bench:
         return kept
 
     def _tracked(self, draw: Draw, start: SceneState | None, first: FrameScore, effort: TrackEffort) -> TaskResult:
-        pushes, models = episode(draw, self._library, self._cameras), self._models
+        pushes = episode(draw, self._library, self._cameras, steps=self._config.steps)
         if start is None:
             score = TrackScore(
                 draw.names, (False,) * len(draw.names), (), (), (), (), (), pushes.moved_m, first.refused
             )
             return TaskResult({"score": score.to_json()}, self._compared(pushes.frames[-1].observation, None))
-        assets, expected, rng = self._meshes(draw.names), start, np.random.default_rng([draw.seed, 5])
+        models, assets, expected, rng = (
+            self._models,
+            self._meshes(draw.names),
+            start,
+            np.random.default_rng([draw.seed, 5]),
+        )
         rows: dict[str, Any] = {key: [] for key in ("position_mm", "rotation_deg", "doubted", "seconds")}
         states = []
         for frame in pushes.frames:

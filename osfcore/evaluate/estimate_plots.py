@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from scipy.special import erf
 
-from osfcore.evaluate.charts import Axis, Curve, chart, cumulative, side_by_side
+from osfcore.evaluate.charts import Axis, Curve, chart, cumulative, round_limit, side_by_side
 from osfcore.evaluate.estimate_bad import BadScore
 from osfcore.evaluate.estimate_report import EstimateReport, errors_at
 from osfcore.evaluate.estimate_scores import (
@@ -98,9 +98,15 @@ def track_plot(tracks: Sequence[TrackScore]) -> UInt8[np.ndarray, "h w 3"]:
             Curve("median", steps.astype(float), np.array([median(v) for v in values], float), dots=True),
             Curve("90 % below", steps.astype(float), np.array([quantile(v, 0.9) for v in values], float), dots=True),
         ]
-        high = float(np.nanmax([axis.high / 2, *(curve.y.max(initial=0.0) * 1.1 for curve in curves)]))
+        high = _limit(curves, 5.0)
         panels.append(
-            chart("Without masks, step by step", Axis("step", 0, max(count, 1)), Axis(axis.label, 0, high), curves)
+            chart(
+                "Without masks, step by step",
+                Axis("step", 0, max(count, 1)),
+                Axis(axis.label, 0, high),
+                curves,
+                legend="top",
+            )
         )
     return side_by_side(panels)
 
@@ -118,13 +124,17 @@ def views_plot(report: EstimateReport) -> UInt8[np.ndarray, "h w 3"]:
     ]
     light = np.array([median(frame.light_deg for frame in f) for f in frames], float)
     errors.append(Curve("light, median [deg]", x, light, dots=True))
-    high = max([1.0, *(float(np.nanmax([*curve.y, 0.0])) * 1.1 for curve in errors)])
     return side_by_side(
         [
             chart("Under 1 cm and 5 deg", axis, _SHARE, [Curve("share", x, right, dots=True)]),
-            chart("Errors", axis, Axis("error", 0, high), errors),
+            chart("Errors", axis, Axis("error", 0, _limit(errors, 1.0)), errors, legend="top"),
         ]
     )
+
+
+def _limit(curves: Sequence[Curve], least: float) -> float:
+    """Where an axis ends that holds all of the curves."""
+    return round_limit(max(least, *(float(np.nanmax([*curve.y, 0.0])) for curve in curves)))
 
 
 # Galleries

@@ -88,6 +88,8 @@ def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) 
 def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, steps: int = STEPS) -> Episode:
     """Pushes that follow the first frame; in the course of them some object moves by 5 cm or more.
 
+    Pushes that move nothing so far are drawn again, a hundred times at most; `moved_m` tells.
+
     Raises:
         UnknownName, MissingAssets, NoRoom: as for the first frame.
     """
