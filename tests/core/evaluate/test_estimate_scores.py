@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from osfcore.estimated import EstimatedState
 from osfcore.evaluate.estimate_scores import (
     FrameScore,
-    ObjectScore,
     TrackScore,
     coverage,
     flagged_shares,
@@ -26,6 +25,7 @@ from osfcore.evaluate.estimate_scores import (
 )
 from osfcore.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.scene import Light, SceneState
+from tests.core.evaluate.scores import frame, score, track
 
 BOX, CAN = "003_cracker_box", "005_tomato_soup_can"
 NAMES = (BOX, CAN)
@@ -51,14 +51,6 @@ def believed(truth, shift=(0, 0, 0), turn=(0, 0, 0), *, doubts=("", ""), reason=
     quaternion[0] = quaternion_multiply(quaternion_exp(np.array(turn, float)), quaternion[0])
     state = replace(truth, poses=Pose(position, quaternion), light=light or truth.light)
     return EstimatedState(state, np.full(2, std), np.full(2, std), 0.01, doubts, reason)
-
-
-def score(position_mm=1.0, rotation_deg=1.0, *, flagged=False, ratios=(1.0, 1.0, 1.0)):
-    return ObjectScore("a", position_mm, rotation_deg, 0.5, 1.0, ratios, ratios, flagged, "doubt" * flagged)
-
-
-def frame(*objects, light=(0.5, 0.5)):
-    return FrameScore(("a",) * len(objects), objects, 1.0, light, 2.0, True)
 
 
 def test_errors_are_what_was_done_to_the_truth(truth, assets):
@@ -107,8 +99,8 @@ def test_scores_survive_json(truth, assets):
     assert FrameScore.from_json(json.loads(json.dumps(found.to_json()))) == found
     refused = refused_frame(NAMES, "no masks", 0.1)
     assert FrameScore.from_json(json.loads(json.dumps(refused.to_json()))) == refused
-    track = tracked([1.0, 40.0], [1.0, 2.0])
-    assert TrackScore.from_json(json.loads(json.dumps(track.to_json()))) == track
+    kept = track([1.0, 40.0], [1.0, 2.0])
+    assert TrackScore.from_json(json.loads(json.dumps(kept.to_json()))) == kept
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -172,25 +164,8 @@ def test_an_absence_interrupts_the_run():
     assert lost_at([40, 40, 40, 40], [0] * 4, ["", "out of view", "", ""]) == 3
 
 
-def tracked(*position, refused=""):
-    """A track of objects with these errors [mm] at each step."""
-    rows = tuple(zip(*position, strict=True))
-    count, steps = len(position), len(rows)
-    return TrackScore(
-        names=tuple("abc"[:count]),
-        right_at_start=(True,) * count,
-        position_mm=rows,
-        rotation_deg=((0.0,) * count,) * steps,
-        absent=(("",) * count,) * steps,
-        doubted=((False,) * count,) * steps,
-        seconds=(0.5,) * steps,
-        moved_m=(0.06,) * count,
-        refused=refused,
-    )
-
-
 def test_each_object_is_lost_by_itself():
-    assert tracked([0.0, 40.0, 0.0], [0.0, 0.0, 40.0]).lost_at == (None, None)  # never the same one twice
-    assert tracked([0.0, 40.0, 40.0], [0.0, 0.0, 40.0]).lost_at == (2, None)
-    nothing = replace(tracked([0.0]), position_mm=(), rotation_deg=(), absent=(), refused="no start")
+    assert track([0.0, 40.0, 0.0], [0.0, 0.0, 40.0]).lost_at == (None, None)  # never the same one twice
+    assert track([0.0, 40.0, 40.0], [0.0, 0.0, 40.0]).lost_at == (2, None)
+    nothing = replace(track([0.0]), position_mm=(), rotation_deg=(), absent=(), refused="no start")
     assert nothing.lost_at == (0,)
