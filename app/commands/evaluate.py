@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -56,19 +57,12 @@ class Evaluate:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
-        if self.what == "estimate":
-            if self.data is not None or self.weights is not None:
-                raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
-            last, show = follow(self._estimate_steps()), _show_estimate
-        else:
-            last, show = follow(self._steps()), _show
+        last, show = self._estimates() if self.what == "estimate" else (follow(self._steps()), _show)
         assert last is not None
         assert last.report is not None, "the last step brings the report"
         result = last.report.to_json()
         if not self.json:
             show(result)
-            if self.what == "estimate":
-                print(f"Pictures of errors and failures: {self._folder}.")
         return result
 
     @property
@@ -87,14 +81,18 @@ class Evaluate:
         config = EvaluateFields(self._folder, self.names, self.tasks, self.objects, self.seed)
         return evaluate_fields(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects"))
 
-    def _estimate_steps(self) -> Iterator[EstimateEvaluationStep]:
+    def _estimates(self) -> tuple[EstimateEvaluationStep | None, Callable[[dict[str, Any]], None]]:
+        """Measure estimators; the last step, and how to show its report."""
         from osfcore.evaluate.estimate import evaluate_estimate
         from osfcore.evaluate.estimate_parts import EvaluateEstimate
         from osfcore.fields.library import FieldLibrary
         from osfcore.objects.library import AssetLibrary
 
+        if self.data is not None or self.weights is not None:
+            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
         config = EvaluateEstimate(self._folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
-        return evaluate_estimate(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects"))
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        return follow(evaluate_estimate(config, fields, assets)), partial(_show_estimate, config.folder)
 
 
 def _show(result: dict[str, Any]) -> None:
@@ -118,7 +116,7 @@ def _show(result: dict[str, Any]) -> None:
         console.print(f"{result['scenes']} scenes: {', '.join(told)}", highlight=False)
 
 
-def _show_estimate(result: dict[str, Any]) -> None:
+def _show_estimate(folder: Path, result: dict[str, Any]) -> None:
     """The report for people, a line for each part."""
     print(
         f"First frames: {result['tasks']} scenes, {result['objects_total']} objects: "
@@ -153,6 +151,7 @@ def _show_estimate(result: dict[str, Any]) -> None:
             f"Bad cases: {result['bad_cases']}: {result['bad_refused']} refused, {result['bad_flagged']} flagged, "
             f"{result['bad_right']} right, {result['bad_confident_wrong']} wrong without a warning."
         )
+    print(f"Pictures and figures: {folder}")
 
 
 def _errors(row: dict[str, Any]) -> str:
