@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from osfcore.errors import InvalidInput, MissingAssets
 from osfcore.evaluate.cache import TaskResult
 from osfcore.evaluate.estimate_bad import BadScore
-from osfcore.evaluate.estimate_parts import PARTS, VIEWS, Bench, EvaluateEstimate
+from osfcore.evaluate.estimate_parts import PARTS, VIEWS, EvaluateEstimate, TaskRunner
 from osfcore.evaluate.estimate_plots import bad_failure, frame_failure, track_failure, write_gallery, write_plots
 from osfcore.evaluate.estimate_report import EstimateReport
 from osfcore.evaluate.estimate_scores import FrameScore, TrackScore
@@ -57,9 +57,9 @@ def evaluate_estimate(
         InvalidInput: if a number is out of range.
         CorruptFile, CannotWrite: as files are.
     """
-    bench = Bench(config, _checked(config, fields, assets), fields, assets)
+    runner = TaskRunner(config, _checked(config, fields, assets), fields, assets)
     kept: _Results = {}
-    jobs = _jobs(config, bench, kept)
+    jobs = _jobs(config, runner, kept)
     total, done = sum(count for _, count, _ in jobs.values()), 0
     for key, (title, count, work) in jobs.items():
         kept[key] = []
@@ -77,25 +77,25 @@ def evaluate_estimate(
 _Job = tuple[str, int, Callable[[int], TaskResult]]  # what it is called, how many, and one of them
 
 
-def _jobs(config: EvaluateEstimate, bench: Bench, kept: _Results) -> dict[str, _Job]:
+def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[str, _Job]:
     """What there is to do, in order; tracks and goals begin with the first frames in `kept`."""
     tasks = config.tasks
-    jobs: dict[str, _Job] = {"first": ("First frames", tasks, bench.first)}
+    jobs: dict[str, _Job] = {"first": ("First frames", tasks, runner.first)}
     if "track" in config.parts:
-        jobs["track"] = "Tracks", tasks, lambda number: bench.track(number, kept["first"][number])
+        jobs["track"] = "Tracks", tasks, lambda number: runner.track(number, kept["first"][number])
     if "goal" in config.parts:
-        jobs["goal"] = "Goals", tasks, lambda number: bench.goal(number, kept["first"][number])
+        jobs["goal"] = "Goals", tasks, lambda number: runner.goal(number, kept["first"][number])
     if "ablations" in config.parts:
-        jobs["fixed_light"] = "Light held overhead", tasks, bench.fixed_light
+        jobs["fixed_light"] = "Light held overhead", tasks, runner.fixed_light
         for views in VIEWS:
-            jobs[f"views_{views}"] = f"{views} of 4 views", tasks, _few_views(bench, views)
+            jobs[f"views_{views}"] = f"{views} of 4 views", tasks, _few_views(runner, views)
     if config.bad:
-        jobs["bad"] = "Bad cases", config.bad, bench.bad
+        jobs["bad"] = "Bad cases", config.bad, runner.bad
     return jobs
 
 
-def _few_views(bench: Bench, views: int) -> Callable[[int], TaskResult]:
-    return lambda number: bench.few_views(number, views)
+def _few_views(runner: TaskRunner, views: int) -> Callable[[int], TaskResult]:
+    return lambda number: runner.few_views(number, views)
 
 
 def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:

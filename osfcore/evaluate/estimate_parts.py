@@ -30,6 +30,7 @@ from osfcore.evaluate.estimate_bad import FIRST_SCENE, BadCase, BadScore, bad_ca
 from osfcore.evaluate.estimate_scores import FrameScore, TrackScore, flags, pose_errors, refused_frame, score_frame
 from osfcore.evaluate.estimate_scores import is_right as is_right_pose
 from osfcore.evaluate.estimate_tasks import STEPS, Frame, episode, first_frame, goals
+from osfcore.evaluate.estimate_warmup import WARM_SCENE, last_estimate, warm_models
 from osfcore.evaluate.images import Comparison, as_bytes
 from osfcore.fields.library import FieldLibrary
 from osfcore.objects.asset import ObjectAsset
@@ -42,16 +43,6 @@ FORMAT = 1  # of the kept results; rises when figures come to mean something els
 Part = Literal["first", "track", "goal", "ablations"]
 PARTS: tuple[Part, ...] = ("first", "track", "goal", "ablations")
 VIEWS: dict[int, tuple[int, ...]] = {1: (0,), 2: (0, 2)}  # cameras that an ablation keeps: two face each other
-_WARM_SCENE = 900_000
-_WARM = Effort(
-    starts=1,
-    population=4,
-    generations=1,
-    joint_population=4,
-    joint_generations=1,
-    coarse_iterations=1,
-    fine_iterations=1,
-)
 _SHOWN_QUALITY = Quality(samples_per_side=2)
 
 
@@ -93,7 +84,7 @@ class EvaluateEstimate:
         return self.out / "estimate" / f"{self.objects}-objects-seed-{self.seed}"
 
 
-class Bench:
+class TaskRunner:
     """What the parts need: fields ready for use, meshes, and results of earlier runs.
 
     Args:
@@ -202,7 +193,7 @@ class Bench:
         states = []
         for frame in pushes.frames:
             began = time.perf_counter()
-            estimate = _last(estimate_next(models, frame.observation, expected, rng, effort))
+            estimate = last_estimate(estimate_next(models, frame.observation, expected, rng, effort))
             rows["seconds"].append(time.perf_counter() - began)
             expected = estimate.state
             position, rotation = pose_errors(expected, frame.truth, assets)
@@ -243,11 +234,11 @@ class Bench:
         began, estimate, refused = time.perf_counter(), None, ""
         try:
             if case.start is None:
-                estimate = _last(estimate_first(models, case.observation, rng, config.effort))
+                estimate = last_estimate(estimate_first(models, case.observation, rng, config.effort))
             else:
-                prior = _last(estimate_first(models, case.start, rng, config.effort)).state
+                prior = last_estimate(estimate_first(models, case.start, rng, config.effort)).state
                 began = time.perf_counter()
-                estimate = _last(estimate_goal(models, case.observation, prior, config.goal))
+                estimate = last_estimate(estimate_goal(models, case.observation, prior, config.goal))
         except OsfError as error:
             refused = str(error)
         seconds = time.perf_counter() - began
@@ -273,7 +264,7 @@ class Bench:
         """Run an estimate; a refusal is a result too."""
         began = time.perf_counter()
         try:
-            estimate = _last(steps)
+            estimate = last_estimate(steps)
         except OsfError as error:
             return refused_frame(frame.truth.names, str(error), time.perf_counter() - began), None
         seconds = time.perf_counter() - began
@@ -293,24 +284,11 @@ class Bench:
 
     @cached_property
     def _models(self) -> Models:
-        """Fields, warmed up; loaded when the first estimate is asked for, since all may be known from earlier runs."""
-        models = Models({name: self._fields.load(name) for name in self._names}, self._fields.load_table())
-        for name in self._names:
-            models.resting(name)
-        self._warm_up(models)
-        return models
-
-    def _warm_up(self, models: Models) -> None:
-        """Every kind of estimate once, with as little work as they can be asked for."""
-        rng, c, draw = np.random.default_rng(0), self._config, self._draw(_WARM_SCENE)
-        observation = first_frame(draw, self._library, self._cameras).observation
-        state = _last(estimate_first(models, observation, rng, _WARM)).state
-        if "track" in c.parts:
-            effort = replace(c.track, fits_below=0.0, lamp_above=0.0, generations=1, sweeps=1)  # searches in any case
-            _last(estimate_next(models, observation, state, rng, effort))
-        if "goal" in c.parts or c.bad:
-            view = goals(draw, self._library, goal_camera(c.size))[0].frame.observation
-            _last(estimate_goal(models, view, state, replace(c.goal, widen_above=0.0)))
+        """Loaded when the first estimate is asked for: all may be known from earlier runs."""
+        config = self._config
+        goal = "goal" in config.parts or config.bad > 0
+        draw = self._draw(WARM_SCENE)
+        return warm_models(self._names, self._fields, self._library, draw, config.size, goal=goal)
 
     @cached_property
     def _weights(self) -> dict[str, str]:
@@ -352,14 +330,6 @@ def state_of(first: TaskResult) -> SceneState | None:
 def digest(figures: dict[str, Any]) -> str:
     """Of a first estimate, which others begin with."""
     return hashlib.sha256(json.dumps(figures["state"], sort_keys=True).encode()).hexdigest()
-
-
-def _last(steps: Iterator[EstimateStep]) -> EstimatedState:
-    estimate = None
-    for step in steps:
-        estimate = step.estimate
-    assert estimate is not None, "the last step brings the estimate"
-    return estimate
 
 
 def _file(number: int) -> str:

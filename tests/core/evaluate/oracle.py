@@ -8,6 +8,7 @@ import numpy as np
 import osfcore.evaluate.estimate_parts as parts
 import osfcore.evaluate.estimate_tasks as tasks
 from osfcore.errors import InvalidInput
+from osfcore.estimate.models import Models
 from osfcore.estimate.steps import EstimateStep
 from osfcore.estimated import EstimatedState
 from osfcore.poses import Pose
@@ -39,7 +40,7 @@ class Oracle:
         patch.setattr(parts, "estimate_first", self.first)
         patch.setattr(parts, "estimate_next", self.next)
         patch.setattr(parts, "estimate_goal", self.goal)
-        patch.setattr(parts.Bench, "_warm_up", lambda *_: None)
+        patch.setattr(parts, "warm_models", _cold_models)
 
     def first(self, _models, observation, _rng, effort):
         if self.refuses:
@@ -68,6 +69,10 @@ class Oracle:
         state = replace(truth, poses=Pose(truth.poses.position + [SHIFT_M, 0, 0], truth.poses.quaternion))
         estimate = EstimatedState(state, np.full(count, 0.001), np.full(count, 0.01), 0.01, ("",) * count, "")
         yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=estimate)
+
+
+def _cold_models(names, fields, *_args, **_more):
+    return Models({name: fields.load(name) for name in names}, fields.load_table())
 
 
 def _key(observation):

@@ -127,7 +127,7 @@ def test_a_refused_first_frame_is_a_result_too(solids, library, tmp_path, oracle
 
 
 def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library, tmp_path, monkeypatch):
-    monkeypatch.setattr(parts, "Models", refuse)
+    monkeypatch.setattr(parts, "warm_models", refuse)
     config = quick(tmp_path / "out")
     cases = [
         (replace(config, names=("teapot",)), UnknownName, "teapot"),
