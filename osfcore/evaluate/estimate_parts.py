@@ -1,7 +1,8 @@
 """The parts of the evaluation of estimators, one task at a time, each kept on disk when it is done.
 
 Times are of estimates alone: fields are loaded and unpacked, code is compiled and the ways in which objects can lie are
-found in a warm-up on scenes that no figure uses, because all that is done once in a program's life.
+found in a warm-up on a scene that no figure uses, because all that is done once in a program's life. They are kept with
+the rest, so times mean something only where the machine had nothing else to do.
 """
 
 from __future__ import annotations
