@@ -52,7 +52,8 @@ class EvaluateEstimate:
     """Evaluate the estimators against the simulator.
 
     Attributes:
-        out: folder for results; those of an earlier run under the same circumstances are taken over.
+        out: folder for results; those of an earlier run with the same weights, meshes and settings are taken over.
+            Changes to the estimators' code do not show in these: measure them in a new folder.
         tasks: number of scenes, each with its own objects, arrangement and light.
         objects: in each scene.
         seed: of scenes and searches.
