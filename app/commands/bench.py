@@ -12,22 +12,27 @@ from app.commands.progress_bar import follow
 from app.paths import default_data_dir
 
 _FIGURES, _PICTURE = "render.json", "render.png"
+_ESTIMATE_FIGURES = "estimate.json"
+_SCENES = {"render": 60, "estimate": 5}
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure what rendering costs: new scenes against TinyRenderer, planning, growth. Run alone on the machine."""
+    """Measure what things cost. Run alone on the machine.
 
-    what: tyro.conf.Positional[Literal["render"]]
+    render: new scenes against TinyRenderer, planning, growth. estimate: first frames, later frames and goals.
+    """
+
+    what: tyro.conf.Positional[Literal["render", "estimate"]]
     """What to measure."""
     out: Path | None = None
-    """Folder for render.json and a picture of scenes by TinyRenderer and by us."""
+    """Folder for the figures as JSON and, with render, a picture of scenes by TinyRenderer and by us."""
     seed: int = 0
     """Of all scenes."""
-    scenes: int = 60
-    """New scenes against TinyRenderer."""
+    scenes: int | None = None
+    """New scenes; by default 60 to render and 5 to estimate."""
     repeats: int = 5
-    """Of everything else."""
+    """With render: of everything else."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Where fetched objects and trained fields are."""
     json: bool = False
@@ -35,16 +40,18 @@ class Bench:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds figures and tables."""
+        scenes = _SCENES[self.what] if self.scenes is None else self.scenes
+        return self._estimate(scenes) if self.what == "estimate" else self._render(scenes)
+
+    def _render(self, scenes: int) -> dict[str, Any]:
         from osfcore.evaluate.bench_render import BenchRender, bench_render
         from osfcore.evaluate.images import contact_sheet, write_png
         from osfcore.fields.library import FieldLibrary
-        from osfcore.fields.outputs import check_place
         from osfcore.files import write_json
         from osfcore.objects.library import AssetLibrary
 
-        config = BenchRender(scenes=self.scenes, repeats=self.repeats, seed=self.seed)
-        for path in (self.out / _FIGURES, self.out / _PICTURE) if self.out is not None else ():
-            check_place(path)
+        config = BenchRender(scenes=scenes, repeats=self.repeats, seed=self.seed)
+        self._check_places(_FIGURES, _PICTURE)
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         last = follow(bench_render(config, fields, assets))
         assert last is not None
@@ -56,6 +63,36 @@ class Bench:
         if not self.json:
             _show(result)
         return result
+
+    def _estimate(self, scenes: int) -> dict[str, Any]:
+        from osfcore.evaluate.bench_estimate import BenchEstimate, bench_estimate
+        from osfcore.fields.library import FieldLibrary
+        from osfcore.files import write_json
+        from osfcore.objects.library import AssetLibrary
+
+        self._check_places(_ESTIMATE_FIGURES)
+        config = BenchEstimate(scenes=scenes, seed=self.seed)
+        last = follow(bench_estimate(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        result = last.report.to_json()
+        if self.out is not None:
+            write_json(self.out / _ESTIMATE_FIGURES, result)
+        if not self.json:
+            print(
+                f"{result['scenes']} scenes of {result['objects']} objects, {result['threads']} threads, medians: "
+                f"first frame {result['first_s']:.1f} s, later frame {result['next_s']:.2f} s "
+                f"({result['refine_hz']:.1f} Hz), goal {result['goal_s']:.1f} s."
+            )
+        return result
+
+    def _check_places(self, *names: str) -> None:
+        """Refuse what cannot be written before the work begins."""
+        from osfcore.fields.outputs import check_place
+
+        if self.out is not None:
+            for name in names:
+                check_place(self.out / name)
 
 
 def _show(result: dict[str, Any]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,30 +15,37 @@ from app.paths import default_data_dir
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
+    from osfcore.evaluate.estimate import EstimateEvaluationStep
     from osfcore.evaluate.fields import EvaluationStep
+
+_FOLDER = "evaluation"  # of the data directory
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure trained fields: each object alone on unseen views under unseen lights, and scenes under harsh lights.
+    """Measure trained fields, or the estimators that use them, on random scenes under harsh lights.
 
+    fields: each object alone on unseen views under unseen lights, and scenes of several. estimate: poses and light
+    from first frames, along pushes without masks and of goals, what each ingredient is worth, and spoiled inputs.
     Results are kept in the output folder: a killed evaluation goes on when started again, and may be run in pieces.
     """
 
-    what: tyro.conf.Positional[Literal["fields"]]
+    what: tyro.conf.Positional[Literal["fields", "estimate"]]
     """What to evaluate."""
-    out: Path
-    """Folder for results and contact sheets (truth, ours, difference)."""
+    out: Path | None = None
+    """Folder for results and pictures; DATA_DIR/evaluation by default."""
     names: tuple[str, ...] | None = None
-    """Objects; by default all that have a field and a mesh."""
+    """Objects; by default all that have a field and a mesh, with estimate the ten default ones."""
     tasks: int = 20
-    """Scenes against the simulator, each with its own objects and light; 0 for objects alone."""
+    """Scenes against the simulator, each with its own objects and light; with fields, 0 for objects alone."""
     objects: int = 3
     """Objects in a scene."""
     seed: int = 0
-    """Of views, lights and scenes."""
+    """Of views, lights, scenes and searches."""
+    parts: tuple[Literal["first", "track", "goal", "ablations"], ...] = ("first", "track", "goal", "ablations")
+    """With estimate: what to measure; first frames are in any case."""
+    bad: int = 0
+    """With estimate: number of spoiled inputs (100 gives ten of each kind)."""
     data: Path | None = None
     """With --weights: measure on the test images of this set in the OSF format instead of the simulator's."""
     weights: Path | None = None
@@ -47,14 +56,18 @@ class Evaluate:
     """Print the result as one JSON object in the last line."""
 
     def run(self) -> dict[str, Any]:
-        """Measure with a progress bar; the result holds means and every object's figures."""
-        last = follow(self._steps())
+        """Measure with a progress bar; the result holds what the evaluation's report does."""
+        last, show = self._estimates() if self.what == "estimate" else (follow(self._steps()), _show)
         assert last is not None
         assert last.report is not None, "the last step brings the report"
         result = last.report.to_json()
         if not self.json:
-            _show(result)
+            show(result)
         return result
+
+    @property
+    def _folder(self) -> Path:
+        return self.data_dir / _FOLDER if self.out is None else self.out
 
     def _steps(self) -> Iterator[EvaluationStep]:
         from osfcore.evaluate.fields import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
@@ -62,11 +75,24 @@ class Evaluate:
         from osfcore.objects.library import AssetLibrary
 
         if self.data is not None and self.weights is not None:
-            return evaluate_set(EvaluateSet(self.data, self.weights, self.out))
+            return evaluate_set(EvaluateSet(self.data, self.weights, self._folder))
         if self.data is not None or self.weights is not None:
             raise InvalidInput("choice of --data and --weights", "one alone", "both or none")
-        config = EvaluateFields(self.out, self.names, self.tasks, self.objects, self.seed)
+        config = EvaluateFields(self._folder, self.names, self.tasks, self.objects, self.seed)
         return evaluate_fields(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects"))
+
+    def _estimates(self) -> tuple[EstimateEvaluationStep | None, Callable[[dict[str, Any]], None]]:
+        """Measure estimators; the last step, and how to show its report."""
+        from osfcore.evaluate.estimate import evaluate_estimate
+        from osfcore.evaluate.estimate_parts import EvaluateEstimate
+        from osfcore.fields.library import FieldLibrary
+        from osfcore.objects.library import AssetLibrary
+
+        if self.data is not None or self.weights is not None:
+            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
+        config = EvaluateEstimate(self._folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        return follow(evaluate_estimate(config, fields, assets)), partial(_show_estimate, config.folder)
 
 
 def _show(result: dict[str, Any]) -> None:
@@ -88,3 +114,56 @@ def _show(result: dict[str, Any]) -> None:
         shares = {"whole": "scene_psnr_mean", "objects": "scene_psnr_object_mean", "shadow": "scene_psnr_shadow_mean"}
         told = [f"{what} {result[key]:.2f} dB" for what, key in shares.items() if result[key] is not None]
         console.print(f"{result['scenes']} scenes: {', '.join(told)}", highlight=False)
+
+
+def _show_estimate(folder: Path, result: dict[str, Any]) -> None:
+    """The report for people, a line for each part."""
+    print(
+        f"First frames: {result['tasks']} scenes, {result['objects_total']} objects: "
+        f"{_percent(result['frac_1cm_5deg'])} under 1 cm and 5 deg; medians {_errors(result)}, "
+        f"ADD-S {_number(result['adds_mm_median'])} mm, {_number(result['first_s_median'])} s."
+    )
+    print(
+        f"Claimed deviations: {_percent(result['two_sigma_coverage'])} of errors within two; "
+        f"{_number(result['mean_position_std_mm'], 2)} mm on average. "
+        f"Flagged: {_percent(result['flagged_good'])} of right estimates, "
+        f"{_percent(result['flagged_bad'])} of wrong ones."
+    )
+    if result["track_episodes"] is not None:
+        drift = ", ".join(f"{_number(mm)} mm after {step}" for step, mm in result["drift_mm"].items())
+        print(
+            f"Tracks: {result['track_lost']} of {result['track_episodes']} lost "
+            f"({result['track_lost_from_wrong_start']} from a wrong first frame), {drift} steps; "
+            f"{_number(result['refine_hz'])} Hz."
+        )
+    if result["goal_objects_total"] is not None:
+        goals = {key.removeprefix("goal_"): value for key, value in result.items() if key.startswith("goal_")}
+        print(
+            f"Goals: {_percent(goals['frac_1cm_5deg'])} of {goals['objects_total']} objects under 1 cm and 5 deg; "
+            f"medians {_errors(goals)}, {_number(goals['s_median'])} s."
+        )
+    if result["by_views"] is not None:
+        rows = {f"{n} views" if n != "1" else "1 view": row for n, row in result["by_views"].items()}
+        for what, row in {"light held overhead": result["fixed_light"], **rows}.items():
+            print(f"  {what}: {_percent(row['frac_1cm_5deg'])} under 1 cm and 5 deg; medians {_errors(row)}")
+    if "bad_cases" in result:
+        print(
+            f"Bad cases: {result['bad_cases']}: {result['bad_refused']} refused, {result['bad_flagged']} flagged, "
+            f"{result['bad_right']} right, {result['bad_confident_wrong']} wrong without a warning."
+        )
+    print(f"Pictures and figures: {folder}")
+
+
+def _errors(row: dict[str, Any]) -> str:
+    return (
+        f"{_number(row['position_mm_median'])} mm, {_number(row['rotation_deg_median'])} deg, "
+        f"light {_number(row['light_deg_median'])} deg"
+    )
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"

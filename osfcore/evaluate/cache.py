@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from osfcore.errors import CorruptFile
 from osfcore.evaluate.images import Comparison
+from osfcore.fields.table import TableField
 from osfcore.files import write_atomically, write_json
 
 
@@ -74,3 +78,21 @@ class TaskCache:
         write_atomically(self._folder / f"{name}.npz", arrays.getvalue())
         # Last: where the JSON is, the images are.
         write_json(self._folder / f"{name}.json", {"circumstances": circumstances, "figures": result.figures})
+
+
+def file_sha256(path: Path) -> str:
+    """What a result that depends on a file depends on.
+
+    Raises:
+        CorruptFile: if it cannot be read.
+    """
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CorruptFile(path, "it cannot be read") from error
+
+
+def table_sha256(table: TableField) -> str:
+    """The same of a table."""
+    arrays = [np.asarray(getattr(table, entry.name)).tobytes() for entry in fields_of(table)]
+    return hashlib.sha256(b"".join(arrays)).hexdigest()

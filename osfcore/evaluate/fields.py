@@ -7,18 +7,16 @@ killed, resumed and run in pieces.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets
-from osfcore.evaluate.cache import TaskCache, TaskResult
+from osfcore.evaluate.cache import TaskCache, TaskResult, file_sha256, table_sha256
 from osfcore.evaluate.composites import (
     SCENE_QUALITY,
     compare_scene,
@@ -33,7 +31,6 @@ from osfcore.evaluate.views import VIEW_QUALITY, compare_views
 from osfcore.fields.image_set import read_image_set
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.library import FieldLibrary
-from osfcore.fields.table import TableField
 from osfcore.fields.weights import read_field
 from osfcore.objects.library import AssetLibrary
 from osfcore.render.scene_renderer import SceneRenderer
@@ -247,7 +244,7 @@ def _object_alone(config: EvaluateFields, name: str, fields: FieldLibrary, asset
     data = config.out / "sets" / f"{name}-{asset[:_DIGEST_CHARACTERS]}-{config.size}px-{config.seed}"
     circumstances = {
         "format": FORMAT,
-        "weights": _sha256(weights),
+        "weights": file_sha256(weights),
         "asset": asset,
         "set": data.name,
         "quality": asdict(VIEW_QUALITY),
@@ -298,7 +295,7 @@ class _Scenes:
             "format": FORMAT,
             "weights": {name: self._hash(name) for name in draw.names},
             "assets": {name: self._assets.digest(name) for name in draw.names},
-            "table": _table_sha256(table),
+            "table": table_sha256(table),
             "arrangement": draw.seed,
             "light": draw.light.direction.tolist(),
             "size": config.size,
@@ -318,7 +315,7 @@ class _Scenes:
 
     def _hash(self, name: str) -> str:
         if name not in self._hashes:
-            self._hashes[name] = _sha256(self._fields.info(name).path)
+            self._hashes[name] = file_sha256(self._fields.info(name).path)
         return self._hashes[name]
 
     def _load(self, name: str) -> KiloOSF:
@@ -358,15 +355,3 @@ def _titled(result: TaskResult, number: int, label: str) -> Comparison:
 
 def _write_sheet(path: Path, shown: Sequence[Comparison]) -> None:
     write_png(path, contact_sheet(shown))
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise CorruptFile(path, "it cannot be read") from error
-
-
-def _table_sha256(table: TableField) -> str:
-    arrays = [np.asarray(getattr(table, entry.name)).tobytes() for entry in fields_of(table)]
-    return hashlib.sha256(b"".join(arrays)).hexdigest()

@@ -146,10 +146,10 @@ def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 
     height, width = columns[0].truth.shape[:2]
     sheet = np.full((_LABEL_PX + 3 * height, _ROW_LABEL_PX + len(columns) * width, 3), _PAPER, np.uint8)
     for row, name in enumerate((first, "ours", f"diff x{DIFFERENCE_GAIN}")):
-        _write(sheet, name, (1, _LABEL_PX + row * height + height // 2), _ROW_LABEL_PX)
+        put_text(sheet, name, (1, _LABEL_PX + row * height + height // 2), _ROW_LABEL_PX)
     for number, column in enumerate(columns):
         left = _ROW_LABEL_PX + number * width
-        _write(sheet, column.label, (left + 2, _LABEL_PX - 5), width - 4)
+        put_text(sheet, column.label, (left + 2, _LABEL_PX - 5), width - 4)
         difference = np.abs(column.truth.astype(int) - column.ours)
         shown = np.clip(DIFFERENCE_GAIN * difference, 0, 255).astype(np.uint8)
         for row, image in enumerate((column.truth, column.ours, shown)):
@@ -158,7 +158,7 @@ def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 
     return sheet
 
 
-def _write(sheet: UInt8[np.ndarray, "H W 3"], text: str, place: tuple[int, int], width: int) -> None:
+def put_text(sheet: UInt8[np.ndarray, "H W 3"], text: str, place: tuple[int, int], width: int) -> None:
     """Small black letters, cut to a width [px]."""
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.32
     while text and cv2.getTextSize(text, font, scale, 1)[0][0] > width:

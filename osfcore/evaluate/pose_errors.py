@@ -6,8 +6,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from osfcore.estimate.tangent import across
 from osfcore.objects.asset import Symmetry
-from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
+from osfcore.poses import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_log,
+    quaternion_multiply,
+    rotate,
+    rotation_angle,
+)
+
+_PARALLEL = 1e-9
 
 
 def rotation_error(symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: Float[np.ndarray, "4"]) -> float:
@@ -18,11 +28,39 @@ def rotation_error(symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: 
         estimated: rotation from the object's frame to the world, unit.
         true: the same.
     """
+    return float(np.linalg.norm(rotation_components(symmetry, estimated, true)))
+
+
+def rotation_components(
+    symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "C"]:
+    """The rotation from the nearest orientation that looks like the true one to the estimated one [rad].
+
+    Args:
+        symmetry: of the object.
+        estimated: rotation from the object's frame to the world, unit.
+        true: the same.
+
+    Returns:
+        A rotation vector along the world's axes (C = 3); for a body of revolution its two components across the axis,
+        since a turn about it is no error and would only water down a statistic.
+    """
     if symmetry.kind == "continuous":
-        a, b = (rotate(q, np.asarray(symmetry.axis)) for q in (estimated, true))
-        return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-    alike = [true, *(quaternion_multiply(true, np.asarray(turn)) for turn in symmetry.rotations)]
-    return float(min(rotation_angle(np.asarray(estimated), other) for other in alike))
+        axis = np.asarray(symmetry.axis)
+        return direction_components(rotate(estimated, axis), rotate(true, axis))
+    alike = [np.asarray(true), *(quaternion_multiply(true, np.asarray(turn)) for turn in symmetry.rotations)]
+    nearest = min(alike, key=lambda other: float(rotation_angle(np.asarray(estimated), other)))
+    return quaternion_log(quaternion_multiply(estimated, quaternion_conjugate(nearest)))
+
+
+def direction_components(estimated: Float[np.ndarray, "3"], true: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
+    """The shortest rotation between two unit vectors [rad], along two directions across the true one."""
+    basis = np.stack(across(np.asarray(true, float)))
+    turn = basis @ np.cross(true, estimated)
+    sine, cosine = float(np.linalg.norm(turn)), float(np.dot(true, estimated))
+    if sine < _PARALLEL:  # so near that the sine is the angle, or opposite, where any direction serves
+        return turn if cosine > 0 else np.array([np.pi, 0.0])
+    return turn * (np.arctan2(sine, cosine) / sine)
 
 
 def adds(points: Float[np.ndarray, "P 3"], estimated: Pose, true: Pose) -> float:

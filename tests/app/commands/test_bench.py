@@ -1,10 +1,14 @@
 import json
+from functools import partial
 
 import pytest
 
+import osfcore.evaluate.bench_estimate as bench_estimate
 import osfcore.evaluate.bench_render as bench
 from app.cli import main
+from osfcore.evaluate.bench_estimate import BenchEstimate
 from osfcore.evaluate.bench_render import BenchRender
+from tests.core.evaluate.oracle import Oracle
 from tests.core.evaluate.solids import write_fields
 
 
@@ -34,6 +38,28 @@ def test_figures_are_the_last_line_as_json_and_a_file(fields_dir, tmp_path, caps
     assert "TinyRenderer" in shown
     assert "renders a second" in shown
     assert "Growth" in shown
+
+
+def test_estimates_are_timed(data_dir, library, tmp_path, capsys, monkeypatch):
+    write_fields(data_dir, library)
+    oracle = Oracle()
+    oracle.install(monkeypatch)
+    for name in ("first", "next", "goal"):
+        monkeypatch.setattr(bench_estimate, f"estimate_{name}", getattr(oracle, name))
+    monkeypatch.setattr(bench_estimate, "warm_models", lambda *_: None)
+    monkeypatch.setattr(bench_estimate, "BenchEstimate", partial(BenchEstimate, objects=2, steps=2, size=32))
+    arguments = ["bench", "estimate", "--data-dir", str(data_dir), "--scenes", "1"]
+    assert main([*arguments, "--out", str(tmp_path / "out"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert {"first_s", "next_s", "goal_s", "refine_hz", "threads"} <= set(result)
+    assert json.loads((tmp_path / "out" / "estimate.json").read_text()) == result
+    assert main(arguments) == 0
+    assert "1 scenes of 2 objects" in capsys.readouterr().out
+    asked = len(oracle.asked)
+    for more, words in ((["--scenes", "0"], "number of scenes is 0"), (["--out", "/proc/nowhere"], "/proc")):
+        assert main([*arguments, *more]) == 1
+        assert words in capsys.readouterr().err
+    assert len(oracle.asked) == asked
 
 
 def test_mistakes_are_one_sentence(fields_dir, tmp_path, capsys):

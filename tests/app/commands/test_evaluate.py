@@ -3,12 +3,15 @@ from functools import partial
 
 import pytest
 
+import osfcore.evaluate.estimate_parts
 import osfcore.evaluate.fields
 from app.cli import main
 from app.commands.evaluate import Evaluate
 from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.evaluate.estimate_parts import EvaluateEstimate
 from osfcore.evaluate.fields import EvaluateFields
 from osfcore.world.collect_images import CollectObject, collect_object
+from tests.core.evaluate.oracle import Oracle
 from tests.core.evaluate.solids import SOLIDS, write_fields
 
 
@@ -50,6 +53,69 @@ def test_any_set_and_weights(fields_dir, library, tmp_path):
         Evaluate("fields", tmp_path / "out", data=tmp_path / "set", weights=table).run()
     with pytest.raises(CorruptFile, match="anno.json"):
         Evaluate("fields", tmp_path / "out", data=tmp_path, weights=weights).run()
+
+
+@pytest.fixture
+def oracle(fields_dir, monkeypatch):
+    """Estimators that know the truth, and little to do for them."""
+    small = partial(EvaluateEstimate, size=32, steps=2)
+    monkeypatch.setattr(osfcore.evaluate.estimate_parts, "EvaluateEstimate", small)
+    oracle = Oracle()
+    oracle.install(monkeypatch)
+    return oracle
+
+
+def test_estimators_are_measured(fields_dir, oracle, capsys):
+    arguments = ["--data-dir", str(fields_dir), "--names", *SOLIDS, "--tasks", "2", "--objects", "2", "--bad", "1"]
+    assert main(["eval", "estimate", *arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert (result["objects_total"], result["frac_1cm_5deg"], result["track_lost"], result["bad_cases"]) == (4, 1, 0, 1)
+    assert "Tracks (1 of 2)" in told.err
+    assert (fields_dir / "evaluation" / "estimate" / "2-objects-seed-0" / "report.json").exists()
+    asked = len(oracle.asked)
+    assert main(["eval", "estimate", *arguments]) == 0  # taken over
+    assert len(oracle.asked) == asked
+    shown = capsys.readouterr().out
+    for words in (
+        "First frames: 2 scenes, 4 objects: 100.0 %",
+        "0 of 2 lost",
+        "Goals: 100.0 % of 8",
+        "2 views",
+        "Bad cases: 1",
+    ):
+        assert words in shown, words
+
+
+def test_estimators_are_measured_in_pieces(fields_dir, oracle, tmp_path, capsys):
+    arguments = ["--data-dir", str(fields_dir), "--out", str(tmp_path), "--names", *SOLIDS, "--tasks", "1"]
+    assert main(["eval", "estimate", *arguments, "--parts", "first"]) == 0
+    assert [what for what, _ in oracle.asked] == ["first search 4"]
+    shown = capsys.readouterr().out
+    assert "First frames" in shown
+    assert not any(words in shown for words in ("Tracks", "Goals", "views", "Bad"))
+    assert main(["eval", "estimate", *arguments, "--parts", "track", "--json"]) == 0
+    assert [what for what, _ in oracle.asked] == ["first search 4", "next", "next"]
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["goal_frac_1cm_5deg"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--names", "teapot"], "teapot"),
+        (["--tasks", "0"], "number of tasks is 0"),
+        (["--data", "set"], "osf eval fields"),
+        ([], "osf assets fetch"),  # the default objects are not all here
+    ],
+)
+def test_a_mistake_about_estimators_is_one_sentence(fields_dir, oracle, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert main(["eval", "estimate", "--out", str(out), "--data-dir", str(fields_dir), *arguments]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("osf: ")
+    assert words in line
+    assert not out.exists()
+    assert not oracle.asked
 
 
 @pytest.mark.parametrize(

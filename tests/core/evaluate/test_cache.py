@@ -1,11 +1,13 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from osfcore.errors import CannotWrite
-from osfcore.evaluate.cache import TaskCache, TaskResult
+from osfcore.errors import CannotWrite, CorruptFile
+from osfcore.evaluate.cache import TaskCache, TaskResult, file_sha256, table_sha256
 from osfcore.evaluate.images import Comparison
+from tests.core.evaluate.solids import exact_table
 
 CIRCUMSTANCES = {"weights": "abc", "size": 32, "light": (0.1, 0.2)}
 
@@ -54,3 +56,13 @@ def test_a_damaged_result_is_none(tmp_path, result, kind, content):
 def test_an_unwritable_place_is_told(result):
     with pytest.raises(CannotWrite, match="/proc/results"):
         TaskCache(Path("/proc/results")).write("task", CIRCUMSTANCES, result)
+
+
+def test_digests_follow_the_content(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc")
+    assert file_sha256(tmp_path / "a").startswith("ba7816bf")
+    with pytest.raises(CorruptFile, match="cannot be read"):
+        file_sha256(tmp_path / "b")
+    table = exact_table()
+    assert table_sha256(table) == table_sha256(exact_table())
+    assert table_sha256(replace(table, background=table.background * 2)) != table_sha256(table)

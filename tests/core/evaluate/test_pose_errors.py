@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.evaluate.pose_errors import adds, rotation_error
+from osfcore.evaluate.pose_errors import adds, direction_components, rotation_components, rotation_error
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate
 
 NONE = Symmetry("none", reason="labelled")
 ROUND = Symmetry("continuous", axis=(0.0, 0.0, 1.0), reason="a bowl")
@@ -42,6 +42,28 @@ def test_orientations_that_look_alike_are_no_error(name, seed):
     symmetry, true = CATALOGUE[name].symmetry, random_turn(seed)
     for like in symmetry.rotations:
         assert rotation_error(symmetry, quaternion_multiply(true, np.array(like)), true) < 1e-6
+
+
+@given(seeds, st.sampled_from(sorted(CATALOGUE)))
+def test_components_are_those_of_a_small_turn(seed, name):
+    symmetry, true = CATALOGUE[name].symmetry, random_turn(seed)
+    vector = np.random.default_rng(seed + 1).normal(size=3) * 0.02
+    alike = true if symmetry.kind != "discrete" else quaternion_multiply(true, np.array(symmetry.rotations[0]))
+    found = rotation_components(symmetry, quaternion_multiply(quaternion_exp(vector), alike), true)
+    if symmetry.kind == "continuous":
+        axis = rotate(true, np.asarray(symmetry.axis))
+        assert found.shape == (2,)
+        assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(vector - axis * (axis @ vector)), abs=1e-3)
+    else:
+        np.testing.assert_allclose(found, vector, atol=1e-9)
+
+
+@given(seeds, st.floats(0, np.pi))
+def test_directions_differ_by_the_angle_between_them(seed, angle):
+    rng = np.random.default_rng(seed)
+    true, across = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+    found = direction_components(np.cos(angle) * true + np.sin(angle) * across, true)
+    assert np.linalg.norm(found) == pytest.approx(angle, abs=1e-6)
 
 
 @given(seeds)
