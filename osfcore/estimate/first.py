@@ -54,12 +54,12 @@ class Effort:
             "overhead" to hold it there (to measure what knowing the light is worth).
     """
 
-    starts: int = 5
+    starts: int = 3
     population: int = 10
-    generations: int = 10
+    generations: int = 8
     joint_population: int = 16
-    joint_generations: int = 8
-    coarse_iterations: int = 4
+    joint_generations: int = 5
+    coarse_iterations: int = 3
     fine_iterations: int = 3
     light: Literal["search", "cma", "overhead"] = "search"
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from osfcore.estimate.lamp import find_light
 from osfcore.estimate.models import Models
 from osfcore.estimate.polish import PLANAR, Descent, polish
 from osfcore.estimate.resting import about_z
-from osfcore.estimate.rivals import challenged, turned
+from osfcore.estimate.rivals import challenged, pose_losses, turned, with_pose
 from osfcore.estimate.sliding import Sightings, sight
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import Guess
@@ -29,10 +30,11 @@ from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
 _YAWS = 24
-_SIGHTINGS = 60
+_SIGHTINGS = 300
 _ROUNDS = 3
 _FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
-_AWAY = np.array([0.0, 0.0, -1.0])  # below the table: not in the image
+_PLACES, _APART_M = 8, 0.03  # where the first of two objects is tried
+_AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
 _SHOWN = 24
 
 
@@ -49,7 +51,7 @@ class GoalEffort:
 
     side: int = FINE_SIDE
     planar_iterations: int = 5
-    free_iterations: int = 3
+    free_iterations: int = 8
     widen_above: float = 0.045
 
 
@@ -128,29 +130,60 @@ class _Goal:
     def _first(self, sightings: list[Sightings]) -> Guess:
         """The best sighting of each object; those not seen, or not looked for yet, are away."""
         count = len(self._names)
-        positions, quaternions = np.tile(_AWAY, (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        positions, quaternions = np.tile(_AWAY.position, (count, 1)), np.tile(_AWAY.quaternion, (count, 1))
         for n, found in enumerate(sightings):
             if len(found.scores):
                 positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
         return Guess(self._names, positions, quaternions, self._prior.light.direction, None)
 
     def _assemble(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the guess
-        """Choose a sighting for each object in turn, by the whole image; the light is searched between the rounds."""
+        """Choose a sighting for each object, by the whole image; the light is searched between the rounds.
+
+        First each object in turn, then two at a time: one that stands in another's place keeps it from there.
+        """
         for _ in range(_ROUNDS):
-            light = find_light(self._models, self._rough, self._coarse, guess)
-            guess = replace(guess, light=light)
-            losses = []
+            guess = replace(guess, light=find_light(self._models, self._rough, self._coarse, guess))
             for n, found in enumerate(sightings):
-                batch = guess.moved(np.zeros((1 + len(found.scores), guess.size)))
-                positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
-                positions[1:, n], quaternions[1:, n] = found.positions, found.quaternions
-                batch = replace(batch, positions=positions, quaternions=quaternions)
-                tried = whole_loss(residuals(self._models, self._coarse, batch))
-                best = int(tried.argmin())
-                losses.append(float(tried[best]))
-                guess = replace(guess, positions=positions[best], quaternions=quaternions[best])
+                guess, _ = self._placed(guess, n, found)
+            for first, second in combinations(range(len(sightings)), 2):
+                guess = self._pair(guess, (first, second), sightings)
+            losses = [self._loss(guess)] * len(sightings)
             yield self._step("together", "Which sightings explain the image together", guess, sightings, losses)
         return guess
+
+    def _pair(self, guess: Guess, pair: tuple[int, int], sightings: list[Sightings]) -> Guess:
+        """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
+        best, least = guess, self._loss(guess)
+        first, second = pair
+        without = with_pose(with_pose(guess, first, _AWAY), second, _AWAY)
+        for k in self._best_places(without, first, sightings[first]):
+            one = with_pose(without, first, sightings[first].pose(k))
+            both, loss = self._placed(one, second, sightings[second])
+            if loss < least:
+                best, least = both, loss
+        return best
+
+    def _best_places(self, guess: Guess, n: int, found: Sightings) -> list[int]:
+        """Numbers of the sightings of an object that explain the image best, each in a place of its own."""
+        kept: list[int] = []
+        for k in np.argsort(pose_losses(self._models, self._coarse, guess, n, found.poses)):
+            shifts = found.positions[kept] - found.positions[k]
+            if not kept or np.linalg.norm(shifts, axis=1).min() > _APART_M:
+                kept.append(int(k))
+            if len(kept) == _PLACES:
+                break
+        return kept
+
+    def _placed(self, guess: Guess, n: int, found: Sightings) -> tuple[Guess, float]:
+        """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
+        losses = pose_losses(self._models, self._coarse, guess, n, found.poses)
+        own = self._loss(guess)
+        if not len(losses) or losses.min() >= own:
+            return guess, own
+        return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
+
+    def _loss(self, guess: Guess) -> float:
+        return float(whole_loss(residuals(self._models, self._coarse, guess.moved(np.zeros((1, guess.size)))))[0])
 
     def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
         e = self._effort
@@ -164,10 +197,12 @@ class _Goal:
                 yield self._polishing("On the table", at)
         for n, name in enumerate(self._names):
             at, self._rivals[n] = challenged(
-                self._models, self._middle, self._fine, at, n, turned(self._models, at.guess, n)
+                self._models, self._fine, self._fine, at, n, turned(self._models, at.guess, n)
             )
             yield self._polishing(f"{name}: the other way round", at)
-        for step in polish(self._models, self._fine, at, iterations=e.free_iterations, light=self._middle):
+        at = replace(at, dampings=Descent.at(at.guess).dampings)
+        free = polish(self._models, self._fine, at, iterations=e.free_iterations, light=self._middle, until_settled=True)
+        for step in free:
             at = step
             yield self._polishing("The last millimetres", at)
         return at

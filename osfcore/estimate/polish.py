@@ -27,6 +27,7 @@ _SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of the diffe
 _MOST_SHIFT_M, _MOST_TURN_RAD, _MOST_LIGHT_RAD = 0.03, 0.4, 0.3
 _DAMPINGS = np.array([0.1, 1.0, 10.0, 100.0])  # tried at once, times the last good one
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e6
+_SETTLED = 0.97  # share of its loss before a sweep from which more sweeps promise little
 _TINY = 1e-9
 
 
@@ -57,7 +58,7 @@ class Descent:
 
 def polish(
     models: Models, views: Views, start: Descent, *, iterations: int, objects: Sequence[int] | None = None,
-    light: Views | None = None, numbers: Sequence[int] = ANYHOW,
+    light: Views | None = None, numbers: Sequence[int] = ANYHOW, until_settled: bool = False,
 ) -> Iterator[Descent]:  # fmt: skip
     """Descend; yields after each sweep over the objects and the light.
 
@@ -69,9 +70,11 @@ def polish(
         objects: which objects may move; all by default.
         light: images in which to search the light, coarse ones will do; None holds it.
         numbers: which of an object's six numbers may change, `ANYHOW` or `PLANAR`.
+        until_settled: stop before if a sweep hardly lowers the objects' losses.
     """
     at = start
-    moving = range(len(at.guess.names)) if objects is None else objects
+    moving = list(range(len(at.guess.names)) if objects is None else objects)
+    before = np.inf
     for _ in range(iterations):
         for n in moving:
             own = near(views, models, at.guess, n)
@@ -80,6 +83,10 @@ def polish(
             first = POSE * len(at.guess.names)
             at = _block(models, light, at, len(at.guess.names), np.arange(first, first + LIGHT))
         yield at
+        loss = float(at.losses[moving].sum())
+        if until_settled and loss > _SETTLED * before:
+            return
+        before = loss
 
 
 def _block(models: Models, views: Views, at: Descent, block: int, numbers: Int[np.ndarray, "n"]) -> Descent:

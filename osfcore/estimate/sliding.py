@@ -10,17 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from osfcore.estimate.models import QUALITY, Models
 from osfcore.estimate.views import Views, window
-from osfcore.poses import rotate
+from osfcore.poses import Pose, rotate
 from osfcore.render.scene_renderer import SceneBatch
 from osfcore.scene import TABLE_SIDE_M, WORKSPACE_HALF_M, Camera
 
 _BASIS = np.array([[0, 0, 1.0], [0.8, 0, 0.6], [-0.4, 0.48**0.5, 0.6], [-0.4, -(0.48**0.5), 0.6]])  # toward the lights
 _REACH_M = WORKSPACE_HALF_M + 0.06
 _ANCHORS = 5  # along each side of the workspace; templates are rendered there, and slid by half the way between two
+_BLOCK_M = 0.025  # side of a square from which each orientation is kept once
 _RIDGE = 0.05
 _MOST_TABLE_ERROR = 0.3
 _NEAR_M, _NEAR_RAD = 0.02, np.deg2rad(20.0)
@@ -39,6 +40,15 @@ class Sightings:
     positions: Float[np.ndarray, "K 3"]
     quaternions: Float[np.ndarray, "K 4"]
     scores: Float[np.ndarray, "K"]
+
+    @property
+    def poses(self) -> Pose:
+        """All of them."""
+        return Pose(self.positions, self.quaternions)
+
+    def pose(self, number: int) -> Pose:
+        """One of them."""
+        return Pose(self.positions[number], self.quaternions[number])
 
 
 def table_errors(models: Models, views: Views) -> Float[np.ndarray, "h w"]:
@@ -64,7 +74,7 @@ def sight(models: Models, views: Views, name: str, quaternions: Float[np.ndarray
 
 def _around(models: Models, camera: Camera, image: np.ndarray, table: np.ndarray, name: str, quaternions: np.ndarray,
             heights: np.ndarray, anchor: tuple[float, float]) -> tuple[np.ndarray, ...]:  # fmt: skip
-    """The best place of each orientation around an anchor: positions, orientations, scores."""
+    """The best places of each orientation around an anchor: positions, orientations, scores."""
     resting = models.resting(name)
     positions = np.column_stack([np.tile(anchor, (len(heights), 1)), heights])
     centre = positions[0] + rotate(quaternions[0], resting.centre)
@@ -81,14 +91,23 @@ def _around(models: Models, camera: Camera, image: np.ndarray, table: np.ndarray
         return nothing  # the camera does not look there
     patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
     scores = _scores(models, window(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, patches)
-    best = scores.argmax(axis=0)
-    pixels = camera.project(positions) + places[best]
+    best = _best_of_blocks(scores, places, _BLOCK_M * per_metre)
+    scores, places = np.take_along_axis(scores, best, axis=0).ravel(), places[best.ravel()]
+    quaternions, heights = (np.tile(a, (len(best),) + (1,) * (a.ndim - 1)) for a in (quaternions, heights))
+    pixels = np.tile(camera.project(positions), (len(best), 1)) + places
     directions = camera.ray_directions(pixels)
     eye = camera.T_world_camera.position
     far = (heights - eye[2]) / np.minimum(directions[:, 2], -1e-3)
     found = eye + far[:, None] * directions
     on_table = np.abs(found[:, :2]).max(axis=1) < TABLE_SIDE_M / 2  # toward the horizon a pixel is many metres
-    return found[on_table], quaternions[on_table], scores.max(axis=0)[on_table]
+    return found[on_table], quaternions[on_table], scores[on_table]
+
+
+def _best_of_blocks(scores: np.ndarray, places: np.ndarray, side: float) -> Int[np.ndarray, "B K"]:
+    """For each square block of shifted windows, and each template, the window where it scores best."""
+    blocks = np.floor(places / max(side, 1.0)).astype(int)
+    members = [np.flatnonzero((blocks == block).all(axis=1)) for block in np.unique(blocks, axis=0)]
+    return np.stack([own[scores[own].argmax(axis=0)] for own in members])
 
 
 def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[np.ndarray, np.ndarray]:
@@ -128,14 +147,13 @@ def _scores(models: Models, camera: Camera, name: str, positions: np.ndarray, qu
 
 def _thinned(positions: np.ndarray, quaternions: np.ndarray, scores: np.ndarray, most: int) -> Sightings:
     """The best ones that differ in place or orientation."""
-    kept: list[int] = []
-    for k in np.argsort(-scores):
-        if all(
-            np.linalg.norm(positions[k] - positions[o]) > _NEAR_M
-            or abs(quaternions[k] @ quaternions[o]) < np.cos(_NEAR_RAD / 2)
-            for o in kept
-        ):
-            kept.append(int(k))
-        if len(kept) == most:
-            break
+    order = np.argsort(-scores)
+    positions, quaternions, scores = positions[order], quaternions[order], scores[order]
+    kept, left = [], np.ones(len(scores), bool)
+    while left.any() and len(kept) < most:
+        k = int(left.argmax())
+        kept.append(k)
+        near = np.linalg.norm(positions - positions[k], axis=1) <= _NEAR_M
+        left &= ~(near & (np.abs(quaternions @ quaternions[k]) >= np.cos(_NEAR_RAD / 2)))
+        left[k] = False
     return Sightings(positions[kept], quaternions[kept], scores[kept])

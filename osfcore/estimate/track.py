@@ -29,9 +29,6 @@ from osfcore.poses import Pose
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
-_SETTLED = 0.97  # share of its loss before a sweep from which more sweeps promise little
-
-
 @dataclass(frozen=True, slots=True)
 class TrackEffort:
     """How a later frame is estimated.
@@ -142,13 +139,10 @@ class _Track:
     def _descend(
         self, at: Descent, moving: Bool[np.ndarray, "N"], views: Views, sweeps: int
     ) -> Iterator[EstimateStep]:  # returns the Descent
-        objects, before = np.flatnonzero(moving).tolist(), np.inf
-        for step in polish(self._models, views, at, iterations=sweeps, objects=objects):
-            at, loss = step, step.losses[objects].sum()
+        objects = np.flatnonzero(moving).tolist()
+        for step in polish(self._models, views, at, iterations=sweeps, objects=objects, until_settled=True):
+            at = step
             yield self._step("polish", "The last millimetres", at)
-            if loss > _SETTLED * before:
-                break
-            before = loss
         return at
 
     def _settle(self, at: Descent, moving: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
