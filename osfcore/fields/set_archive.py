@@ -1,4 +1,4 @@
-"""Unpacking a zip that somebody uploaded as an image set, without trusting anything in it."""
+"""Unpacking a zip that somebody uploaded as an image set or observation, without trusting anything in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
@@ -22,6 +22,7 @@ _MAX_NAME_BYTES = 200
 _MAX_DEPTH = 8
 _CHUNK_BYTES = 1 << 20
 _ANNOTATIONS = PurePosixPath("train/anno.json")
+_OBSERVATION = PurePosixPath("observation.json")
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, struct.error, ValueError, OverflowError)
 
 
@@ -45,13 +46,49 @@ def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_file
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
+    what = "image set"
+    expected = f"a zipped {what} with train and test is expected"
+    found = (_ANNOTATIONS, what, expected)
+    return _unpack(archive, out, found, max_bytes, max_files, kept=("train", "test"))
+
+
+def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
+    """Unpack an observation folder, under the same guards; `osfcore.observationfile` judges it.
+
+    Args:
+        archive: a .zip file.
+        out: folder to write; must not exist or be empty.
+        max_bytes: of the unpacked archive.
+        max_files: in the archive.
+
+    Returns:
+        `out`, the folder that holds observation.json.
+
+    Raises:
+        CorruptFile: if it is no zip, damaged, locked, a bomb, holds no observation, or leads elsewhere.
+        InvalidInput: if `out` is there and not empty.
+        CannotWrite: if the disk is full or cannot be written.
+    """
+    what = "observation"
+    found = (_OBSERVATION, what, f"a zipped {what} folder with the images that it names is expected")
+    return _unpack(archive, out, found, max_bytes, max_files)
+
+
+def _unpack(
+    archive: Path,
+    out: Path,
+    found: tuple[PurePosixPath, str, str],
+    max_bytes: int,
+    max_files: int,
+    kept: Collection[str] | None = None,
+) -> Path:
     archive, out = Path(archive), Path(out).absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
     try:
         with zipfile.ZipFile(archive) as file:
             members = _members(archive, file, max_bytes, max_files)
-            wanted = _wanted(archive, members)
+            wanted = _wanted(archive, members, found, kept)
             _write(archive, file, wanted, out)
     except _DAMAGE as error:
         if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
@@ -74,7 +111,7 @@ def _members(
         raise CorruptFile(archive, f"it unpacks to {size / 1e6:.0f} MB; at most {max_bytes / 1e6:.0f} MB are unpacked")
     packed = archive.stat().st_size
     if size > _SMALL_BYTES and size > MAX_RATIO * packed:
-        expected = f"more than {MAX_RATIO} times its size, which no image set does"
+        expected = f"more than {MAX_RATIO} times its size, which no images do"
         raise CorruptFile(archive, f"{packed / 1e6:.1f} MB unpack to {size / 1e6:.0f} MB, {expected}")
     members: dict[PurePosixPath, zipfile.ZipInfo] = {}
     for info in infos:
@@ -106,18 +143,24 @@ def _safe_path(archive: Path, info: zipfile.ZipInfo) -> PurePosixPath:
     return path
 
 
-def _wanted(archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo]) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """What belongs to the set's train and test folders, by its path inside the set."""
-    depth = len(_ANNOTATIONS.parts)
-    roots = [p.parent.parent for p in members if PurePosixPath(*p.parts[-depth:]) == _ANNOTATIONS]
+def _wanted(
+    archive: Path,
+    members: Mapping[PurePosixPath, zipfile.ZipInfo],
+    found: tuple[PurePosixPath, str, str],
+    kept: Collection[str] | None,
+) -> dict[PurePosixPath, zipfile.ZipInfo]:
+    """What lies beside the file that marks a set or observation, in the folders to keep, by its path from there."""
+    marker, what, expected = found
+    depth = len(marker.parts)
+    roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == marker]
     if not roots:
-        raise CorruptFile(archive, "it holds no train/anno.json; a zipped image set with train and test is expected")
+        raise CorruptFile(archive, f"it holds no {marker}; {expected}")
     roots.sort(key=lambda root: len(root.parts))
     if len(roots) > 1 and len(roots[0].parts) == len(roots[1].parts):
-        raise CorruptFile(archive, f"it holds several image sets, {roots[0]} and {roots[1]}; one is expected")
+        raise CorruptFile(archive, f"it holds several {what}s, {roots[0]} and {roots[1]}; one is expected")
     root = roots[0]
     inside = {path.relative_to(root): info for path, info in members.items() if path.is_relative_to(root)}
-    return {path: info for path, info in inside.items() if path.parts[0] in ("train", "test")}
+    return {path: info for path, info in inside.items() if kept is None or path.parts[0] in kept}
 
 
 def _write(archive: Path, file: zipfile.ZipFile, wanted: Mapping[PurePosixPath, zipfile.ZipInfo], out: Path) -> None:
