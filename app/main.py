@@ -98,7 +98,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         found = Estimates(runner, fields, settings.data_dir)
         stack.push_async_callback(run_in_threadpool, found.stop)
         await run_in_threadpool(found.start)
-        viewer = Viewer(runner, neural, fields.names)
+        viewer = Viewer(runner, neural, fields.names, found)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
         services = Services(settings, store, runner, viewer, shelf, fields, neural, found)
