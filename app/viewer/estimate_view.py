@@ -87,6 +87,10 @@ class EstimateView:
         self._current = current
         self._thread.start()
 
+    def visited(self) -> None:
+        """Somebody has come, for whom there may be a picture to make."""
+        self._wake()
+
     def stop(self) -> None:
         """End the thread. Calling it again does nothing."""
         with self._changed:
@@ -240,7 +244,7 @@ class EstimateView:
             self._plot = self._server.gui.add_uplot(
                 data,
                 tuple(series),
-                title="Loss, share of its stage's largest",
+                title="Loss, relative within each stage",
                 scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.05))},
                 legend=uplot.Legend(show=True, live=False),
                 aspect=1.3,

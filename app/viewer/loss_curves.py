@@ -1,4 +1,4 @@
-"""Losses of an estimate as curves: each stage has units of its own, so each is drawn relative to its largest loss."""
+"""Losses of an estimate as curves; stages have units of their own, so each is drawn relative to its largest loss."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LossCurves:
                 continue
             stage = np.array([losses for _, losses in self.rows[start:end]])
             numbers += [*range(start + 1, end + 1), end + 0.5]
-            values += [*np.concatenate([_relative(stage[:, :-1]), _relative(stage[:, -1:])], axis=1)]
+            values += [*_relative(stage)]
             values.append([float("nan")] * count)
             start = end
         table = np.array(values).reshape(-1, count)
@@ -47,7 +47,6 @@ class LossCurves:
 
 
 def _relative(losses: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "P K"]:
-    """Losses of one stage as shares of the largest."""
-    finite = losses[np.isfinite(losses)]
-    most = float(finite.max()) if len(finite) else 1.0
-    return losses / max(most, 1e-300)
+    """Losses of one stage as shares of each curve's largest."""
+    most = np.where(np.isfinite(losses), losses, 0.0).max(axis=0)
+    return losses / np.maximum(most, 1e-300)

@@ -126,6 +126,7 @@ class Viewer:
     def _welcome(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(1)
         self._neural_views.add(client)
+        self._estimate_view.visited()
 
     def _part(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(-1)
