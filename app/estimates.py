@@ -12,7 +12,7 @@ import uuid
 from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
@@ -21,15 +21,14 @@ from app.field_shelf import FieldShelf, MissingFields
 from app.job import Job
 from app.neural.messages import CompareView
 from app.runner import Runner
+from app.truth import errors_of
 from app.uploads import Examiner, save
 from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName
+from osfcore.estimated import EstimatedState
 from osfcore.files import read_json, write_json
-from osfcore.scene import MAX_SEED, Camera
+from osfcore.scene import Camera, check_seed
 from osfcore.scenefile import Scene, camera_from_json, read_scene, scene_to_json
 from osfcore.statefile import estimated_to_json, read_estimated, write_estimated
-
-if TYPE_CHECKING:
-    from osfcore.estimated import EstimatedState
 
 KIND = "estimate"
 _TEMPORARY_PREFIX = ".new-"
@@ -126,7 +125,7 @@ class Estimates:
             NoPrior: if an earlier estimate is needed and there is none.
             QueueFull: if too many jobs wait.
         """
-        _check_seed(asked.seed)
+        check_seed(asked.seed)
         scene = scene or self._runner.current
         if scene is None:
             raise NoScene
@@ -154,7 +153,7 @@ class Estimates:
             NoPrior: if an earlier estimate is needed and there is none.
             QueueFull: if too many jobs wait.
         """
-        _check_seed(asked.seed)
+        check_seed(asked.seed)
         with self._new_folder() as folder:
             await save(chunks, folder / _ARCHIVE)
             found = await self._examiner.examine(folder)
@@ -231,8 +230,6 @@ class Estimates:
 
     def simulation_errors(self, job: Job) -> dict[str, Any] | None:
         """How far the result is from the truth, which only a simulation knows; None without either."""
-        from app.truth import errors_of
-
         truth = self._runner.jobs.inputs(job.id) / TRUTH
         if job.state != "done" or not truth.is_file():
             return None
@@ -318,11 +315,6 @@ def _check_fits(mode: Mode, found: Uploaded) -> None:
         raise InvalidInput(f"mask of {found.unseen[0]}", "empty in every view", "not empty in at least one view")
     if mode == "goal" and len(found.cameras) != 1:
         raise InvalidInput("number of views of a goal", len(found.cameras), "1")
-
-
-def _check_seed(seed: int) -> None:
-    if not 0 <= seed <= MAX_SEED:
-        raise InvalidInput("seed", seed, f"between 0 and {MAX_SEED}")
 
 
 def _cameras(folder: Path) -> tuple[Camera, ...]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel, Field
 
+from app.estimate_job import Mode
 from app.estimates import Asked
 from app.job import Job, State
 from app.schemas import Input, PointOut, Position, Quaternion, Seed
-
-Mode = Literal["first", "next", "goal"]
 
 
 class EstimateIn(Input):

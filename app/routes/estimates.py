@@ -11,6 +11,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import ValidationError
 from starlette.requests import ClientDisconnect
 
+from app.estimate_job import Mode
 from app.estimates import Asked, Estimates
 from app.job import Job
 from app.problems import NotFound
@@ -18,7 +19,7 @@ from app.routes import problems
 from app.routes.events import Mailbox, job_event
 from app.routes.neural import COMPARED, compared, compared_png
 from app.schemas import Seed
-from app.schemas_estimates import EstimateIn, EstimateList, EstimateOut, Mode
+from app.schemas_estimates import EstimateIn, EstimateList, EstimateOut
 from app.services import ServicesDep
 from osfcore.errors import OsfError, UnknownName
 

@@ -125,6 +125,10 @@ class SceneDrawing:
                 if name in self._frustums:
                     self._frustums[name].image = image
 
+    def has(self, name: str) -> bool:
+        """Whether an object is on the table."""
+        return name in self._bodies
+
     def show_cameras(self, is_on: bool) -> None:
         """Show or hide the cameras."""
         for frustum in self._frustums.values():

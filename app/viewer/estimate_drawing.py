@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import viser
@@ -39,10 +39,14 @@ class EstimateDrawing:
     Args:
         server: to draw in.
         library: knows the objects' shapes.
+        is_named: tells whether an object is drawn with its name already, since it is on the table.
     """
 
-    def __init__(self, server: viser.ViserServer, library: AssetLibrary) -> None:
+    def __init__(
+        self, server: viser.ViserServer, library: AssetLibrary, is_named: Callable[[str], bool] = lambda _: True
+    ) -> None:
         self._server = server
+        self._is_named = is_named
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
@@ -120,6 +124,12 @@ class EstimateDrawing:
             _log.info("%s is drawn as a cube: %s", name, error)
             return box(_UNKNOWN_M)
         return coarse(mesh.vertices, mesh.faces)
+
+    def _label(self, name: str) -> str:
+        try:
+            return self._library.info(name).label
+        except OsfError:
+            return name
 
     def _copies(
         self,
@@ -199,6 +209,8 @@ class EstimateDrawing:
         reach_m = footprint_m(vertices, pose.quaternion)
         flat = sector(heading_rad(pose.quaternion), turn_rad, reach_m + _RING_M[0], reach_m + _RING_M[1])
         text = f"± {_told(1000 * _SIGMAS * position_std)} mm, ± {_told(np.rad2deg(_SIGMAS * rotation_std))}°"
+        text = f"DOUBTFUL: {doubt}" if doubt else text
+        text = text if self._is_named(name) else f"{self._label(name)}: {text}"
         self._verdicts += [
             scene.add_icosphere(
                 f"/estimate/verdict/{name}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False
@@ -215,7 +227,7 @@ class EstimateDrawing:
             ),
             scene.add_label(
                 f"/estimate/verdict/{name}/words",
-                f"DOUBTFUL: {doubt}" if doubt else text,
+                text,
                 position=top + np.array([0.0, 0.0, _LABEL_M + ball_m]),
                 font_screen_scale=0.75,
                 anchor="bottom-center",

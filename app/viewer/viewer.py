@@ -91,7 +91,7 @@ class Viewer:
         self._add_panel(self._server)
         self._estimate_view = EstimateView(
             self._server,
-            (self._drawing, EstimateDrawing(self._server, self._runner.library)),
+            (self._drawing, EstimateDrawing(self._server, self._runner.library, self._drawing.has)),
             self._estimates,
             self._neural,
             self._obey,

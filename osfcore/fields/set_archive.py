@@ -9,7 +9,8 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
@@ -21,9 +22,32 @@ _SMALL_BYTES = 10_000_000  # below this no ratio hurts
 _MAX_NAME_BYTES = 200
 _MAX_DEPTH = 8
 _CHUNK_BYTES = 1 << 20
-_ANNOTATIONS = PurePosixPath("train/anno.json")
-_OBSERVATION = PurePosixPath("observation.json")
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, struct.error, ValueError, OverflowError)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """What an archive may hold.
+
+    Attributes:
+        what: it is called.
+        marker: a file that tells where in the archive it lies.
+        kept: the folders that belong to it; all that lies beside the marker if empty.
+        expected: what was to be sent, for people.
+    """
+
+    what: str
+    marker: PurePosixPath
+    kept: tuple[str, ...]
+    expected: str
+
+
+_IMAGE_SET = _Kind(
+    "image set", PurePosixPath("train/anno.json"), ("train", "test"), "a zipped image set with train and test"
+)
+_OBSERVATION = _Kind(
+    "observation", PurePosixPath("observation.json"), (), "a zipped observation folder with the images that it names"
+)
 
 
 def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
@@ -46,10 +70,7 @@ def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_file
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
-    what = "image set"
-    expected = f"a zipped {what} with train and test is expected"
-    found = (_ANNOTATIONS, what, expected)
-    return _unpack(archive, out, found, max_bytes, max_files, kept=("train", "test"))
+    return _unpack(archive, out, _IMAGE_SET, max_bytes, max_files)
 
 
 def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
@@ -69,26 +90,17 @@ def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, 
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
-    what = "observation"
-    found = (_OBSERVATION, what, f"a zipped {what} folder with the images that it names is expected")
-    return _unpack(archive, out, found, max_bytes, max_files)
+    return _unpack(archive, out, _OBSERVATION, max_bytes, max_files)
 
 
-def _unpack(
-    archive: Path,
-    out: Path,
-    found: tuple[PurePosixPath, str, str],
-    max_bytes: int,
-    max_files: int,
-    kept: Collection[str] | None = None,
-) -> Path:
+def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: int) -> Path:
     archive, out = Path(archive), Path(out).absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
     try:
         with zipfile.ZipFile(archive) as file:
             members = _members(archive, file, max_bytes, max_files)
-            wanted = _wanted(archive, members, found, kept)
+            wanted = _wanted(archive, members, kind)
             _write(archive, file, wanted, out)
     except _DAMAGE as error:
         if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
@@ -144,23 +156,19 @@ def _safe_path(archive: Path, info: zipfile.ZipInfo) -> PurePosixPath:
 
 
 def _wanted(
-    archive: Path,
-    members: Mapping[PurePosixPath, zipfile.ZipInfo],
-    found: tuple[PurePosixPath, str, str],
-    kept: Collection[str] | None,
+    archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: _Kind
 ) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """What lies beside the file that marks a set or observation, in the folders to keep, by its path from there."""
-    marker, what, expected = found
-    depth = len(marker.parts)
-    roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == marker]
+    """What lies beside the file that marks the place and is to be kept, by its path from there."""
+    depth = len(kind.marker.parts)
+    roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == kind.marker]
     if not roots:
-        raise CorruptFile(archive, f"it holds no {marker}; {expected}")
+        raise CorruptFile(archive, f"it holds no {kind.marker}; {kind.expected} is expected")
     roots.sort(key=lambda root: len(root.parts))
     if len(roots) > 1 and len(roots[0].parts) == len(roots[1].parts):
-        raise CorruptFile(archive, f"it holds several {what}s, {roots[0]} and {roots[1]}; one is expected")
+        raise CorruptFile(archive, f"it holds several {kind.what}s, {roots[0]} and {roots[1]}; one is expected")
     root = roots[0]
     inside = {path.relative_to(root): info for path, info in members.items() if path.is_relative_to(root)}
-    return {path: info for path, info in inside.items() if kept is None or path.parts[0] in kept}
+    return {path: info for path, info in inside.items() if not kind.kept or path.parts[0] in kind.kept}
 
 
 def _write(archive: Path, file: zipfile.ZipFile, wanted: Mapping[PurePosixPath, zipfile.ZipInfo], out: Path) -> None:

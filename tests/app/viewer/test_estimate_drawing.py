@@ -131,6 +131,15 @@ def test_doubted_objects_are_drawn_in_another_colour_with_the_reason(drawing):
     np.testing.assert_array_equal(drawing._guesses[BOX].batched_colors, drawing._guesses[UNKNOWN].batched_colors)
 
 
+def test_what_is_not_on_the_table_is_named(server, library):
+    drawing = EstimateDrawing(server, library, lambda name: name != BOX)
+    drawing.show(step(estimate=judged("it is hardly visible")))
+    texts = [node.text for node in nodes(drawing, "words")]
+    assert texts[0] == "Cracker box: DOUBTFUL: it is hardly visible"
+    assert texts[1].startswith("± 2 mm")
+    drawing.clear()
+
+
 def test_candidates_can_be_hidden_and_everything_removed(drawing):
     drawing.show_candidates(False)
     drawing.show(step(candidates=tried(4), lights=np.array([[0, 0, 1.0]])))
