@@ -66,7 +66,7 @@ def estimate_job(params: dict[str, Any], place: Place) -> Iterator[Estimating]:
     from osfcore.observationfile import read_observation
     from osfcore.statefile import read_estimated, write_estimated
 
-    yield Estimating(0, 0, "Loading fields")
+    yield Estimating(0, 0, "Loading fields, half a minute the first time")
     inputs = place.folder / INPUTS
     observation = read_observation(inputs / OBSERVATION)
     mode: Mode = params["mode"]
