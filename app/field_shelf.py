@@ -18,6 +18,13 @@ class ShippedField(OsfError):
         super().__init__(f"The field of {name} is shipped with the program and cannot be deleted.")
 
 
+class MissingFields(OsfError):
+    """Objects that can be neither rendered nor recognised."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
+
+
 class FieldShelf:
     """Reads and deletes fields.
 

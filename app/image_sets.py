@@ -6,32 +6,23 @@ and `set.json`. It is made under another name beside its place, so that a set is
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
-import logging
 import shutil
-import signal
 import threading
 import uuid
 from collections.abc import AsyncIterator
 from dataclasses import asdict, dataclass
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from starlette.concurrency import run_in_threadpool
 
-from app.messages import Failure
-from app.processes import end, launch, own_group, silence_stdout
 from app.store import CannotStore, now_utc
+from app.uploads import Examiner, save
 from osfcore.errors import CorruptFile, OsfError, UnknownName
 
 _ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"
 _TEMPORARY_PREFIX = ".new-"
-_WRITE_BYTES = 1 << 20
-_PATIENCE_S = 600.0
-_log = logging.getLogger(__name__)
 
 
 class TooManySets(OsfError):
@@ -39,14 +30,6 @@ class TooManySets(OsfError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"There are {limit} image sets already, which is the most; delete one first.")
-
-
-class SetRefused(OsfError):
-    """An upload that is no usable set, told by the process that looked at it; `kind` is the class of its error."""
-
-    def __init__(self, kind: str, text: str) -> None:
-        super().__init__(text)
-        self.kind = "CannotStore" if kind == "CannotWrite" else "SetRefused"
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +79,8 @@ class ImageSets:
     def __init__(self, root: Path, max_sets: int = 20) -> None:
         self._root = root
         self._max_sets = max_sets
-        self._one_at_a_time = asyncio.Lock()  # decoding takes much memory
         self._keeping = threading.Lock()
-        self._worker: SpawnProcess | None = None
-        self._worker_lock = threading.Lock()
-        self._is_stopped = False
+        self._examiner = Examiner(examine, "set", _names)
 
     def start(self) -> None:
         """Remove what an earlier service left half done."""
@@ -109,10 +89,7 @@ class ImageSets:
 
     def stop(self) -> None:
         """End the process that looks at a set, if there is one. Calling it again does nothing."""
-        with self._worker_lock:
-            self._is_stopped = True
-            if self._worker is not None:
-                end(self._worker)
+        self._examiner.stop()
 
     def all(self) -> tuple[SetRecord, ...]:
         """All sets, oldest first."""
@@ -162,56 +139,20 @@ class ImageSets:
 
         Raises:
             TooManySets: if there are too many.
-            SetRefused: if it is no sound set of an object; nothing is kept.
+            UploadRefused: if it is no sound set of an object; nothing is kept.
             CannotStore: if the disk is full.
         """
         await run_in_threadpool(self._check_room)
         set_id = uuid.uuid4().hex[:12]
         folder = self._root / f"{_TEMPORARY_PREFIX}{set_id}"
         try:
-            await self._save(chunks, folder)
-            async with self._one_at_a_time:
-                found = await run_in_threadpool(self._examine, folder)
+            await save(chunks, folder / _ARCHIVE)
+            found = await self._examiner.examine(folder)
             record = SetRecord(set_id, file_name, now_utc(), found.train, found.test, found.summary)
             await run_in_threadpool(self._keep, folder, record)
         finally:
             await run_in_threadpool(shutil.rmtree, folder, True)
         return record
-
-    async def _save(self, chunks: AsyncIterator[bytes], folder: Path) -> None:
-        try:
-            await run_in_threadpool(folder.mkdir, parents=True)
-            with (folder / _ARCHIVE).open("wb") as file:
-                waiting = bytearray()
-                async for chunk in chunks:
-                    waiting += chunk
-                    if len(waiting) >= _WRITE_BYTES:
-                        await run_in_threadpool(file.write, bytes(waiting))
-                        waiting.clear()
-                await run_in_threadpool(file.write, bytes(waiting))
-        except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
-
-    def _examine(self, folder: Path) -> Examined:
-        with self._worker_lock:
-            if self._is_stopped:
-                raise SetRefused("Stopped", "The service is stopping; upload the set again later.")
-            process, connection = launch(examine_main, "osf-set", folder)
-            self._worker = process
-        try:
-            if not connection.poll(_PATIENCE_S):
-                raise SetRefused("TooSlow", f"Looking at the set took more than {_PATIENCE_S / 60:.0f} minutes.")
-            outcome = connection.recv()
-        except (EOFError, OSError):
-            died = "The process that looked at the set ended unexpectedly; it may have run out of memory."
-            raise SetRefused("Died", died) from None
-        finally:
-            end(process)
-            connection.close()
-            self._worker = None
-        if isinstance(outcome, Failure):
-            raise SetRefused(outcome.kind, outcome.text)
-        return outcome
 
     def _check_room(self) -> None:
         if len(self.all()) >= self._max_sets:
@@ -225,26 +166,6 @@ class ImageSets:
                 folder.rename(self._root / record.id)
         except OSError as error:
             raise CannotStore(self._root, error.strerror or str(error)) from error
-
-
-def examine_main(connection: Connection, folder: Path) -> None:
-    """Unpack and judge the archive in a folder, in a process of its own; tells an Examined or a Failure."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    own_group()
-    silence_stdout()
-    outcome: object
-    try:
-        outcome = examine(folder)
-    except OsfError as error:
-        outcome = Failure(0, type(error).__name__, _plain(str(error), folder))
-    except MemoryError:
-        outcome = Failure(0, "OutOfMemory", "The set needs more memory than there is; take fewer or smaller images.")
-    except Exception as error:
-        _log.exception("looking at a set failed")
-        text = f"The set could not be looked at ({type(error).__name__}); the service's log tells more."
-        outcome = Failure(0, "Internal", text)
-    with contextlib.suppress(OSError):  # the web process has gone
-        connection.send(outcome)
 
 
 def examine(folder: Path) -> Examined:
@@ -266,15 +187,13 @@ def examine(folder: Path) -> Examined:
     return Examined(report.facts["train"], report.facts["test"], report.summary)
 
 
-def _plain(text: str, folder: Path) -> str:
-    """An error's sentence without the names of places that the uploader does not know."""
-    for place, name in (
-        (f"{folder / _ARCHIVE}", "The uploaded file"),
-        (f"{folder / _IMAGES}/", ""),
-        (f"{folder / _IMAGES}", "The uploaded set"),
-    ):
-        text = text.replace(place, name)
-    return text
+def _names(folder: Path) -> dict[str, str]:
+    """What the uploader calls the places in a folder."""
+    return {
+        f"{folder / _ARCHIVE}": "The uploaded file",
+        f"{folder / _IMAGES}/": "",
+        f"{folder / _IMAGES}": "The uploaded set",
+    }
 
 
 def _read(path: Path) -> SetRecord:

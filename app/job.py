@@ -10,6 +10,7 @@ from app.store import now_utc
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled"]
+INPUTS = "inputs"  # in the folder of a job that was given files
 FINISHED: tuple[State, ...] = ("done", "failed", "cancelled")
 
 
@@ -84,6 +85,14 @@ class JobChanged:
 
     event: int
     job: Job
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JobSeen:
+    """What a running job lets the live view draw; it is neither kept nor told to pages."""
+
+    job: Job
+    seen: object
 
 
 def job_fields(job: Job) -> dict[str, Any]:

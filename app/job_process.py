@@ -77,14 +77,22 @@ def _train_field(params: dict[str, Any], place: Place) -> Iterator[Any]:
     yield from train_field_job(params, place)
 
 
+def _estimate(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from app.estimate_job import estimate_job
+
+    yield from estimate_job(params, place)
+
+
 KINDS: dict[str, Callable[[dict[str, Any], Place], Iterator[Any]]] = {
     "collect_pushes": _collect_pushes,
     "collect_object": _collect_object,
     "collect_table": _collect_table,
     "fetch_assets": _fetch_assets,
     "train_field": _train_field,
+    "estimate": _estimate,
 }
-_WITHOUT_PHYSICS = ("fetch_assets", "train_field")
+_WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
+_NOT_EXTRA = ("done", "total", "note", "seen")
 
 
 def job_main(connection: Connection, kind: str, params: dict[str, Any], place: Place) -> None:
@@ -108,7 +116,7 @@ def _run(connection: Connection, orders: Orders, kind: str, params: dict[str, An
                 result = _extras(step)
                 now = time.monotonic()
                 if now - last >= STEP_INTERVAL_S or step.done == step.total:
-                    connection.send(JobStep(step.done, step.total, step.note, result))
+                    connection.send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
                     last = now
                 if orders.must_stop():
                     return JobCancelled()
@@ -157,10 +165,11 @@ class Orders:
 
 
 def _extras(step: object) -> dict[str, Any]:
-    """What a step tells besides done, total and note."""
+    """What a step tells besides done, total, note and what the live view draws."""
     if not dataclasses.is_dataclass(step) or isinstance(step, type):
         return {}
-    return {key: value for key, value in dataclasses.asdict(step).items() if key not in ("done", "total", "note")}
+    names = (field.name for field in dataclasses.fields(step))
+    return {name: getattr(step, name) for name in names if name not in _NOT_EXTRA}
 
 
 def _pack(folder: Path) -> None:

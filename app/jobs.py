@@ -19,16 +19,17 @@ from pathlib import Path
 from typing import Any
 
 from app.field_files import clear_workshop
-from app.job import Job, JobChanged, State, WrongJobState, ended, job_fields, job_from_fields
+from app.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended, job_fields, job_from_fields
 from app.job_process import Place, job_main
 from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
 from app.processes import end, launch
-from app.store import Store, now_utc
+from app.store import CannotStore, Store, now_utc
 from osfcore.errors import OsfError, UnknownName
 
 STOPPED_NOTE = "The service stopped while this job was running; start it again."
 DIED_NOTE = "The job's process ended unexpectedly; it may have run out of memory."
 RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."
+_ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
 _LOOK_INTERVAL_S = 0.2
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
 _log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class Jobs:
     Args:
         store: where they are kept.
         data_dir: objects are read from it, outputs go to `collections/JOB` in it.
-        publish: told of every change.
+        publish: told of every change, and of what running jobs let the live view draw.
         max_queued: how many may wait.
         cancel_grace_s: how long a cancelled job may take to stop by itself.
     """
@@ -67,7 +68,7 @@ class Jobs:
         self,
         store: Store,
         data_dir: Path,
-        publish: Callable[[JobChanged], None],
+        publish: Callable[[JobChanged | JobSeen], None],
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
     ) -> None:
@@ -137,16 +138,28 @@ class Jobs:
             job = self._jobs[self._run.id] if self._run else None
             return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
 
-    def submit(self, kind: str, params: dict[str, Any]) -> Job:
+    def inputs(self, job: str) -> Path:
+        """Where a job's inputs are, if it was given any."""
+        return self.folder(job) / INPUTS
+
+    def submit(self, kind: str, params: dict[str, Any], inputs: Path | None = None) -> Job:
         """Put a job into the queue.
+
+        Args:
+            kind: what to do.
+            params: with what.
+            inputs: a folder in the data directory; becomes the job's and goes with it.
 
         Raises:
             QueueFull: if too many wait already.
+            CannotStore: if the inputs cannot be put in place.
         """
         with self._changed:
             if len(self._queue()) >= self._max_queued:
                 raise QueueFull(self._max_queued)
             job = Job(uuid.uuid4().hex[:12], kind, params)
+            if inputs is not None:
+                self._take(job, inputs)
             self._numbers[job.id] = 1 + max(self._numbers.values(), default=0)
             self._set(job)
             self._changed.notify_all()
@@ -169,7 +182,8 @@ class Jobs:
                 self._tell_queue()
                 return self.get(job)
             if self._run is not None and self._run.cancel_at is None:
-                self._run.cancel_at = time.monotonic() + self._cancel_grace_s
+                grace_s = 0.0 if found.kind in _ENDED_AT_ONCE else self._cancel_grace_s
+                self._run.cancel_at = time.monotonic() + grace_s
                 self._order(CancelJob())
             self._changed.wait_for(lambda: self._jobs[job].is_finished, wait_s)
             return self.get(job)
@@ -241,6 +255,8 @@ class Jobs:
                     break
                 if isinstance(message, JobStep):
                     self._progress(message)
+                    if message.seen is not None:
+                        self._publish(JobSeen(self._jobs[run.id], message.seen))
                 else:
                     outcome = message
             with self._changed:
@@ -340,8 +356,17 @@ class Jobs:
         shutil.rmtree(self.folder(job.id), ignore_errors=True)
         self._set(ended(job, "failed", note="Failed", error=_with_advice(job, STOPPED_NOTE)))
 
+    def _take(self, job: Job, inputs: Path) -> None:
+        place = self.inputs(job.id)
+        try:
+            place.parent.mkdir(parents=True)
+            inputs.rename(place)
+        except OSError as error:
+            raise CannotStore(place, error.strerror or str(error)) from error
+
     def _forget_work(self, job: Job) -> None:
-        """Remove what a failed job would leave for its next try, unless another job works there."""
+        """Remove what a job that was not done was given, or would find at its next try, unless another works there."""
+        shutil.rmtree(self.folder(job.id), ignore_errors=True)
         if job.kind != "train_field":
             return
         name = job.params["name"]

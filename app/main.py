@@ -18,11 +18,13 @@ from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
 from app import problems, relay
+from app.estimates import Estimates
 from app.field_shelf import FieldShelf
 from app.neural.link import NeuralLink
-from app.routes import events, fields, health, jobs, neural, objects, scenes
+from app.routes import estimates, events, fields, health, jobs, neural, objects, scenes
 from app.runner import Runner
 from app.schemas import FrameEvent, NoticeEvent, Problem
+from app.schemas_estimates import EstimateIn
 from app.security import BodyLimitMiddleware, SecurityMiddleware
 from app.services import Services, Shelf
 from app.settings import Settings
@@ -31,10 +33,14 @@ from app.viewer import Viewer
 from osfcore.objects.library import AssetLibrary
 
 _DESCRIPTION = (
-    "Scenes of real objects on a lit table, a pusher to move them, cameras to look at them, and jobs for long work. "
+    "Scenes of real objects on a lit table, a pusher to move them, cameras to look at them, estimates of what they "
+    "see, and jobs for long work. "
     "Metres, seconds, quaternions (w, x, y, z); world z up, table top at z = 0. "
     "Errors are application/problem+json with one sentence in `detail`."
 )
+
+_UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
+_STREAM = "text/event-stream"
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -60,7 +66,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         limit_of=limit_of,
     )
     problems.install(app)
-    for module in (health, objects, fields, scenes, neural, jobs, events):
+    for module in (health, objects, fields, scenes, neural, estimates, jobs, events):
         app.include_router(module.router)
     app.include_router(relay.router)
     _add_docs(app)
@@ -89,10 +95,13 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.push_async_callback(run_in_threadpool, neural.stop)
         shelf = Shelf(runner.library)
         fields = FieldShelf(settings.data_dir, shelf.names)
-        viewer = Viewer(runner, neural, fields.names)
+        found = Estimates(runner, fields, settings.data_dir)
+        stack.push_async_callback(run_in_threadpool, found.stop)
+        await run_in_threadpool(found.start)
+        viewer = Viewer(runner, neural, fields.names, found)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
-        services = Services(settings, store, runner, viewer, shelf, fields, neural)
+        services = Services(settings, store, runner, viewer, shelf, fields, neural, found)
         app.state.services = services
         stack.callback(services.closing.set)
         yield
@@ -100,7 +109,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 def _body_limit(settings: Settings, path: str) -> int:
     """How large a request to a path may be [bytes]: only uploads are large."""
-    return settings.max_upload_bytes if path.rstrip("/") == fields.UPLOAD_PATH else settings.max_body_bytes
+    return settings.max_upload_bytes if path.rstrip("/") in _UPLOAD_PATHS else settings.max_body_bytes
 
 
 def _operation_id(route: APIRoute) -> str:
@@ -112,13 +121,14 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-        for model in (Problem, FrameEvent, NoticeEvent):
+        for model in (Problem, FrameEvent, NoticeEvent, EstimateIn):
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
             schemas[model.__name__] = own
-        stream = schema["paths"]["/api/events"]["get"]["responses"]["200"]["content"]
-        # FastAPI describes the stream in terms of OpenAPI 3.2, which readers of 3.1 refuse.
-        stream["text/event-stream"] = {"schema": {"type": "string"}}
+        for path in (operations["get"] for operations in schema["paths"].values() if "get" in operations):
+            content = path["responses"]["200"].get("content", {})
+            if _STREAM in content:  # FastAPI describes it in terms of OpenAPI 3.2, which readers of 3.1 refuse
+                content[_STREAM] = {"schema": {"type": "string"}}
         app.openapi_schema = schema
     return app.openapi_schema
 

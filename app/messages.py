@@ -6,6 +6,7 @@ Errors cross as `Failure` (class name and sentence), because exceptions with con
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -122,6 +123,23 @@ class TakeMask:
 
 
 @dataclass(frozen=True, slots=True)
+class ObserveScene:
+    """What the robot sees of a scene now, as an observation folder. Answered by the SceneRecord that was observed.
+
+    Attributes:
+        id: of the scene.
+        folder: to write; nothing in it tells the truth.
+        goal: the goal camera's view alone, without the pusher.
+        masks: whether to tell each object's visible pixels.
+    """
+
+    id: str
+    folder: Path
+    goal: bool
+    masks: bool
+
+
+@dataclass(frozen=True, slots=True)
 class ShowScene:
     """Which scene's camera images are wanted live; None for no scene."""
 
@@ -149,6 +167,7 @@ Command = (
     | Act
     | TakeImage
     | TakeMask
+    | ObserveScene
     | ShowScene
     | WatchFrames
     | Leave
@@ -236,14 +255,23 @@ class FramesTaken:
 # From and to job processes.
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class JobStep:
-    """How far a job is; `result` holds what its kind tells besides."""
+    """How far a job is.
+
+    Attributes:
+        done: units finished.
+        total: units in all.
+        note: what is being done, for a person.
+        result: what its kind tells besides.
+        seen: what the live view draws of it, and nobody keeps; None for most kinds.
+    """
 
     done: int
     total: int
     note: str
     result: dict[str, Any]
+    seen: object = None
 
 
 @dataclass(frozen=True, slots=True)

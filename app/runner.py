@@ -9,6 +9,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from app.field_files import sweep
 from app.hub import Hub
 from app.image_cache import ImageCache
 from app.image_sets import ImageSets
-from app.job import Job, JobChanged, SetInUse, TrainingAlready, check_params
+from app.job import Job, JobChanged, JobSeen, SetInUse, TrainingAlready, check_params
 from app.jobs import Jobs
 from app.messages import (
     Act,
@@ -28,6 +29,7 @@ from app.messages import (
     DropScene,
     EditScene,
     Notice,
+    ObserveScene,
     ResetScene,
     SceneChanged,
     SceneRecord,
@@ -302,6 +304,16 @@ class Runner:
         if not done.cancelled():
             done.exception()  # taken note of, in case that everybody has left
 
+    def observe(self, scene: str, folder: Path, *, goal: bool, masks: bool) -> SceneRecord:
+        """Write what the robot sees of a scene now as an observation folder; tells the scene as it was then.
+
+        Raises:
+            UnknownName: if there is no such scene.
+            OsfError: if the simulation is not there now.
+        """
+        self.scene(scene)
+        return self._stage.call(ObserveScene(scene, folder, goal, masks))
+
     def watch_frames(self, change: int) -> None:
         """Tell that `change` more (or less, if negative) listeners look at live images."""
         with self._lock:
@@ -417,9 +429,9 @@ class Runner:
     def _on_stage_lost(self) -> None:
         self.hub.publish(Notice("error", "The simulation stopped unexpectedly and is being restarted."))
 
-    def _on_job(self, event: JobChanged) -> None:
+    def _on_job(self, event: JobChanged | JobSeen) -> None:
         self.hub.publish(event)
-        if event.job.kind == "fetch_assets" and event.job.state == "done":
+        if isinstance(event, JobChanged) and event.job.kind == "fetch_assets" and event.job.state == "done":
             self.ensure_demo_scene()
 
 

@@ -113,7 +113,7 @@ class JobOut(BaseModel):
     """A job as it is now."""
 
     id: str
-    kind: Literal["collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field"]
+    kind: Literal["collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field", "estimate"]
     params: dict[str, Any]
     state: State
     position: int | None = Field(description="Place in the queue, 1 is next; null when not queued.")

@@ -10,6 +10,7 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from app.estimates import Estimates
 from app.field_shelf import FieldShelf
 from app.messages import SceneRecord
 from app.neural.link import NeuralLink
@@ -69,6 +70,7 @@ class Services:
     shelf: Shelf
     fields: FieldShelf
     neural: NeuralLink
+    estimates: Estimates
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
     def scene_out(self, record: SceneRecord) -> SceneOut:

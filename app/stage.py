@@ -29,6 +29,7 @@ from app.messages import (
     Failure,
     FramesTaken,
     Leave,
+    ObserveScene,
     Reply,
     Request,
     ResetScene,
@@ -151,6 +152,8 @@ class Stage:
                 return self._image(command)
             case TakeMask():
                 return self._mask(command)
+            case ObserveScene():
+                return self._observe(command)
             case ShowScene(scene):
                 self._shown = scene
                 self._frames_due = scene is not None
@@ -302,6 +305,15 @@ class Stage:
         if masks is None:
             raise InvalidInput("renderer", "without masks", "one that makes masks")
         return _encoded(masks[0][world.names.index(command.object)].astype(np.uint8) * 255, ".png")
+
+    def _observe(self, command: ObserveScene) -> SceneRecord:
+        from osfcore.observationfile import write_observation
+
+        record, world = self._record(command.id), self._world(command.id)
+        cameras = (goal_camera(record.image_size),) if command.goal else default_cameras(record.image_size)
+        seen = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
+        write_observation(command.folder, seen)
+        return replace(record, state=world.truth())
 
     def _take_frames(self) -> None:
         """Send the shown scene's live images if they are wanted and stale."""

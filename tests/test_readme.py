@@ -1,7 +1,10 @@
 """The README's commands work as they stand."""
 
+import json
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +12,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from osfcore.world.collect_observation import CollectObservation, collect_observation
 from tests.live import live_service
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
@@ -39,16 +43,46 @@ def test_commands_run(data_dir, tmp_path):
         assert done.returncode == 0, f"{command}: {done.stderr[-500:]}"
 
 
-def test_rest_example_runs(data_dir, tmp_path):
-    (program,) = blocks("python")
+@pytest.fixture(scope="module")
+def seen(library, tmp_path_factory):
+    """An observation that is soon estimated, as `osf collect observation` leaves it."""
+    place = tmp_path_factory.mktemp("readme") / "seen"
+    collect_observation(CollectObservation(place, ("006_mustard_bottle",), size=64), library)
+    return place
+
+
+def test_rest_examples_run(data_dir, tmp_path):
+    first, second = blocks("python")  # the second goes on where the first ended
     with live_service(data_dir) as url:
-        program = program.replace("http://127.0.0.1:8000", url)
+        program = (first + second).replace("http://127.0.0.1:8000", url)
         done = subprocess.run(
-            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120
+            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
         )
     assert done.returncode == 0, done.stderr[-500:]
     assert "pusher went from" in done.stdout
-    assert (tmp_path / "goal.png").read_bytes().startswith(b"\x89PNG")
+    assert "trusted: " in done.stdout
+    assert "'light_deg': " in done.stdout
+    for image in ("goal.png", "compared.png"):
+        assert (tmp_path / image).read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_observation_is_sent_as_written(data_dir, tmp_path, seen):
+    if shutil.which("curl") is None:
+        pytest.skip("curl is not on this machine")
+    shutil.copytree(seen, tmp_path / "seen")
+    commands = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(("curl ", "python3 "))]
+    assert len(commands) >= 3
+    told = []
+    with live_service(data_dir) as url:
+        for command in commands:
+            arguments = shlex.split(command.replace("http://127.0.0.1:8000", url))
+            arguments[0] = sys.executable if arguments[0] == "python3" else arguments[0]
+            done = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+            assert done.returncode == 0, f"{command}: {done.stderr[-500:]}"
+            told.append(done.stdout)
+    sent, listed = (json.loads(text) for text in told[1:])
+    assert (sent["objects"], sent["seed"], sent["of"]["file_name"]) == (["006_mustard_bottle"], 1, "observation.zip")
+    assert [estimate["id"] for estimate in listed["estimates"]] == [sent["id"]]
 
 
 @pytest.mark.parametrize("link", re.findall(r"\]\(([^)#:]+)\)", README))

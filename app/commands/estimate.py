@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from osfcore.estimate.models import Models
     from osfcore.estimate.steps import EstimateStep
     from osfcore.estimated import EstimatedState
-    from osfcore.scene import Observation, SceneState
+    from osfcore.scene import Observation
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class Estimate:
         """Estimate; the result is what state.json holds, and how long it took."""
         import numpy as np
 
+        from app.estimate_job import load_models, steps_of
         from osfcore.observationfile import read_observation
         from osfcore.scene import check_seed
         from osfcore.statefile import estimated_to_json, read_estimated, write_estimated
@@ -55,9 +56,9 @@ class Estimate:
             raise InvalidInput("--prior", self.prior or "missing", allowed)
         observation = read_observation(self.observation)
         prior = None if self.prior is None else read_estimated(self.prior).state
-        models = self._models(observation)
+        models = load_models(self.data_dir, observation.names)
         start = time.perf_counter()
-        estimate = _last(self._steps(models, observation, prior, rng))
+        estimate = _last(steps_of("goal" if self.goal else "first", models, observation, prior, rng))
         seconds = round(time.perf_counter() - start, 2)
         write_estimated(self.out, estimate)
         if not self.json:
@@ -81,28 +82,6 @@ class Estimate:
         check_place(self.out)
         if self.images is not None:
             check_place(_sheet_path(self.images, 0))
-
-    def _models(self, observation: Observation) -> Models:
-        from osfcore.estimate.models import Models
-        from osfcore.fields.library import FieldLibrary
-
-        library = FieldLibrary(self.data_dir)
-        return Models({name: library.load(name) for name in observation.names}, library.load_table())
-
-    def _steps(
-        self,
-        models: Models,
-        observation: Observation,
-        prior: SceneState | None,
-        rng: Any,  # noqa: ANN401 - NumPy is imported late
-    ) -> Iterator[EstimateStep]:
-        if prior is not None:
-            from osfcore.estimate.goal import estimate_goal
-
-            return estimate_goal(models, observation, prior)
-        from osfcore.estimate.first import estimate_first
-
-        return estimate_first(models, observation, rng)
 
 
 @dataclass(frozen=True)

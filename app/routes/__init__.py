@@ -22,6 +22,7 @@ _TEXTS = {
     404: "There is no such thing.",
     409: "It does not fit the present state.",
     413: "The request is too large.",
+    415: "The body is neither JSON nor a zip.",
     421: "The service is not known under this host name.",
     422: "The input is not valid; the detail says what is allowed.",
     429: "Too many jobs wait already.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncIterator
@@ -44,6 +45,17 @@ class Mailbox:
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._put, event)
 
+    async def next_job(self, job: str) -> JobChanged | None:
+        """The next letter about a job; None if there is none for a while."""
+        while self.letters:
+            letter = self.letters.popleft()
+            if isinstance(letter, JobChanged) and letter.job.id == job:
+                return letter
+        self.arrived.clear()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.arrived.wait(), _LOOK_INTERVAL_S)
+        return None
+
     def _put(self, event: object) -> None:
         match event:
             case JobChanged() | Notice():
@@ -78,7 +90,7 @@ async def stream(
             last = min(int(last_event_id[:19]), _MAX_EVENT)
             for number, fields in await run_in_threadpool(services.store.events_after, last):
                 last = number
-                yield _job_event(number, job_from_fields(fields))
+                yield job_event(number, job_from_fields(fields))
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
     finally:
@@ -97,7 +109,7 @@ async def _follow(
             if isinstance(letter, Notice):
                 yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
             elif letter.event == 0 or letter.event > last:  # not replayed already
-                yield _job_event(letter.event, letter.job)
+                yield job_event(letter.event, letter.job)
         now = time.monotonic()
         if mailbox.is_scene_new and now >= scene_at:
             mailbox.is_scene_new, scene_at = False, now + SCENE_INTERVAL_S
@@ -118,7 +130,8 @@ async def _follow(
                 continue
 
 
-def _job_event(number: int, job: Job) -> ServerSentEvent:
+def job_event(number: int, job: Job) -> ServerSentEvent:
+    """A job as an event; the number is 0 where nothing came after it that could be asked for."""
     return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
 
+from app.field_shelf import MissingFields
 from app.messages import SceneRecord, TakeImage
 from app.neural.cameras import scene_camera
 from app.neural.messages import CompareView, Comparison
@@ -20,26 +21,20 @@ _PSNR: dict[str, object] = {
     "description": "Peak signal-to-noise ratio of the rendering against the camera's image [dB].",
     "schema": {"type": "number"},
 }
-_ANSWER = {200: {**PNG[200], "headers": {PSNR_HEADER: _PSNR}}}
+COMPARED: dict[int | str, dict[str, object]] = {200: {**PNG[200], "headers": {PSNR_HEADER: _PSNR}}}
+Kind = Annotated[
+    Literal["rendered", "difference", "comparison"],
+    Query(description="The difference is absolute, times 4; a comparison is camera image, rendering, difference."),
+]
 router = APIRouter(prefix="/api/scenes", tags=["neural"], responses=problems(503))
 
 
-class MissingFields(OsfError):
-    """Objects of a scene that cannot be rendered."""
-
-    def __init__(self, names: list[str]) -> None:
-        super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
-
-
-@router.get("/{scene}/neural/{camera}.png", response_class=Response, responses={**problems(404, 409), **_ANSWER})
+@router.get("/{scene}/neural/{camera}.png", response_class=Response, responses={**problems(404, 409), **COMPARED})
 async def image(
     services: ServicesDep,
     scene: SceneId,
     camera: CameraName,
-    kind: Annotated[
-        Literal["rendered", "difference", "comparison"],
-        Query(description="The difference is absolute, times 4; a comparison is camera image, rendering, difference."),
-    ] = "rendered",
+    kind: Kind = "rendered",
     size: SizeQuery = None,
     pusher: Annotated[bool, Query(description="Whether the pusher and its shadow are in the image.")] = True,
 ) -> Response:
@@ -48,9 +43,14 @@ async def image(
     The first time, this waits for the renderer to load.
     """
     side = size or view_of(services, scene, camera).image_size
-    compared = await _compare(services, TakeImage(scene, camera, side, pusher=pusher))
-    headers = {"Cache-Control": "no-cache", PSNR_HEADER: f"{compared.psnr_db:.2f}"}
-    return Response(getattr(compared, kind), media_type="image/png", headers=headers)
+    comparison = await _compare(services, TakeImage(scene, camera, side, pusher=pusher))
+    return compared_png(comparison, kind)
+
+
+def compared_png(comparison: Comparison, kind: str) -> Response:
+    """One picture of a comparison, with its PSNR in the header."""
+    headers = {"Cache-Control": "no-cache", PSNR_HEADER: f"{comparison.psnr_db:.2f}"}
+    return Response(getattr(comparison, kind), media_type="image/png", headers=headers)
 
 
 async def _compare(services: Services, command: TakeImage) -> Comparison:
@@ -63,6 +63,15 @@ async def _compare(services: Services, command: TakeImage) -> Comparison:
     if not command.pusher:
         state = SceneState(state.names, state.poses, state.light, None)
     order = CompareView(uuid.uuid4().hex, state, scene_camera(command.camera, command.size), observed)
+    return await compared(services, order)
+
+
+async def compared(services: Services, order: CompareView) -> Comparison:
+    """What answers an order.
+
+    Raises:
+        OsfError: if the renderer refuses it or is not there now.
+    """
     answer = await asyncio.wrap_future(await asyncio.to_thread(services.neural.submit, order))
     assert isinstance(answer, Comparison)
     return answer

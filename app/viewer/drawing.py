@@ -32,6 +32,7 @@ from osfcore.world.optics import TABLE_ALBEDO
 VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.95, -0.95, 0.9), (0.0, 0.0, 0.1), 0.8
 TABLE_THICKNESS_M = 0.04
 LIGHT_CUBE_M = 0.06
+LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
 LABEL_GAP_M = 0.01
 AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -66,6 +67,7 @@ class SceneDrawing:
         self._is_light_held = False
         self._has_names = True
         self._has_gizmos = False
+        self._has_lamp = True
         self._add_room()
         self._add_light()
         self._frustums = {camera.name: self._frustum(camera) for camera in default_cameras()}
@@ -82,7 +84,8 @@ class SceneDrawing:
                     self._add_object(name)
             self._grabbed.clear()
             self._is_light_held = False
-            self._pusher.visible = self._ray.visible = record is not None
+            self._pusher.visible = record is not None
+            self._ray.visible = self._has_lamp and record is not None
             for frustum in self._frustums.values():
                 frustum.image = None
             if record is not None:
@@ -122,10 +125,23 @@ class SceneDrawing:
                 if name in self._frustums:
                     self._frustums[name].image = image
 
+    def has(self, name: str) -> bool:
+        """Whether an object is on the table."""
+        return name in self._bodies
+
     def show_cameras(self, is_on: bool) -> None:
         """Show or hide the cameras."""
         for frustum in self._frustums.values():
             frustum.visible = is_on
+
+    def show_lamp(self, *, is_on: bool, name: str = "") -> None:
+        """Show or hide the scene's own light; with a name, in another colour, so that it is not taken for a guess."""
+        with self._lock:
+            self._cube.visible = self._light_gizmo.visible = self._has_lamp = is_on
+            self._ray.visible = is_on and self._pusher.visible
+            self._cube.color = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
+            self._ray.colors = np.array(self._cube.color, np.uint8)
+            self._lamp_name.text, self._lamp_name.visible = name, is_on and bool(name)
 
     def show_names(self, is_on: bool) -> None:
         """Show or hide the objects' names."""
@@ -183,9 +199,12 @@ class SceneDrawing:
         )
         cube = (LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M)
         self._cube = scene.add_box(
-            "/light", color=(40, 200, 60), dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
+            "/light", color=LIGHT_COLOUR, dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
         )
-        self._ray = scene.add_line_segments("/light_ray", _ray_from(np.array(start)), (40, 200, 60), thickness=0.004)
+        self._ray = scene.add_line_segments("/light_ray", _ray_from(np.array(start)), LIGHT_COLOUR, thickness=0.004)
+        self._lamp_name = scene.add_label(
+            "/light_name", "", position=start, visible=False, font_screen_scale=0.8, anchor="bottom-center"
+        )
         self._light_gizmo = scene.add_transform_controls(
             "/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
         )
@@ -268,6 +287,7 @@ class SceneDrawing:
     def _place_light(self, position: np.ndarray) -> None:
         _put(self._cube, position)
         _put(self._lamp, position)
+        _put(self._lamp_name, position)
         self._ray.points = _ray_from(position)
 
 

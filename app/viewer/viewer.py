@@ -14,12 +14,15 @@ from pathlib import Path
 
 import viser
 
+from app.estimates import Estimates
 from app.job import JobChanged
 from app.messages import CurrentScene
 from app.neural.link import NeuralLink
 from app.playback import Playback
 from app.runner import Runner
 from app.viewer.drawing import Client, SceneDrawing
+from app.viewer.estimate_drawing import EstimateDrawing
+from app.viewer.estimate_view import EstimateView
 from app.viewer.neural_view import NeuralViews
 from osfcore.errors import OsfError
 from osfcore.poses import Pose
@@ -42,14 +45,18 @@ class LoopbackViser(viser.ViserServer):
 class Viewer:
     """The view of the runner's current scene, the same for any number of browsers."""
 
-    def __init__(self, runner: Runner, neural: NeuralLink, fields: Callable[[], Collection[str]]) -> None:
+    def __init__(
+        self, runner: Runner, neural: NeuralLink, fields: Callable[[], Collection[str]], estimates: Estimates
+    ) -> None:
         """Prepare the view.
 
         Args:
             runner: carries out what people do.
             neural: renders what they see.
             fields: names of the objects that have one.
+            estimates: finds poses and light in what the cameras see.
         """
+        self._estimates = estimates
         self._runner = runner
         self._neural = neural
         self._fields = fields
@@ -82,13 +89,23 @@ class Viewer:
         self._drawing.watch(self._neural_views.scene_moved)
         self._playback = Playback(self._drawing)
         self._add_panel(self._server)
+        self._estimate_view = EstimateView(
+            self._server,
+            (self._drawing, EstimateDrawing(self._server, self._runner.library, self._drawing.has)),
+            self._estimates,
+            self._neural,
+            self._obey,
+            self._runner.jobs.cancel,
+        )
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._part)
         self._neural_views.start()
         self._playback.start()
+        self._estimate_view.start(self._runner.current)
         self._undo = [
             self._runner.hub.subscribe(self._playback.note),
             self._runner.hub.subscribe(self._on_job),
+            self._runner.hub.subscribe(self._estimate_view.note),
         ]
         self._show_current()
 
@@ -100,6 +117,7 @@ class Viewer:
             undo()
         self._playback.stop()
         self._neural_views.stop()
+        self._estimate_view.stop()
         self._commands.shutdown(wait=False, cancel_futures=True)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
@@ -108,6 +126,7 @@ class Viewer:
     def _welcome(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(1)
         self._neural_views.add(client)
+        self._estimate_view.visited()
 
     def _part(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(-1)

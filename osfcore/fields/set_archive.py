@@ -1,4 +1,4 @@
-"""Unpacking a zip that somebody uploaded as an image set, without trusting anything in it."""
+"""Unpacking a zip that somebody uploaded as an image set or observation, without trusting anything in it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
@@ -21,8 +22,32 @@ _SMALL_BYTES = 10_000_000  # below this no ratio hurts
 _MAX_NAME_BYTES = 200
 _MAX_DEPTH = 8
 _CHUNK_BYTES = 1 << 20
-_ANNOTATIONS = PurePosixPath("train/anno.json")
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, struct.error, ValueError, OverflowError)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """What an archive may hold.
+
+    Attributes:
+        what: it is called.
+        marker: a file that tells where in the archive it lies.
+        kept: the folders that belong to it; all that lies beside the marker if empty.
+        expected: what was to be sent, for people.
+    """
+
+    what: str
+    marker: PurePosixPath
+    kept: tuple[str, ...]
+    expected: str
+
+
+_IMAGE_SET = _Kind(
+    "image set", PurePosixPath("train/anno.json"), ("train", "test"), "a zipped image set with train and test"
+)
+_OBSERVATION = _Kind(
+    "observation", PurePosixPath("observation.json"), (), "a zipped observation folder with the images that it names"
+)
 
 
 def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
@@ -45,13 +70,37 @@ def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_file
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
+    return _unpack(archive, out, _IMAGE_SET, max_bytes, max_files)
+
+
+def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
+    """Unpack an observation folder, under the same guards; `osfcore.observationfile` judges it.
+
+    Args:
+        archive: a .zip file.
+        out: folder to write; must not exist or be empty.
+        max_bytes: of the unpacked archive.
+        max_files: in the archive.
+
+    Returns:
+        `out`, the folder that holds observation.json.
+
+    Raises:
+        CorruptFile: if it is no zip, damaged, locked, a bomb, holds no observation, or leads elsewhere.
+        InvalidInput: if `out` is there and not empty.
+        CannotWrite: if the disk is full or cannot be written.
+    """
+    return _unpack(archive, out, _OBSERVATION, max_bytes, max_files)
+
+
+def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: int) -> Path:
     archive, out = Path(archive), Path(out).absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
     try:
         with zipfile.ZipFile(archive) as file:
             members = _members(archive, file, max_bytes, max_files)
-            wanted = _wanted(archive, members)
+            wanted = _wanted(archive, members, kind)
             _write(archive, file, wanted, out)
     except _DAMAGE as error:
         if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
@@ -74,7 +123,7 @@ def _members(
         raise CorruptFile(archive, f"it unpacks to {size / 1e6:.0f} MB; at most {max_bytes / 1e6:.0f} MB are unpacked")
     packed = archive.stat().st_size
     if size > _SMALL_BYTES and size > MAX_RATIO * packed:
-        expected = f"more than {MAX_RATIO} times its size, which no image set does"
+        expected = f"more than {MAX_RATIO} times its size, which no images do"
         raise CorruptFile(archive, f"{packed / 1e6:.1f} MB unpack to {size / 1e6:.0f} MB, {expected}")
     members: dict[PurePosixPath, zipfile.ZipInfo] = {}
     for info in infos:
@@ -106,18 +155,20 @@ def _safe_path(archive: Path, info: zipfile.ZipInfo) -> PurePosixPath:
     return path
 
 
-def _wanted(archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo]) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """What belongs to the set's train and test folders, by its path inside the set."""
-    depth = len(_ANNOTATIONS.parts)
-    roots = [p.parent.parent for p in members if PurePosixPath(*p.parts[-depth:]) == _ANNOTATIONS]
+def _wanted(
+    archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: _Kind
+) -> dict[PurePosixPath, zipfile.ZipInfo]:
+    """What lies beside the file that marks the place and is to be kept, by its path from there."""
+    depth = len(kind.marker.parts)
+    roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == kind.marker]
     if not roots:
-        raise CorruptFile(archive, "it holds no train/anno.json; a zipped image set with train and test is expected")
+        raise CorruptFile(archive, f"it holds no {kind.marker}; {kind.expected} is expected")
     roots.sort(key=lambda root: len(root.parts))
     if len(roots) > 1 and len(roots[0].parts) == len(roots[1].parts):
-        raise CorruptFile(archive, f"it holds several image sets, {roots[0]} and {roots[1]}; one is expected")
+        raise CorruptFile(archive, f"it holds several {kind.what}s, {roots[0]} and {roots[1]}; one is expected")
     root = roots[0]
     inside = {path.relative_to(root): info for path, info in members.items() if path.is_relative_to(root)}
-    return {path: info for path, info in inside.items() if path.parts[0] in ("train", "test")}
+    return {path: info for path, info in inside.items() if not kind.kept or path.parts[0] in kind.kept}
 
 
 def _write(archive: Path, file: zipfile.ZipFile, wanted: Mapping[PurePosixPath, zipfile.ZipInfo], out: Path) -> None:

@@ -10,7 +10,7 @@ let showsMasks = false;
 let largeCamera = null;
 
 /** Loads the newest image asked for, one at a time, so that a fast scene never piles up requests. */
-class LatestImage {
+export class LatestImage {
   constructor(image) {
     this.image = image;
     this.busy = false;

@@ -7,7 +7,7 @@ import { tellFailure } from "./toasts.js";
 
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
-  train_field: "Field",
+  train_field: "Field", estimate: "Estimate",
 };
 export const LIVE = new Set(["queued", "running", "paused"]);
 const number = (name, label, value, min, max) => ({ name, label, value, min, max, type: "number" });
@@ -89,6 +89,7 @@ function orderText({ kind, params: p }) {
   if (kind === "collect_pushes") return `${p.episodes} × ${p.steps} steps, ${p.objects} objects, ${p.policy} policy, seed ${p.seed}`;
   if (kind === "fetch_assets") return p.names?.length ? p.names.join(", ") : "all from the package index";
   if (kind === "train_field") return `${p.minutes} min from ${p.source.mesh ? `${p.images} images of its mesh` : "an uploaded set"}, seed ${p.seed}`;
+  if (kind === "estimate") return `${p.mode} frame of ${p.of.file_name ?? "a scene"}, ${p.names.length} objects, seed ${p.seed}`;
   return `${p.images} images of ${p.size} px, seed ${p.seed}`;
 }
 
@@ -148,9 +149,9 @@ function draw(job) {
   node.key = controlsKey(job);
 }
 
-/** The training that runs, else the one that was asked for last. */
-function latestTraining() {
-  const all = [...jobs.values()].filter((job) => job.kind === "train_field");
+/** The job of a kind that runs, else the one that was asked for last. */
+function latest(kind) {
+  const all = [...jobs.values()].filter((job) => job.kind === kind);
   return all.find((job) => job.state === "running" || job.state === "paused") ?? all.at(-1);
 }
 
@@ -162,7 +163,8 @@ export function showJob(job) {
   const live = [...jobs.values()].filter((other) => LIVE.has(other.state)).length;
   byId("jobs-count").textContent = live;
   byId("jobs-count").hidden = live === 0;
-  if (job.kind === "train_field") set("training", latestTraining());
+  if (job.kind === "train_field") set("training", latest("train_field"));
+  if (job.kind === "estimate") set("estimate", latest("estimate"));
   if (job.kind === "fetch_assets" && job.state === "done" && before && before.state !== "done") refreshObjects();
 }
 

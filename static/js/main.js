@@ -2,6 +2,7 @@
 import { get } from "./api.js";
 import { setUpCameras, showFrames } from "./cameras.js";
 import { byId } from "./dom.js";
+import { setUpEstimate } from "./estimate.js";
 import { listen } from "./events.js";
 import { refreshSets, setUpFields } from "./fields.js";
 import { refreshJobs, setUpJobs, showJob } from "./jobs.js";
@@ -62,6 +63,7 @@ setUpScenes();
 setUpObjects();
 setUpJobs();
 setUpFields();
+setUpEstimate();
 setUpWelcome();
 setUpKeyboard();
 refreshObjects();

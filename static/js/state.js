@@ -1,9 +1,9 @@
 // What the page knows of the service; modules subscribe to what they show.
 
 // The scene is undefined until the service has told, and null when there is none.
-// `training` is the job that trains a field now, or the latest one that did.
-const state = { scene: undefined, objects: [], training: undefined };
-const listeners = { scene: [], objects: [], training: [] };
+// `training` is the job that trains a field now, or the latest one that did; `estimate` likewise.
+const state = { scene: undefined, objects: [], training: undefined, estimate: undefined };
+const listeners = { scene: [], objects: [], training: [], estimate: [] };
 
 export const current = () => state.scene;
 export const objects = () => state.objects;

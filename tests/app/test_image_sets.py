@@ -2,8 +2,6 @@ import asyncio
 import dataclasses
 import json
 import shutil
-import threading
-import time
 import zipfile
 from pathlib import Path
 
@@ -11,9 +9,9 @@ import pytest
 from starlette.requests import ClientDisconnect
 
 import app.image_sets
-from app.image_sets import ImageSets, SetRefused, TooManySets, examine
+from app.image_sets import ImageSets, TooManySets, examine
+from app.uploads import UploadRefused
 from osfcore.errors import CorruptFile, UnknownName
-from tests.app.conftest import until
 from tests.core.fields.sets import edit, write_set
 
 
@@ -74,7 +72,7 @@ def broken(tmp_path: Path, damage) -> bytes:
     ],
 )
 def test_an_unsound_set_is_refused_in_words_that_know_only_the_uploaders_names(sets, tmp_path, damage, words):
-    with pytest.raises(SetRefused) as refusal:
+    with pytest.raises(UploadRefused) as refusal:
         receive(sets, broken(tmp_path, damage))
     assert words in str(refusal.value)
     assert str(tmp_path) not in str(refusal.value)
@@ -83,7 +81,7 @@ def test_an_unsound_set_is_refused_in_words_that_know_only_the_uploaders_names(s
 
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04 no zip", b"x" * 3_000_000])
 def test_what_is_no_zip_is_refused(sets, tmp_path, data):
-    with pytest.raises(SetRefused, match=r"The uploaded file cannot be used: it is no zip"):
+    with pytest.raises(UploadRefused, match=r"The uploaded file cannot be used: it is no zip"):
         receive(sets, data)
     assert list((tmp_path / "sets").iterdir()) == []
 
@@ -92,7 +90,7 @@ def test_a_zip_that_leads_elsewhere_writes_nothing_there(sets, tmp_path):
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as file:
         file.writestr("train/anno.json", "[]")
         file.writestr("../../evil.txt", "x")
-    with pytest.raises(SetRefused, match="leads out"):
+    with pytest.raises(UploadRefused, match="leads out"):
         receive(sets, (tmp_path / "evil.zip").read_bytes())
     assert not any(tmp_path.rglob("evil.txt"))
 
@@ -100,7 +98,7 @@ def test_a_zip_that_leads_elsewhere_writes_nothing_there(sets, tmp_path):
 def test_a_zip_bomb_is_refused(sets, tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("train/anno.json", b"0" * 50_000_000)
-    with pytest.raises(SetRefused, match="which no image set does"):
+    with pytest.raises(UploadRefused, match="which no images do"):
         receive(sets, (tmp_path / "bomb.zip").read_bytes())
 
 
@@ -127,7 +125,7 @@ def test_uploads_at_the_same_time_do_not_overrun_the_limit(sets, archive, tmp_pa
         (folder / "set.zip").unlink()
         return app.image_sets.Examined(1, 1, "a set")
 
-    monkeypatch.setattr(sets, "_examine", look)
+    monkeypatch.setattr(sets._examiner, "_examine", look)
 
     async def chunks():
         yield archive
@@ -189,27 +187,3 @@ def test_what_a_killed_service_left_half_done_goes_at_the_next_start(tmp_path, a
     again.start()
     assert not (tmp_path / "sets" / ".new-abc").exists()
     assert again.all() == (record,)
-
-
-def test_stopping_ends_the_look_at_a_set(sets, archive, monkeypatch, tmp_path):
-    monkeypatch.setattr(app.image_sets, "examine_main", _sleep)
-    outcome = []
-
-    def upload():
-        try:
-            receive(sets, archive)
-        except SetRefused as error:
-            outcome.append(error)
-
-    thread = threading.Thread(target=upload)
-    thread.start()
-    until(lambda: sets._worker is not None and sets._worker.is_alive())
-    sets.stop()
-    thread.join(10)
-    assert "ended unexpectedly" in str(outcome[0])
-    with pytest.raises(SetRefused, match="stopping"):
-        receive(sets, archive)
-
-
-def _sleep(connection, folder):
-    time.sleep(60)

@@ -101,6 +101,13 @@ def test_pausing_holds_and_cancelling_frees():
     theirs.close()
 
 
-def test_every_kind_that_rest_offers_exists():
-    assert set(KINDS) == {"collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field"}
+def test_every_kind_that_rest_tells_of_exists():
+    assert set(KINDS) == {
+        "collect_pushes",
+        "collect_object",
+        "collect_table",
+        "fetch_assets",
+        "train_field",
+        "estimate",
+    }
     assert Place(Path("d"), Path("f")).library.root == Path("d/objects")

@@ -4,9 +4,12 @@ import time
 
 import pytest
 
+import app.jobs as jobs_module
 from app.field_files import workshop
+from app.job import JobSeen
 from app.jobs import RESUMES_NOTE, STOPPED_NOTE, Jobs, QueueFull, WrongJobState
-from app.store import Store
+from app.messages import JobStep
+from app.store import CannotStore, Store
 from osfcore.errors import UnknownName
 from tests.app.conftest import until
 
@@ -203,3 +206,49 @@ def test_progress_that_comes_too_soon_is_told_when_nothing_follows(open_jobs):
     os.kill(jobs._run.process.pid, signal.SIGSTOP)  # nothing follows, as in a long step
     until(lambda: events and events[-1].job.done == jobs.get(job.id).done)
     jobs.cancel(job.id)
+
+
+def test_inputs_become_the_jobs_own_and_go_with_it(open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    running = jobs.submit(*LONG)
+    (data_dir / "given").mkdir()
+    (data_dir / "given" / "file").write_text("x")
+    job = jobs.submit(*TABLE, data_dir / "given")
+    assert not (data_dir / "given").exists()
+    assert (jobs.inputs(job.id) / "file").read_text() == "x"
+    jobs.cancel(job.id)
+    assert not jobs.folder(job.id).exists()
+    jobs.cancel(running.id)
+    with pytest.raises(CannotStore):
+        jobs.submit(*TABLE, data_dir / "given")
+    assert len(jobs.all()) == 2
+
+
+def test_what_a_job_lets_the_live_view_draw_is_told_but_not_kept(open_jobs, monkeypatch):
+    jobs, events = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    connection = jobs._run.connection
+
+    class Showing:
+        def recv(self):
+            monkeypatch.setattr(jobs._run, "connection", connection)
+            return JobStep(7, 10, "Look", {}, seen="a view")
+
+        def fileno(self):
+            return connection.fileno()
+
+    monkeypatch.setattr(jobs._run, "connection", Showing())
+    (seen,) = until(lambda: [event for event in events if isinstance(event, JobSeen)])
+    assert (seen.job.id, seen.seen) == (job.id, "a view")
+    assert "a view" not in str(jobs.get(job.id))
+    jobs.cancel(job.id)
+
+
+def test_an_estimate_is_ended_without_grace(open_jobs, monkeypatch):
+    jobs, _ = open_jobs(cancel_grace_s=600)
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(jobs._run.process.pid, signal.SIGSTOP)  # as in a step that takes long
+    monkeypatch.setattr(jobs_module, "_ENDED_AT_ONCE", (LONG[0],))
+    assert jobs.cancel(job.id).state == "cancelled"

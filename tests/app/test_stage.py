@@ -15,6 +15,7 @@ from app.messages import (
     Failure,
     FramesTaken,
     Leave,
+    ObserveScene,
     Reply,
     Request,
     ResetScene,
@@ -25,6 +26,7 @@ from app.messages import (
     WatchFrames,
 )
 from app.stage import MASK_COLOURS, Stage, draw_masks
+from osfcore.observationfile import read_observation
 from osfcore.poses import Pose
 from osfcore.scene import STEP_S, Light
 
@@ -179,3 +181,24 @@ def test_masks_are_drawn_over_where_they_are():
     assert np.array_equal(drawn[1, 2], (100 + MASK_COLOURS[1].astype(int)) // 2)
     assert np.array_equal(image, np.full((4, 4, 3), 100))
     assert (drawn != image).any(axis=-1).sum() == 1
+
+
+def test_a_scene_is_observed_as_the_robot_sees_it_and_nothing_tells_the_truth(director, tmp_path):
+    made = create(director)
+    seen = director.call(ObserveScene("a", tmp_path / "first", goal=False, masks=True))
+    assert np.array_equal(seen.state.poses.position, made.state.poses.position)
+    first = read_observation(tmp_path / "first")
+    assert [camera.name for camera in first.cameras] == ["0", "1", "2", "3"]
+    assert first.names == (BOX, BOTTLE)
+    assert first.images.shape == (4, 64, 64, 3)
+    assert first.masks.any(axis=(0, 2, 3)).all()
+    np.testing.assert_allclose(first.pusher, made.state.pusher)
+    text = (tmp_path / "first" / "observation.json").read_text()
+    assert "quaternion" not in text
+    assert "light" not in text
+    director.call(ObserveScene("a", tmp_path / "goal", goal=True, masks=False))
+    goal = read_observation(tmp_path / "goal")
+    assert [camera.name for camera in goal.cameras] == ["goal"]
+    assert goal.masks is None
+    assert goal.pusher is None
+    assert director.call(ObserveScene("b", tmp_path / "none", goal=False, masks=True)).kind == "UnknownName"

@@ -83,3 +83,22 @@ def test_a_dragged_light_lights_the_scene_when_let_go(live, drawing, shown):
         lambda: np.allclose(live.request("GET", f"/api/scenes/{shown['id']}")[1]["light"]["position"], [0, 0.6, 0.8])
     )
     assert light
+
+
+def test_the_lamp_can_be_hidden_or_named_and_still_follows(live, drawing, shown):
+    until(lambda: agrees(drawing, shown))
+    own = tuple(drawing._cube.color)
+    drawing.show_lamp(is_on=False)
+    assert not drawing._cube.visible
+    assert not drawing._ray.visible
+    assert not drawing._light_gizmo.visible
+    _, lit = live.request("PATCH", f"/api/scenes/{shown['id']}", {"light": {"position": [0, -1, 1]}})
+    until(lambda: agrees(drawing, lit))
+    drawing.show_lamp(is_on=True, name="true light")
+    assert drawing._cube.visible
+    assert tuple(drawing._cube.color) != own
+    assert drawing._lamp_name.text == "true light"
+    np.testing.assert_allclose(drawing._lamp_name.position, lit["light"]["position"], atol=1e-5)
+    drawing.show_lamp(is_on=True)
+    assert tuple(drawing._cube.color) == own
+    assert not drawing._lamp_name.visible

@@ -8,7 +8,7 @@ import pytest
 import osfcore.fields.set_archive as module
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.fields.image_set import read_splits
-from osfcore.fields.set_archive import unpack_set
+from osfcore.fields.set_archive import unpack_observation, unpack_set
 
 
 def packed(folder, path, below="", compression=zipfile.ZIP_DEFLATED):
@@ -170,3 +170,25 @@ def test_a_full_disk_is_told_and_leaves_nothing(archive, tmp_path, monkeypatch):
     with pytest.raises(CannotWrite, match="No space left"):
         unpack_set(archive, tmp_path / "out")
     assert left_in(tmp_path) == ["set.zip"]
+
+
+@pytest.mark.parametrize("below", ["", "seen/"])
+def test_a_zipped_observation_is_unpacked_with_all_that_lies_beside_it(tmp_path, below):
+    with zipfile.ZipFile(tmp_path / "seen.zip", "w") as file:
+        for name in ("observation.json", "images/0.png", "prior.json"):
+            file.writestr(below + name, name)
+        file.writestr("__MACOSX/._seen", "x")
+    out = unpack_observation(tmp_path / "seen.zip", tmp_path / "out")
+    assert (out / "images" / "0.png").read_text() == "images/0.png"
+    assert (out / "observation.json").read_text() == "observation.json"
+    with pytest.raises(CorruptFile, match="holds no train/anno.json"):
+        unpack_set(tmp_path / "seen.zip", tmp_path / "set")
+
+
+def test_an_archive_without_an_observation_is_told(archive, tmp_path):
+    with pytest.raises(CorruptFile, match=r"holds no observation.json; a zipped observation folder"):
+        unpack_observation(archive, tmp_path / "out")
+    add(archive, "../observation.json")
+    with pytest.raises(CorruptFile, match="leads out"):
+        unpack_observation(archive, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

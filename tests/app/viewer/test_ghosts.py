@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from app.viewer.ghosts import CELLS, box, coarse, footprint_m, heading_rad, sector, spread, top_m
+from osfcore.poses import Pose, quaternion_multiply
+
+TURN_Y = np.array([0.5**0.5, 0, 0.5**0.5, 0])  # +x goes down, +z to +x
+
+
+def area_m2(vertices, faces):
+    a, b, c = (vertices[faces[:, i]].astype(float) for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+
+
+@pytest.mark.parametrize("name", ["006_mustard_bottle", "035_power_drill"])
+def test_a_coarse_mesh_has_few_triangles_and_nearly_the_same_shape(library, name):
+    mesh = library.load(name).mesh
+    vertices, faces = coarse(mesh.vertices, mesh.faces)
+    assert 100 < len(faces) < len(mesh.faces) / 5
+    assert faces.max() < len(vertices)
+    cell_m = (mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)).max() / CELLS
+    assert np.abs(vertices.max(axis=0) - mesh.vertices.max(axis=0)).max() < cell_m
+    assert np.abs(vertices.min(axis=0) - mesh.vertices.min(axis=0)).max() < cell_m
+    assert area_m2(vertices, faces) == pytest.approx(area_m2(mesh.vertices, mesh.faces), rel=0.2)
+
+
+def test_no_triangle_of_a_coarse_mesh_vanishes_or_comes_twice():
+    rng = np.random.default_rng(0)
+    vertices, faces = coarse(rng.normal(size=(200, 3)), rng.integers(0, 200, (500, 3)), 4)
+    rows = np.sort(faces, axis=1)
+    assert (np.diff(rows.astype(int), axis=1) > 0).all()
+    assert len(np.unique(rows, axis=0)) == len(rows)
+    assert len(vertices) <= 64
+
+
+def test_a_cube_is_closed_and_faces_outward():
+    vertices, faces = box(0.1)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    assert area_m2(vertices, faces) == pytest.approx(0.06)
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) > 0).all()
+
+
+def test_a_sector_opens_as_far_as_it_is_told_and_faces_up():
+    vertices, faces = sector(1.0, 0.2, 0.05, 0.08)
+    headings = np.arctan2(vertices[:, 1], vertices[:, 0])
+    assert (headings.min(), headings.max()) == pytest.approx((0.8, 1.2), abs=1e-6)
+    reach = np.linalg.norm(vertices, axis=1)
+    assert (reach.min(), reach.max()) == pytest.approx((0.05, 0.08), abs=1e-6)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+    assert area_m2(vertices, faces) == pytest.approx(0.2 * (0.08**2 - 0.05**2), rel=0.01)
+
+
+@pytest.mark.parametrize(("of", "count"), [(50, 24), (24, 24), (17, 24), (1, 3)])
+def test_as_many_poses_as_wanted_are_spread_over_all(of, count):
+    poses = Pose(np.arange(3.0 * of).reshape(of, 3), np.tile([1.0, 0, 0, 0], (of, 1)))
+    chosen = spread(poses, count)
+    assert chosen.position.shape == (count, 3)
+    assert chosen.position[0, 0] == 0
+    assert chosen.position[-1, 0] == 3 * (of - 1 if count > 1 else 0)
+    assert len(np.unique(chosen.position[:, 0])) == min(of, count)
+
+
+def test_a_turned_mesh_tells_how_far_it_reaches():
+    vertices = box(1.0)[0] * np.array([0.2, 0.1, 0.06])
+    upright = np.array([1.0, 0, 0, 0])
+    assert top_m(vertices, upright) == pytest.approx(0.03)
+    assert top_m(vertices, TURN_Y) == pytest.approx(0.1)
+    assert footprint_m(vertices, upright) == pytest.approx(np.hypot(0.1, 0.05))
+    assert footprint_m(vertices, TURN_Y) == pytest.approx(np.hypot(0.03, 0.05))
+
+
+def test_the_heading_follows_turns_about_the_vertical():
+    half = 0.35
+    turn = np.array([np.cos(half), 0, 0, np.sin(half)])
+    for lying in (np.array([1.0, 0, 0, 0]), TURN_Y):
+        before, after = heading_rad(lying), heading_rad(quaternion_multiply(turn, lying))
+        assert (after - before) % (2 * np.pi) == pytest.approx(2 * half)
