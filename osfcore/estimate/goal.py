@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Int
 
 from osfcore.errors import InvalidInput
-from osfcore.estimate.lamp import find_light
+from osfcore.estimate.lamp import find_light, hemisphere
 from osfcore.estimate.models import Models
 from osfcore.estimate.polish import PLANAR, Descent, polish
 from osfcore.estimate.resting import about_z
@@ -23,19 +24,22 @@ from osfcore.estimate.sliding import Sightings, sight
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import Guess
 from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
-from osfcore.estimate.views import FINE_SIDE, views_of
+from osfcore.estimate.views import FINE_SIDE, Views, views_of
 from osfcore.estimate.whole import residuals, whole_loss
-from osfcore.poses import Pose, quaternion_multiply, rotate
+from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
 _YAWS = 24
 _SIGHTINGS = 300
-_ROUNDS = 3
+_ROUNDS = 2
 _FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
-_PLACES, _APART_M = 8, 0.03  # where the first of two objects is tried
+_LIGHTS = 40  # over the whole sphere, to begin with
+_KEPT = 3  # of the scenes found under them
+_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # where the first of two objects is tried, and the second
 _AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
 _SHOWN = 24
+_CHALLENGES, _TURNED_RAD = 2, np.deg2rad(30.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +94,7 @@ class _Goal:
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, effort.side)
         self._done = 0
-        self._pass = _ROUNDS + effort.planar_iterations + _FINE_PLANAR + len(self._names) + effort.free_iterations
+        self._pass = 3 + effort.planar_iterations + _FINE_PLANAR + len(self._names) + effort.free_iterations
         self._total = len(self._names) + self._pass + 1
         self._rivals: dict[int, float] = {}
 
@@ -137,28 +141,47 @@ class _Goal:
         return Guess(self._names, positions, quaternions, self._prior.light.direction, None)
 
     def _assemble(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the guess
-        """Choose a sighting for each object, by the whole image; the light is searched between the rounds.
+        """Choose a sighting for each object by the whole image, the light being unknown.
 
-        First each object in turn, then two at a time: one that stands in another's place keeps it from there.
+        From lights all over the hemisphere, in turn the objects and the light, on rough images; then the best of these
+        scenes on finer ones. Last two objects at a time: one that stands in another's place keeps it from there.
         """
+        starts = [self._alternated(start, sightings, self._rough) for start in self._starts(guess)]
+        starts.sort(key=lambda start: self._loss(start, self._rough))
+        yield self._assembled(starts[0], sightings)
+        starts = [self._alternated(start, sightings, self._coarse) for start in starts[:_KEPT]]
+        guess = min(starts, key=lambda start: self._loss(start, self._coarse))
+        yield self._assembled(guess, sightings)
+        for pair in combinations(range(len(sightings)), 2):
+            guess = self._pair(guess, pair, sightings)
+        guess = self._alternated(guess, sightings, self._coarse)
+        yield self._assembled(guess, sightings)
+        return guess
+
+    def _starts(self, guess: Guess) -> list[Guess]:
+        """A guess, and scenes without objects under lights all over the hemisphere."""
+        nothing = guess
+        for n in range(len(self._names)):
+            nothing = with_pose(nothing, n, _AWAY)
+        return [guess, *(replace(nothing, light=light) for light in hemisphere(_LIGHTS))]
+
+    def _alternated(self, guess: Guess, sightings: list[Sightings], views: Views) -> Guess:
+        """In turn each object at its best sighting, and the light."""
         for _ in range(_ROUNDS):
-            guess = replace(guess, light=find_light(self._models, self._rough, self._coarse, guess))
             for n, found in enumerate(sightings):
-                guess, _ = self._placed(guess, n, found)
-            for first, second in combinations(range(len(sightings)), 2):
-                guess = self._pair(guess, (first, second), sightings)
-            losses = [self._loss(guess)] * len(sightings)
-            yield self._step("together", "Which sightings explain the image together", guess, sightings, losses)
+                guess, _ = self._placed(guess, n, found, views)
+            guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
         return guess
 
     def _pair(self, guess: Guess, pair: tuple[int, int], sightings: list[Sightings]) -> Guess:
         """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
-        best, least = guess, self._loss(guess)
+        best, least = guess, self._loss(guess, self._coarse)
         first, second = pair
         without = with_pose(with_pose(guess, first, _AWAY), second, _AWAY)
+        others = sightings[second].chosen(self._ranking(without, second, sightings[second])[:_SECOND])
         for k in self._best_places(without, first, sightings[first]):
             one = with_pose(without, first, sightings[first].pose(k))
-            both, loss = self._placed(one, second, sightings[second])
+            both, loss = self._placed(one, second, others, self._coarse)
             if loss < least:
                 best, least = both, loss
         return best
@@ -166,7 +189,7 @@ class _Goal:
     def _best_places(self, guess: Guess, n: int, found: Sightings) -> list[int]:
         """Numbers of the sightings of an object that explain the image best, each in a place of its own."""
         kept: list[int] = []
-        for k in np.argsort(pose_losses(self._models, self._coarse, guess, n, found.poses)):
+        for k in self._ranking(guess, n, found):
             shifts = found.positions[kept] - found.positions[k]
             if not kept or np.linalg.norm(shifts, axis=1).min() > _APART_M:
                 kept.append(int(k))
@@ -174,16 +197,25 @@ class _Goal:
                 break
         return kept
 
-    def _placed(self, guess: Guess, n: int, found: Sightings) -> tuple[Guess, float]:
+    def _ranking(self, guess: Guess, n: int, found: Sightings) -> Int[np.ndarray, "K"]:
+        if not len(found.scores):
+            return np.zeros(0, int)
+        return np.argsort(pose_losses(self._models, self._coarse, guess, n, found.poses))
+
+    def _placed(self, guess: Guess, n: int, found: Sightings, views: Views) -> tuple[Guess, float]:
         """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
-        losses = pose_losses(self._models, self._coarse, guess, n, found.poses)
-        own = self._loss(guess)
-        if not len(losses) or losses.min() >= own:
+        own = self._loss(guess, views)
+        losses = pose_losses(self._models, views, guess, n, found.poses) if len(found.scores) else np.array([np.inf])
+        if losses.min() >= own:
             return guess, own
         return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
 
-    def _loss(self, guess: Guess) -> float:
-        return float(whole_loss(residuals(self._models, self._coarse, guess.moved(np.zeros((1, guess.size)))))[0])
+    def _loss(self, guess: Guess, views: Views) -> float:
+        return float(whole_loss(residuals(self._models, views, guess.moved(np.zeros((1, guess.size)))))[0])
+
+    def _assembled(self, guess: Guess, sightings: list[Sightings]) -> EstimateStep:
+        losses = [self._loss(guess, self._coarse)] * len(sightings)
+        return self._step("together", "Which sightings explain the image together", guess, sightings, losses)
 
     def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
         e = self._effort
@@ -195,14 +227,23 @@ class _Goal:
             for step in polish(self._models, views, at, iterations=iterations, numbers=numbers, light=self._middle):
                 at = step
                 yield self._polishing("On the table", at)
+        for _ in range(_CHALLENGES):
+            before = at.guess.quaternions
+            at = yield from self._challenge(at)
+            if rotation_angle(before, at.guess.quaternions).max() < _TURNED_RAD:
+                break  # nobody was turned round, so nobody else looks different now
+        return at
+
+    def _challenge(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
+        """Turn each object round where that explains the image better, and descend over whole poses."""
         for n, name in enumerate(self._names):
             at, self._rivals[n] = challenged(
                 self._models, self._fine, self._fine, at, n, turned(self._models, at.guess, n)
             )
             yield self._polishing(f"{name}: the other way round", at)
         at = replace(at, dampings=Descent.at(at.guess).dampings)
-        free = polish(self._models, self._fine, at, iterations=e.free_iterations, light=self._middle, until_settled=True)
-        for step in free:
+        sweeps = self._effort.free_iterations
+        for step in polish(self._models, self._fine, at, iterations=sweeps, light=self._middle, until_settled=True):
             at = step
             yield self._polishing("The last millimetres", at)
         return at

@@ -34,7 +34,7 @@ def find_light(models: Models, coarse: Views, fine: Views, guess: Guess) -> Floa
         fine: images to refine on.
         guess: objects and pusher; its light plays no part.
     """
-    directions = _hemisphere()
+    directions = hemisphere()
     best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_FIRST_SURVIVORS]]
     step = _FIRST_STEP_RAD
     for _ in range(_ROUNDS):
@@ -46,13 +46,14 @@ def find_light(models: Models, coarse: Views, fine: Views, guess: Guess) -> Floa
 
 def elsewhere(models: Models, views: Views, guess: Guess) -> float:
     """Loss under the best of directions all over the hemisphere, over that under the light of a guess."""
-    directions = np.concatenate([guess.light[None], _hemisphere()])
+    directions = np.concatenate([guess.light[None], hemisphere()])
     losses = _losses(models, views, guess, directions)
     return float(losses[1:].min() / max(losses[0], 1e-12))
 
 
-def _hemisphere() -> Float[np.ndarray, "K 3"]:
-    directions = sphere(_DIRECTIONS)
+def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
+    """Where a light may be: those of `count` directions, spread over the whole sphere, that are high enough."""
+    directions = sphere(count)
     return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
 
 

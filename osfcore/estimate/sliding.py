@@ -50,6 +50,10 @@ class Sightings:
         """One of them."""
         return Pose(self.positions[number], self.quaternions[number])
 
+    def chosen(self, numbers: Int[np.ndarray, "C"]) -> Sightings:
+        """Some of them."""
+        return Sightings(self.positions[numbers], self.quaternions[numbers], self.scores[numbers])
+
 
 def table_errors(models: Models, views: Views) -> Float[np.ndarray, "h w"]:
     """Squared error of the first view's pixels, the table being lit or shaded at will."""

@@ -29,6 +29,7 @@ from osfcore.poses import Pose
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
+
 @dataclass(frozen=True, slots=True)
 class TrackEffort:
     """How a later frame is estimated.

@@ -20,7 +20,7 @@ from osfcore.render.scene_renderer import SceneBatch
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
-_MOST_RESIDUAL = 0.045  # radiance, root of mean square over an object's pixels
+_MOST_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
 _LEAST_OVERLAP = 0.75  # of silhouette and mask
 _FEW_PX = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)

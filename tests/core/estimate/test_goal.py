@@ -10,7 +10,7 @@ from osfcore.poses import Pose, quaternion_multiply
 from osfcore.scene import Camera, Light, default_cameras, goal_camera
 from tests.core.estimate.scenes import BOTTLE, BOX, apart, lying, observe, scene
 
-QUICK = GoalEffort(side=32, planar_iterations=4, free_iterations=3)
+QUICK = GoalEffort(side=64, planar_iterations=4, free_iterations=3)
 
 
 def steps_of(models, seen, prior, effort=QUICK):
