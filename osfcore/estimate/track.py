@@ -203,7 +203,9 @@ class _Track:
 
     def _finish(self, at: Descent) -> EstimateStep:
         evidence = gather(self._models, self._middle, at.guess)
-        estimate = judged(at.guess, at.normals, evidence, self._rivals, light_held=True)
+        estimate = judged(
+            at.guess, at.normals, evidence, self._rivals, light_held=True, most_residual=self._effort.fits_below
+        )
         self._done = self._total - 1
         step = self._step("done", "Done" if estimate.trusted else estimate.reason, at)
         return replace(step, estimate=estimate)
