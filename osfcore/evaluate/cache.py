@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -96,3 +97,9 @@ def table_sha256(table: TableField) -> str:
     """The same of a table."""
     arrays = [np.asarray(getattr(table, entry.name)).tobytes() for entry in fields_of(table)]
     return hashlib.sha256(b"".join(arrays)).hexdigest()
+
+
+def code_sha256(*packages: ModuleType) -> str:
+    """The same of packages' sources: figures are the code's that made them."""
+    files = sorted(path for package in packages for folder in package.__path__ for path in Path(folder).rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

@@ -18,6 +18,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+import osfcore.estimate
+import osfcore.render
 from osfcore.errors import OsfError
 from osfcore.estimate.first import Effort, estimate_first
 from osfcore.estimate.goal import GoalEffort, estimate_goal
@@ -25,7 +27,7 @@ from osfcore.estimate.models import Models
 from osfcore.estimate.steps import EstimateStep
 from osfcore.estimate.track import TrackEffort, estimate_next
 from osfcore.estimated import EstimatedState
-from osfcore.evaluate.cache import TaskCache, TaskResult, file_sha256, table_sha256
+from osfcore.evaluate.cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
 from osfcore.evaluate.composites import Draw, draw_scene
 from osfcore.evaluate.estimate_bad import FIRST_SCENE, BadCase, BadScore, bad_case
 from osfcore.evaluate.estimate_scores import FrameScore, TrackScore, flags, pose_errors, refused_frame, score_frame
@@ -297,13 +299,18 @@ class TaskRunner:
         return {name: file_sha256(self._fields.info(name).path) for name in self._names}
 
     @cached_property
+    def _code(self) -> str:
+        return code_sha256(osfcore.estimate, osfcore.render)
+
+    @cached_property
     def _table(self) -> str:
         return table_sha256(self._fields.load_table())
 
     def _circumstances(self, draw: Draw, effort: dict[str, Any]) -> dict[str, Any]:
-        """Everything that a result depends on, the estimator's code aside."""
+        """Everything that a result depends on."""
         return {
             "format": FORMAT,
+            "code": self._code,
             "weights": {name: self._weights[name] for name in draw.names},
             "assets": {name: self._library.digest(name) for name in draw.names},
             "table": self._table,
