@@ -1,43 +1,35 @@
 """Goal images: one view, no masks, objects known by name, perhaps under another light than the scene.
 
 Nothing says where the objects are, so templates are slid over the image (`sliding`), first of each object as it lies
-now, since goals are mostly reached by pushing. The scene is put together from the best sightings, one object after the
-other, each time the whole image deciding; then the light is searched and the poses are refined as in the first frame.
+now, since goals are mostly reached by pushing. Scenes are put together from the sightings (`assembly`), and the best is
+refined as in the first frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
-from jaxtyping import Int
 
 from osfcore.errors import InvalidInput
-from osfcore.estimate.lamp import find_light, hemisphere
+from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes
 from osfcore.estimate.models import Models
 from osfcore.estimate.polish import PLANAR, Descent, polish
 from osfcore.estimate.resting import about_z
-from osfcore.estimate.rivals import challenged, pose_losses, turned, with_pose
+from osfcore.estimate.rivals import challenged, turned
 from osfcore.estimate.sliding import Sightings, sight
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import Guess
 from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
-from osfcore.estimate.views import FINE_SIDE, Views, views_of
-from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.estimate.views import FINE_SIDE, views_of
 from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
 _YAWS = 24
 _SIGHTINGS = 300
-_ROUNDS = 2
 _FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
-_LIGHTS = 40  # over the whole sphere, to begin with
-_KEPT = 3  # of the scenes found under them
-_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # where the first of two objects is tried, and the second
-_AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
 _SHOWN = 24
 _CHALLENGES, _TURNED_RAD = 2, np.deg2rad(30.0)
 
@@ -94,7 +86,9 @@ class _Goal:
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, effort.side)
         self._done = 0
-        self._pass = 3 + effort.planar_iterations + _FINE_PLANAR + len(self._names) + effort.free_iterations
+        challenge = len(self._names) + effort.free_iterations
+        self._pass = (count_of_scenes(len(self._names)) + effort.planar_iterations + _FINE_PLANAR
+                      + _CHALLENGES * challenge)  # fmt: skip
         self._total = len(self._names) + self._pass + 1
         self._rivals: dict[int, float] = {}
 
@@ -134,88 +128,18 @@ class _Goal:
     def _first(self, sightings: list[Sightings]) -> Guess:
         """The best sighting of each object; those not seen, or not looked for yet, are away."""
         count = len(self._names)
-        positions, quaternions = np.tile(_AWAY.position, (count, 1)), np.tile(_AWAY.quaternion, (count, 1))
+        positions, quaternions = np.tile(AWAY.position, (count, 1)), np.tile(AWAY.quaternion, (count, 1))
         for n, found in enumerate(sightings):
             if len(found.scores):
                 positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
         return Guess(self._names, positions, quaternions, self._prior.light.direction, None)
 
     def _assemble(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the guess
-        """Choose a sighting for each object by the whole image, the light being unknown.
-
-        From lights all over the hemisphere, in turn the objects and the light, on rough images; then the best of these
-        scenes on finer ones. Last two objects at a time: one that stands in another's place keeps it from there.
-        """
-        starts = [self._alternated(start, sightings, self._rough) for start in self._starts(guess)]
-        starts.sort(key=lambda start: self._loss(start, self._rough))
-        yield self._assembled(starts[0], sightings)
-        starts = [self._alternated(start, sightings, self._coarse) for start in starts[:_KEPT]]
-        guess = min(starts, key=lambda start: self._loss(start, self._coarse))
-        yield self._assembled(guess, sightings)
-        for pair in combinations(range(len(sightings)), 2):
-            guess = self._pair(guess, pair, sightings)
-        guess = self._alternated(guess, sightings, self._coarse)
-        yield self._assembled(guess, sightings)
+        """The sightings that explain the image together."""
+        for step in assembled(self._models, self._rough, self._coarse, guess, sightings):
+            guess, loss = step
+            yield self._step("together", "Which sightings explain the image together", guess, sightings, loss=loss)
         return guess
-
-    def _starts(self, guess: Guess) -> list[Guess]:
-        """A guess, and scenes without objects under lights all over the hemisphere."""
-        nothing = guess
-        for n in range(len(self._names)):
-            nothing = with_pose(nothing, n, _AWAY)
-        return [guess, *(replace(nothing, light=light) for light in hemisphere(_LIGHTS))]
-
-    def _alternated(self, guess: Guess, sightings: list[Sightings], views: Views) -> Guess:
-        """In turn each object at its best sighting, and the light."""
-        for _ in range(_ROUNDS):
-            for n, found in enumerate(sightings):
-                guess, _ = self._placed(guess, n, found, views)
-            guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
-        return guess
-
-    def _pair(self, guess: Guess, pair: tuple[int, int], sightings: list[Sightings]) -> Guess:
-        """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
-        best, least = guess, self._loss(guess, self._coarse)
-        first, second = pair
-        without = with_pose(with_pose(guess, first, _AWAY), second, _AWAY)
-        others = sightings[second].chosen(self._ranking(without, second, sightings[second])[:_SECOND])
-        for k in self._best_places(without, first, sightings[first]):
-            one = with_pose(without, first, sightings[first].pose(k))
-            both, loss = self._placed(one, second, others, self._coarse)
-            if loss < least:
-                best, least = both, loss
-        return best
-
-    def _best_places(self, guess: Guess, n: int, found: Sightings) -> list[int]:
-        """Numbers of the sightings of an object that explain the image best, each in a place of its own."""
-        kept: list[int] = []
-        for k in self._ranking(guess, n, found):
-            shifts = found.positions[kept] - found.positions[k]
-            if not kept or np.linalg.norm(shifts, axis=1).min() > _APART_M:
-                kept.append(int(k))
-            if len(kept) == _PLACES:
-                break
-        return kept
-
-    def _ranking(self, guess: Guess, n: int, found: Sightings) -> Int[np.ndarray, "K"]:
-        if not len(found.scores):
-            return np.zeros(0, int)
-        return np.argsort(pose_losses(self._models, self._coarse, guess, n, found.poses))
-
-    def _placed(self, guess: Guess, n: int, found: Sightings, views: Views) -> tuple[Guess, float]:
-        """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
-        own = self._loss(guess, views)
-        losses = pose_losses(self._models, views, guess, n, found.poses) if len(found.scores) else np.array([np.inf])
-        if losses.min() >= own:
-            return guess, own
-        return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
-
-    def _loss(self, guess: Guess, views: Views) -> float:
-        return float(whole_loss(residuals(self._models, views, guess.moved(np.zeros((1, guess.size)))))[0])
-
-    def _assembled(self, guess: Guess, sightings: list[Sightings]) -> EstimateStep:
-        losses = [self._loss(guess, self._coarse)] * len(sightings)
-        return self._step("together", "Which sightings explain the image together", guess, sightings, losses)
 
     def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
         e = self._effort

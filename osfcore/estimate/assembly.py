@@ -1,0 +1,124 @@
+"""Scenes put together from sightings: which of them explain an image together, its light being unknown.
+
+Objects and light depend on each other: under a wrong light a wrong scene may look right. So it is begun under lights
+all over the hemisphere, on rough images, and the best of these scenes are sorted out on finer ones. Last, objects are
+replaced two at a time: one that stands in another's place keeps it from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Int
+
+from osfcore.estimate.lamp import find_light, hemisphere
+from osfcore.estimate.models import Models
+from osfcore.estimate.rivals import pose_losses, with_pose
+from osfcore.estimate.sliding import Sightings
+from osfcore.estimate.tangent import Guess
+from osfcore.estimate.views import Views
+from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.poses import Pose
+
+AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
+_LIGHTS = 40  # over the whole sphere, to begin with
+_ROUNDS = 2  # of objects and light in turn
+_KEPT = 3  # of the scenes found under them
+_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, sightings for the second
+
+
+def assembled(
+    models: Models, rough: Views, coarse: Views, start: Guess, sightings: list[Sightings]
+) -> Iterator[tuple[Guess, float]]:
+    """Put scenes together; yields the best so far and its loss, each time one more was tried.
+
+    Args:
+        models: fields.
+        rough: images for all lights.
+        coarse: images for the best of them.
+        start: one scene to begin with; the others begin with no object.
+        sightings: of each object.
+    """
+    yield from _Assembly(models, rough, coarse, sightings).scenes(start)
+
+
+def count_of_scenes(objects: int) -> int:
+    """How many steps it takes."""
+    return 1 + len(hemisphere(_LIGHTS)) + _KEPT + objects * (objects - 1) // 2 + 1
+
+
+class _Assembly:
+    def __init__(self, models: Models, rough: Views, coarse: Views, sightings: list[Sightings]) -> None:
+        self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, sightings
+
+    def scenes(self, start: Guess) -> Iterator[tuple[Guess, float]]:
+        empty = start
+        for n in range(len(self._sightings)):
+            empty = with_pose(empty, n, AWAY)
+        found = []
+        for guess in (start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))):
+            found.append(self._alternated(guess, self._rough))
+            found.sort(key=lambda pair: pair[1])
+            yield found[0]
+        finer = []
+        for guess, _ in found[:_KEPT]:
+            finer.append(self._alternated(guess, self._coarse))
+            yield min(finer, key=lambda pair: pair[1])
+        guess, loss = min(finer, key=lambda pair: pair[1])
+        for pair in combinations(range(len(self._sightings)), 2):
+            guess, loss = self._replaced(guess, loss, pair)
+            yield guess, loss
+        yield self._alternated(guess, self._coarse)
+
+    def _alternated(self, guess: Guess, views: Views) -> tuple[Guess, float]:
+        """In turn each object at its best sighting, and the light."""
+        for _ in range(_ROUNDS):
+            for n, found in enumerate(self._sightings):
+                guess, _ = self._placed(guess, n, found, views)
+            guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
+        return guess, self._loss(guess, views)
+
+    def _replaced(self, guess: Guess, loss: float, pair: tuple[int, int]) -> tuple[Guess, float]:
+        """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
+        best, least = guess, loss
+        first, second = pair
+        without = with_pose(with_pose(guess, first, AWAY), second, AWAY)
+        others = self._sightings[second]
+        others = others.chosen(self._ranking(without, second)[:_SECOND])
+        for k in self._best_places(without, first):
+            one = with_pose(without, first, self._sightings[first].pose(k))
+            both, loss = self._placed(one, second, others, self._coarse)
+            if loss < least:
+                best, least = both, loss
+        return best, least
+
+    def _best_places(self, guess: Guess, n: int) -> list[int]:
+        """Numbers of the sightings of an object that explain the image best, each in a place of its own."""
+        positions, kept = self._sightings[n].positions, []
+        for k in self._ranking(guess, n).tolist():
+            if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:
+                kept.append(k)
+            if len(kept) == _PLACES:
+                break
+        return kept
+
+    def _ranking(self, guess: Guess, n: int) -> Int[np.ndarray, "K"]:
+        return np.argsort(self._losses(guess, n, self._sightings[n], self._coarse))
+
+    def _placed(self, guess: Guess, n: int, found: Sightings, views: Views) -> tuple[Guess, float]:
+        """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
+        own, losses = self._loss(guess, views), self._losses(guess, n, found, views)
+        if losses.min(initial=np.inf) >= own:
+            return guess, own
+        return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
+
+    def _losses(self, guess: Guess, n: int, found: Sightings, views: Views) -> np.ndarray:
+        if not len(found.scores):
+            return np.zeros(0)
+        return pose_losses(self._models, views, guess, n, found.poses)
+
+    def _loss(self, guess: Guess, views: Views) -> float:
+        return float(whole_loss(residuals(self._models, views, guess.moved(np.zeros((1, guess.size)))))[0])
