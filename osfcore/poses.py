@@ -121,6 +121,11 @@ class Pose:
         return Pose(np.zeros((*batch, 3)), quaternion)
 
     @staticmethod
+    def joined(*batches: Pose) -> Pose:
+        """One batch of several, along the first axis."""
+        return Pose(np.concatenate([b.position for b in batches]), np.concatenate([b.quaternion for b in batches]))
+
+    @staticmethod
     def from_matrix(matrix: Float[np.ndarray, "*batch 4 4"]) -> Pose:
         """The pose of homogeneous 4 x 4 matrices whose upper left block is a rotation."""
         matrix = np.asarray(matrix, float)

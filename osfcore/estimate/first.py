@@ -194,9 +194,7 @@ class _First:
     def _compare(self, at: Descent, starts: list[Starts]) -> Iterator[EstimateStep]:  # returns the better Descent
         """Put other orientations of each object into the scene and let the whole images decide."""
         for n, found in enumerate(starts):
-            spun = turned(self._models, at.guess, n)
-            others = Pose(np.concatenate([found.positions, spun.position]),
-                          np.concatenate([found.quaternions, spun.quaternion]))  # fmt: skip
+            others = Pose.joined(Pose(found.positions, found.quaternions), turned(self._models, at.guess, n))
             at, self._rivals[n] = challenged(self._models, self._middle, self._fine, at, n, others)
             yield self._polishing(f"{self._names[n]}: the other way round", at)
         return at

@@ -32,6 +32,7 @@ _SIGHTINGS = 300
 _FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
 _SHOWN = 24
 _CHALLENGES, _TURNED_RAD = 2, np.deg2rad(30.0)
+_BESIDE_M = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +100,7 @@ class _Goal:
             sightings.append(self._as_it_lies(n))
             yield self._step("orientations", f"{name}: where it may be", self._first(sightings), sightings)
         guess = yield from self._assemble(self._first(sightings), sightings)
-        at = yield from self._descend(guess)
+        at = yield from self._descend(guess, sightings)
         evidence = gather(self._models, self._fine, at.guess)
         bad = [n for n in range(count) if object_residuals(evidence)[n] > self._effort.widen_above]
         if bad:
@@ -108,7 +109,7 @@ class _Goal:
                 sightings[n] = self._any_way(n)
                 yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
             other = yield from self._assemble(at.guess, sightings)
-            other = yield from self._descend(other)
+            other = yield from self._descend(other, sightings)
             at = other if other.losses[-1] < at.losses[-1] else at
             evidence = gather(self._models, self._fine, at.guess)
         yield self._finish(at, evidence)
@@ -141,7 +142,7 @@ class _Goal:
             yield self._step("together", "Which sightings explain the image together", guess, sightings, loss=loss)
         return guess
 
-    def _descend(self, guess: Guess) -> Iterator[EstimateStep]:  # returns the last Descent
+    def _descend(self, guess: Guess, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the last Descent
         e = self._effort
         at = Descent.at(guess)
         for views, numbers, iterations in (
@@ -153,17 +154,20 @@ class _Goal:
                 yield self._polishing("On the table", at)
         for _ in range(_CHALLENGES):
             before = at.guess.quaternions
-            at = yield from self._challenge(at)
+            at = yield from self._challenge(at, sightings)
             if rotation_angle(before, at.guess.quaternions).max() < _TURNED_RAD:
                 break  # nobody was turned round, so nobody else looks different now
         return at
 
-    def _challenge(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
-        """Turn each object round where that explains the image better, and descend over whole poses."""
+    def _challenge(self, at: Descent, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the Descent
+        """Turn each object round where that explains the image better, and descend over whole poses.
+
+        An object that is turned wrongly was drawn aside by that, so its sightings nearby are tried as well.
+        """
         for n, name in enumerate(self._names):
-            at, self._rivals[n] = challenged(
-                self._models, self._fine, self._fine, at, n, turned(self._models, at.guess, n)
-            )
+            beside = sightings[n].near(at.guess.positions[n], _BESIDE_M)
+            others = Pose.joined(turned(self._models, at.guess, n), beside.poses)
+            at, self._rivals[n] = challenged(self._models, self._fine, self._fine, at, n, others)
             yield self._polishing(f"{name}: the other way round", at)
         at = replace(at, dampings=Descent.at(at.guess).dampings)
         sweeps = self._effort.free_iterations

@@ -50,6 +50,10 @@ class Sightings:
         """One of them."""
         return Pose(self.positions[number], self.quaternions[number])
 
+    def near(self, position: Float[np.ndarray, "3"], reach: float) -> Sightings:
+        """Those within `reach` [m] of a position."""
+        return self.chosen(np.flatnonzero(np.linalg.norm(self.positions - position, axis=1) < reach))
+
     def chosen(self, numbers: Int[np.ndarray, "C"]) -> Sightings:
         """Some of them."""
         return Sightings(self.positions[numbers], self.quaternions[numbers], self.scores[numbers])

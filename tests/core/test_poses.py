@@ -84,3 +84,10 @@ def test_nearly_unit_quaternions_are_normalised_exactly():
 def test_other_quaternions_are_refused(bad):
     with pytest.raises(InvalidInput, match="quaternion"):
         unit_quaternion(np.array(bad))
+
+
+def test_batches_are_joined_along_the_first_axis():
+    one, two = Pose.identity(2), Pose(np.ones((1, 3)), np.array([[0.0, 1.0, 0.0, 0.0]]))
+    both = Pose.joined(one, two)
+    np.testing.assert_array_equal(both.position, [[0, 0, 0], [0, 0, 0], [1, 1, 1]])
+    np.testing.assert_array_equal(both.quaternion[:, 1], [0, 0, 1])

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimate.sliding import sight, table_errors
+from osfcore.estimate.sliding import Sightings, sight, table_errors
 from osfcore.estimate.views import views_of
 from osfcore.poses import rotate, rotation_angle
 from osfcore.scene import Camera, goal_camera
@@ -71,3 +71,12 @@ def test_a_camera_among_the_objects_sees_what_is_before_it(models):
     found = sight(models, image_of(models, state, 32, camera), BOX, *ways(models, BOX, 30), most=100)
     near = np.linalg.norm(found.positions - state.poses.position[0], axis=1)
     assert near.min() < 0.04
+
+
+def test_some_of_the_sightings():
+    positions = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.1, 0, 0]])
+    found = Sightings(positions, np.tile([1.0, 0, 0, 0], (3, 1)), np.array([3.0, 2.0, 1.0]))
+    np.testing.assert_array_equal(found.near(np.array([0.01, 0, 0]), 0.02).scores, [3, 2])
+    np.testing.assert_array_equal(found.chosen(np.array([2, 0])).scores, [1, 3])
+    np.testing.assert_array_equal(found.pose(1).position, found.poses[1].position)
+    assert len(found.near(np.array([1.0, 0, 0]), 0.1).scores) == 0
