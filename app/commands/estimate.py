@@ -24,11 +24,11 @@ class Estimate:
     """Find where known objects lie, and the light, in images of them; no depth, no meshes."""
 
     observation: Path
-    """Folder with observation.json and its images; masks are needed unless it is a goal."""
+    """Folder with observation.json and its images; masks are needed unless there is a prior."""
     out: Path
     """state.json to write."""
     prior: Path | None = None
-    """For a goal: state.json or scene.json that tells how the objects lie now."""
+    """state.json or scene.json: of a goal, how the objects lie now; else the frame before, or what was predicted."""
     goal: bool = False
     """A goal image: one view without masks, in which the objects may be anywhere and the light another."""
     seed: int = 0
@@ -51,14 +51,14 @@ class Estimate:
 
         rng = np.random.default_rng(check_seed(self.seed))
         self._check_places()
-        if self.goal != (self.prior is not None):
-            allowed = "given: how the objects lie now" if self.goal else "given with --goal only"
-            raise InvalidInput("--prior", self.prior or "missing", allowed)
+        if self.goal and self.prior is None:
+            raise InvalidInput("--prior", "missing", "given: how the objects lie now")
         observation = read_observation(self.observation)
         prior = None if self.prior is None else read_estimated(self.prior).state
         models = load_models(self.data_dir, observation.names)
         start = time.perf_counter()
-        estimate = _last(steps_of("goal" if self.goal else "first", models, observation, prior, rng))
+        mode = "goal" if self.goal else "first" if prior is None else "next"
+        estimate = _last(steps_of(mode, models, observation, prior, rng))
         seconds = round(time.perf_counter() - start, 2)
         write_estimated(self.out, estimate)
         if not self.json:

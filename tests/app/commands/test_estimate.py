@@ -83,6 +83,14 @@ def test_an_untrusted_goal_is_written_and_told_clearly(scene, data_dir, tmp_path
     assert not read_estimated(out).trusted
 
 
+def test_a_later_frame_begins_where_the_last_one_ended(scene, data_dir, tmp_path):
+    write_observation(scene, replace(read_observation(scene), masks=None))
+    Estimate(scene, tmp_path / "next.json", prior=scene / "truth.json", data_dir=data_dir, json=True).run()
+    estimate, truth = read_estimated(tmp_path / "next.json"), read_scene(scene / "truth.json").state
+    assert np.abs(estimate.state.poses.position - truth.poses.position).max() < 0.005
+    np.testing.assert_array_equal(estimate.state.light.direction, truth.light.direction)  # held
+
+
 def test_mistakes_are_told_before_the_work_begins(scene, data_dir, tmp_path, untried):
     def refused(kind, words, **changes):
         with pytest.raises(kind, match=words):
@@ -96,7 +104,6 @@ def test_mistakes_are_told_before_the_work_begins(scene, data_dir, tmp_path, unt
     refused(InvalidInput, "another file than the observation", out=scene / OBSERVATION_FILE)
     refused(CorruptFile, "no folder with an observation.json", observation=tmp_path)
     refused(InvalidInput, "--prior is missing, but it must be given", goal=True)
-    refused(InvalidInput, "with --goal only", prior=scene / "truth.json")
     refused(CorruptFile, "No such file", goal=True, prior=tmp_path / "nothing.json")
     refused(InvalidInput, "seed", seed=-1)
     write_observation(tmp_path / "spoons", replace(read_observation(scene), names=("spoon",)))
