@@ -25,8 +25,7 @@ from osfcore.poses import Pose
 
 AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
 _LIGHTS = 40  # over the whole sphere, to begin with
-_ROUNDS = 2  # of objects and light in turn
-_KEPT = 3  # of the scenes found under them
+_KEPT_ROUGH, _KEPT = 8, 3  # of the scenes found under them, for another round, and for one on finer images
 _PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, sightings for the second
 
 
@@ -47,7 +46,7 @@ def assembled(
 
 def count_of_scenes(objects: int) -> int:
     """How many steps it takes."""
-    return 1 + len(hemisphere(_LIGHTS)) + _KEPT + objects * (objects - 1) // 2 + 1
+    return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
 
 
 class _Assembly:
@@ -58,16 +57,15 @@ class _Assembly:
         empty = start
         for n in range(len(self._sightings)):
             empty = with_pose(empty, n, AWAY)
-        found = []
-        for guess in (start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))):
-            found.append(self._alternated(guess, self._rough))
-            found.sort(key=lambda pair: pair[1])
-            yield found[0]
-        finer = []
-        for guess, _ in found[:_KEPT]:
-            finer.append(self._alternated(guess, self._coarse))
-            yield min(finer, key=lambda pair: pair[1])
-        guess, loss = min(finer, key=lambda pair: pair[1])
+        scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
+        for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
+            found: list[tuple[Guess, float]] = []
+            for guess in scenes[:kept]:
+                found.append(self._alternated(guess, views))
+                found.sort(key=lambda pair: pair[1])
+                yield found[0]
+            scenes = [guess for guess, _ in found]
+        guess, loss = found[0]
         for pair in combinations(range(len(self._sightings)), 2):
             guess, loss = self._replaced(guess, loss, pair)
             yield guess, loss
@@ -75,10 +73,9 @@ class _Assembly:
 
     def _alternated(self, guess: Guess, views: Views) -> tuple[Guess, float]:
         """In turn each object at its best sighting, and the light."""
-        for _ in range(_ROUNDS):
-            for n, found in enumerate(self._sightings):
-                guess, _ = self._placed(guess, n, found, views)
-            guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
+        for n, found in enumerate(self._sightings):
+            guess, _ = self._placed(guess, n, found, views)
+        guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
         return guess, self._loss(guess, views)
 
     def _replaced(self, guess: Guess, loss: float, pair: tuple[int, int]) -> tuple[Guess, float]:

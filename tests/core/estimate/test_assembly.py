@@ -54,7 +54,7 @@ def test_one_that_stands_in_anothers_place_is_moved(models, truth, views, empty)
 def test_losses_fall_within_each_part_and_the_count_is_known(models, truth, views, empty):
     steps = list(assembled(models, *views, empty, sightings_at(truth, (0.03, 0, 0), (0, 0, 0))))
     assert len(steps) == count_of_scenes(2)
-    rough = [loss for _, loss in steps[:-5]]
+    rough = [loss for _, loss in steps[:8]]  # the lights to begin with are more than these
     assert np.all(np.diff(rough) <= 0)
 
 
