@@ -19,7 +19,7 @@ from osfcore.estimate.lamp import elsewhere, find_light
 from osfcore.estimate.models import Models
 from osfcore.estimate.moves import lying_there, shoved, shoved_together
 from osfcore.estimate.polish import Descent, polish
-from osfcore.estimate.rivals import challenged, pose_losses, with_pose
+from osfcore.estimate.rivals import challenged, pose_losses, turned, with_pose
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import POSE, Guess
 from osfcore.estimate.trust import gather, judged, object_residuals
@@ -44,6 +44,7 @@ class TrackEffort:
         generations: of that search.
         shift: its spread [m].
         turn: its spread about the vertical [rad]; a quarter of it about other axes.
+        turned_within: loss of an object turned about the vertical, over its own, up to which it is looked at closely.
         reach: how far around an object's expected place images are looked at [m].
     """
 
@@ -58,6 +59,7 @@ class TrackEffort:
     shift: float = 0.01
     turn: float = 0.2
     reach: float = 0.03
+    turned_within: float = 4.0
 
 
 def estimate_next(
@@ -93,6 +95,7 @@ class _Track:
         self._models, self._rng, self._effort = models, rng, effort
         self._guess = Guess.of(expected, observation.pusher)
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
+        self._fine = views_of(observation, FINE_SIDE, samples=2)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._push = _push(expected.pusher, observation.pusher)
@@ -108,11 +111,13 @@ class _Track:
         if misfit.any():
             at = yield from self._descend(at, misfit, self._coarse, 1)
             misfit, _ = self._misfits(at.guess)
+        searched = misfit
         for look in (self._search, self._recover):
             if misfit.any():
                 at = yield from look(at, misfit)
                 at = yield from self._settle(at, misfit)
                 misfit, _ = self._misfits(at.guess)
+        at = yield from self._turn_round(at, searched & ~misfit)
         at = yield from self._descend(at, np.ones_like(misfit), self._middle, 1)
         yield self._finish(at)
 
@@ -199,6 +204,19 @@ class _Track:
                 self._models, self._middle, self._middle, at, int(n), lying_there(self._models, at.guess, int(n))
             )
             yield self._step("together", f"{at.guess.names[n]}: lying in another way", at)
+        return at
+
+    def _turn_round(self, at: Descent, moved: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """What was found anew may be found half a turn off: the labels of cans tell at full resolution only."""
+        for n in np.flatnonzero(moved):
+            others = turned(self._models, at.guess, int(n))
+            own = around(self._middle, self._models, at.guess, int(n))
+            tried = Pose.joined(at.guess.state().poses[int(n)][None], others)
+            here, *there = pose_losses(self._models, own, at.guess, int(n), tried)
+            if min(there) > self._effort.turned_within * here:
+                continue
+            at, self._rivals[int(n)] = challenged(self._models, self._middle, self._fine, at, int(n), others)
+            yield self._step("together", f"{at.guess.names[n]}: the other way round", at)
         return at
 
     def _finish(self, at: Descent) -> EstimateStep:
