@@ -20,7 +20,7 @@ from osfcore.estimate.rivals import pose_losses, with_pose
 from osfcore.estimate.sliding import Sightings
 from osfcore.estimate.tangent import Guess
 from osfcore.estimate.views import Views
-from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.estimate.whole import loss_of
 from osfcore.poses import Pose
 
 AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
@@ -76,7 +76,7 @@ class _Assembly:
         for n, found in enumerate(self._sightings):
             guess, _ = self._placed(guess, n, found, views)
         guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
-        return guess, self._loss(guess, views)
+        return guess, loss_of(self._models, views, guess)
 
     def _replaced(self, guess: Guess, loss: float, pair: tuple[int, int]) -> tuple[Guess, float]:
         """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
@@ -107,7 +107,7 @@ class _Assembly:
 
     def _placed(self, guess: Guess, n: int, found: Sightings, views: Views) -> tuple[Guess, float]:
         """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
-        own, losses = self._loss(guess, views), self._losses(guess, n, found, views)
+        own, losses = loss_of(self._models, views, guess), self._losses(guess, n, found, views)
         if losses.min(initial=np.inf) >= own:
             return guess, own
         return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
@@ -116,6 +116,3 @@ class _Assembly:
         if not len(found.scores):
             return np.zeros(0)
         return pose_losses(self._models, views, guess, n, found.poses)
-
-    def _loss(self, guess: Guess, views: Views) -> float:
-        return float(whole_loss(residuals(self._models, views, guess.moved(np.zeros((1, guess.size)))))[0])

@@ -12,7 +12,7 @@ from osfcore.estimate.polish import Descent, polish
 from osfcore.estimate.resting import about_z
 from osfcore.estimate.tangent import Guess
 from osfcore.estimate.views import Views, around
-from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.estimate.whole import loss_of, residuals, whole_loss
 from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
@@ -50,12 +50,12 @@ def challenged(
     if not refined:
         return at, np.inf
     own = around(coarse, models, at.guess, number)
-    ends = [_loss(models, own, descent.guess, number) for descent in refined]
+    ends = [loss_of(models, own, descent.guess) for descent in refined]
     rival = refined[int(np.argmin(ends))]
-    if min(ends) < _CLOSE * _loss(models, own, at.guess, number):
+    if min(ends) < _CLOSE * loss_of(models, own, at.guess):
         rival = _refined(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
     own = around(fine, models, at.guess, number)
-    here, there = (_loss(models, own, guess, number) for guess in (at.guess, rival.guess))
+    here, there = (loss_of(models, own, guess) for guess in (at.guess, rival.guess))
     angle = rotation_angle(rival.guess.quaternions[number], at.guess.quaternions[number])
     ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
     return (replace(rival, losses=at.losses) if there < here else at), float(ratio)
@@ -86,10 +86,6 @@ def with_pose(guess: Guess, number: int, pose: Pose) -> Guess:
 
 def _pose(guess: Guess, number: int) -> Pose:
     return Pose(guess.positions[number], guess.quaternions[number])
-
-
-def _loss(models: Models, views: Views, guess: Guess, number: int) -> float:
-    return float(pose_losses(models, views, guess, number, _pose(guess, number)[None])[0])
 
 
 def pose_losses(models: Models, views: Views, guess: Guess, number: int, poses: Pose) -> Float[np.ndarray, "K"]:

@@ -24,7 +24,7 @@ from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import POSE, Guess
 from osfcore.estimate.trust import gather, judged, object_residuals
 from osfcore.estimate.views import FINE_SIDE, Views, around, views_of
-from osfcore.estimate.whole import residuals, whole_loss
+from osfcore.estimate.whole import loss_of, residuals, whole_loss
 from osfcore.poses import Pose
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
@@ -107,7 +107,7 @@ class _Track:
         misfit, lamp = self._misfits(at.guess)
         if lamp:
             at = yield from self._search_light(at)
-            misfit, lamp = self._misfits(at.guess)
+            misfit, _ = self._misfits(at.guess)
         if misfit.any():
             at = yield from self._descend(at, misfit, self._coarse, 1)
             misfit, _ = self._misfits(at.guess)
@@ -132,15 +132,11 @@ class _Track:
         if elsewhere(self._models, self._rough, at.guess) > self._effort.lamp_hint:
             return at  # objects that moved are no reason to search on
         guess = replace(at.guess, light=find_light(self._models, self._rough, self._coarse, at.guess))
-        here, there = (self._loss(one) for one in (at.guess, guess))
+        here, there = (loss_of(self._models, self._coarse, one) for one in (at.guess, guess))
         if there < self._effort.lamp_gain * here:
             at = replace(at, guess=guess)
         yield self._step("light", "Shading and shadows", at)
         return at
-
-    def _loss(self, guess: Guess) -> float:
-        batch = guess.moved(np.zeros((1, guess.size)))
-        return float(whole_loss(residuals(self._models, self._coarse, batch))[0])
 
     def _descend(
         self, at: Descent, moving: Bool[np.ndarray, "N"], views: Views, sweeps: int

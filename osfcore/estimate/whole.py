@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from osfcore.estimate.models import Models
+from osfcore.estimate.tangent import Guess
 from osfcore.estimate.views import Views
 from osfcore.render.scene_renderer import SceneBatch
 
@@ -22,3 +23,8 @@ def whole_loss(errors: Float32[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B
     """Mean over all numbers of Huber's loss. Deviation from paper eq. 6: it is the square for small errors only."""
     size = np.abs(errors.reshape(len(errors), -1))
     return np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER)).mean(axis=1, dtype=float)
+
+
+def loss_of(models: Models, views: Views, guess: Guess) -> float:
+    """Loss of one scene."""
+    return float(whole_loss(residuals(models, views, guess.moved(np.zeros((1, guess.size)))))[0])
