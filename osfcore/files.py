@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -45,6 +47,29 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         CannotWrite: if the disk refuses.
     """
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+@contextlib.contextmanager
+def folder_at_once(out: Path) -> Iterator[Path]:
+    """A folder beside `out` to fill, which takes that name (an empty folder's too) only when everything is there.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise CannotWrite(out, error.strerror or str(error)) from error
+    try:
+        yield partial
+        try:
+            partial.chmod(0o755)  # temporary folders are private
+            partial.rename(out)
+        except OSError as error:
+            raise CannotWrite(out, error.strerror or str(error)) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def read_json(path: Path, parse: Callable[[object], T]) -> T:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import lzma
-import shutil
 import stat
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -14,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
+from osfcore.files import folder_at_once
 
 MAX_BYTES = 2 << 30
 MAX_FILES = 20_000
@@ -172,22 +171,10 @@ def _wanted(
 
 
 def _write(archive: Path, file: zipfile.ZipFile, wanted: Mapping[PurePosixPath, zipfile.ZipInfo], out: Path) -> None:
-    """Write the files into a folder beside `out`, which takes its name only when everything is there."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise CannotWrite(out, error.strerror or str(error)) from error
-    try:
+    """Write the files, all or none."""
+    with folder_at_once(out) as partial:
         for path, info in wanted.items():
             _extract(archive, file, info, partial / path, out)
-        try:
-            partial.chmod(0o755)  # temporary folders are private
-            partial.rename(out)  # replaces an empty folder
-        except OSError as error:
-            raise CannotWrite(out, error.strerror or str(error)) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _extract(archive: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, out: Path) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from osfcore.errors import CannotWrite, InvalidInput
-from osfcore.files import write_json
+from osfcore.errors import InvalidInput
+from osfcore.files import folder_at_once, write_json
 from osfcore.objects.library import AssetLibrary
 from osfcore.observationfile import write_observation
 from osfcore.scene import (
@@ -100,18 +98,7 @@ def _names(config: CollectObservation, library: AssetLibrary, known: Collection[
 
 
 def _write(out: Path, observation: Observation, truth: dict[str, object]) -> None:
-    """Write into a folder beside `out`, which takes its name only when everything is there."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise CannotWrite(out, error.strerror or str(error)) from error
-    try:
+    """Truth and observation, all or nothing."""
+    with folder_at_once(out) as partial:
         write_json(partial / TRUTH_FILE, truth)
         write_observation(partial, observation)
-        partial.chmod(0o755)  # temporary folders are private
-        partial.rename(out)  # replaces an empty folder
-    except OSError as error:
-        raise CannotWrite(out, error.strerror or str(error)) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

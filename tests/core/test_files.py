@@ -9,6 +9,7 @@ from osfcore.files import (
     MAX_JSON_BYTES,
     as_mapping,
     entry_of,
+    folder_at_once,
     is_text,
     list_of,
     read_json,
@@ -103,3 +104,17 @@ def test_whatever_a_png_raises_becomes_one_sentence(error):
         raise error
     with pytest.raises(CorruptFile, match="16 bits"), reading_png(Path("a.png"), "it is damaged"):
         raise CorruptFile("a.png", "16 bits")
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    out = tmp_path / "new" / "folder"
+    with folder_at_once(out) as partial:
+        (partial / "a").write_text("1")
+        assert not out.exists()
+    assert (out / "a").read_text() == "1"
+    with pytest.raises(ZeroDivisionError), folder_at_once(tmp_path / "other") as partial:
+        (partial / "a").write_text(str(1 / 0))
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    with pytest.raises(CannotWrite), folder_at_once(out):
+        pass  # it is not empty
+    assert [path.name for path in out.parent.iterdir()] == ["folder"]

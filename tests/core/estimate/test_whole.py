@@ -4,7 +4,8 @@ from hypothesis import strategies as st
 from scipy.special import huber
 
 from osfcore.estimate.views import Views
-from osfcore.estimate.whole import HUBER, residuals, whole_loss
+from osfcore.estimate.whole import HUBER, loss_of, residuals, whole_loss
+from osfcore.scene import default_cameras
 from tests.core.estimate.scenes import guess_of, own_views
 from tests.core.render.scenes import state, view
 
@@ -38,3 +39,12 @@ def test_residuals_are_rendered_minus_observed(plain):
     darker = Views(views.cameras, views.images - np.float32(0.25), None, None, views.quality)
     errors = residuals(plain, darker, guess.moved(np.zeros((1, guess.size))))
     np.testing.assert_allclose(errors, 0.25, atol=1e-6)
+
+
+def test_the_loss_of_one_scene_is_that_of_a_batch_of_one(models, truth):
+    guess = guess_of(truth)
+    seen = own_views(models, guess, default_cameras(32)[:1])
+    moved = guess.changed(np.array([0.01] * 12 + [0.0, 0.0]))
+    assert loss_of(models, seen, guess) == 0
+    batch = moved.moved(np.zeros((1, moved.size)))
+    assert loss_of(models, seen, moved) == whole_loss(residuals(models, seen, batch))[0] > 0
