@@ -195,7 +195,7 @@ class _First:
         """Put other orientations of each object into the scene and let the whole images decide."""
         for n, found in enumerate(starts):
             others = Pose.joined(Pose(found.positions, found.quaternions), turned(self._models, at.guess, n))
-            at, self._rivals[n] = challenged(self._models, self._middle, self._fine, at, n, others)
+            at, self._rivals[n] = challenged(self._models, self._coarse, self._middle, self._fine, at, n, others)
             yield self._polishing(f"{self._names[n]}: the other way round", at)
         return at
 

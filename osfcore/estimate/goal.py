@@ -167,7 +167,7 @@ class _Goal:
         for n, name in enumerate(self._names):
             beside = sightings[n].near(at.guess.positions[n], _BESIDE_M)
             others = Pose.joined(turned(self._models, at.guess, n), beside.poses)
-            at, self._rivals[n] = challenged(self._models, self._fine, self._fine, at, n, others)
+            at, self._rivals[n] = challenged(self._models, self._middle, self._fine, self._fine, at, n, others)
             yield self._polishing(f"{name}: the other way round", at)
         at = replace(at, dampings=Descent.at(at.guess).dampings)
         sweeps = self._effort.free_iterations

@@ -16,8 +16,9 @@ from osfcore.estimate.whole import loss_of, residuals, whole_loss
 from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
-_TRIED = 3  # rivals that are refined
-_ITERATIONS, _FINE_ITERATIONS = 3, 2
+_SIFTED = 64  # rivals that are ranked again in coarse images
+_TRIED, _KEPT = 8, 2  # of these, so many that differ are refined, and of them so many further
+_ITERATIONS, _FINE_ITERATIONS = 2, 2
 _CLOSE = 1.5  # a rival's loss, over that of the pose, up to which it is refined on fine images
 _SAME_RAD = np.deg2rad(12.0)
 
@@ -32,24 +33,30 @@ def turned(models: Models, guess: Guess, number: int) -> Pose:
 
 
 def challenged(
-    models: Models, coarse: Views, fine: Views, at: Descent, number: int, others: Pose
+    models: Models, rough: Views, coarse: Views, fine: Views, at: Descent, number: int, others: Pose
 ) -> tuple[Descent, float]:
     """The better of a descent's pose of one object and its best rival, and by which factor the loser's loss is larger.
 
     Args:
         models: fields.
-        coarse: images in which rivals are tried and refined.
+        rough: images in which rivals are ranked.
+        coarse: images in which the first of them are ranked again and refined.
         fine: images in which the best of them is compared.
         at: the scene so far.
         number: of the object.
         others: poses that it might have instead, a batch.
     """
-    order = np.argsort(pose_losses(models, around(coarse, models, at.guess, number), at.guess, number, others))
-    far = [k for k in order if rotation_angle(others.quaternion[k], at.guess.quaternions[number]) > _SAME_RAD]
-    refined = [_refined(models, coarse, at, number, others[k], _ITERATIONS) for k in _distinct(far, others)]
-    if not refined:
+    same = rotation_angle(others.quaternion, at.guess.quaternions[number]) <= _SAME_RAD
+    far = others[~same]
+    if not len(far.position):
         return at, np.inf
+    own = around(rough, models, at.guess, number)
+    far = far[np.argsort(pose_losses(models, own, at.guess, number, far))[:_SIFTED]]
     own = around(coarse, models, at.guess, number)
+    far = far[np.argsort(pose_losses(models, own, at.guess, number, far))]
+    tried = [_refined(models, coarse, at, number, far[k], _ITERATIONS) for k in _distinct(far)]
+    best = sorted(tried, key=lambda descent: loss_of(models, own, descent.guess))[:_KEPT]
+    refined = [_refined(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in best]
     ends = [loss_of(models, own, descent.guess) for descent in refined]
     rival = refined[int(np.argmin(ends))]
     if min(ends) < _CLOSE * loss_of(models, own, at.guess):
@@ -67,9 +74,10 @@ def _refined(models: Models, views: Views, at: Descent, number: int, pose: Pose,
     return list(polish(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
-def _distinct(order: list[int], poses: Pose) -> list[int]:
+def _distinct(poses: Pose) -> list[int]:
+    """Numbers of the first few poses that differ from each other."""
     kept: list[int] = []
-    for k in order:
+    for k in range(len(poses.position)):
         if all(rotation_angle(poses.quaternion[k], poses.quaternion[o]) > _SAME_RAD * 1.5 for o in kept):
             kept.append(k)
         if len(kept) == _TRIED:

@@ -1,8 +1,10 @@
 """Later frames: no masks, started from the last estimate or from a predicted state (paper section 4.2, last part).
 
 Most objects stand where they were expected; the residual of each tells. What fits is only polished. What does not is
-searched by CMA with a small spread around where it was expected, and then polished. The light is held unless the bare
-table stops looking as it should and another light mends that: then somebody moved the lamp.
+looked for where a push may have taken it; if that does not lead to a fit, by CMA with a small spread around there; and
+if that does not either, lying in any other way. Fine images at last tell what is half a turn off, for the labels of
+cans are too small for coarse ones. The light is held unless the bare table stops looking as it should and another light
+mends that: then somebody moved the lamp.
 """
 
 from __future__ import annotations
@@ -17,13 +19,13 @@ from osfcore.errors import InvalidInput
 from osfcore.estimate.evolution import Evolution
 from osfcore.estimate.lamp import elsewhere, find_light
 from osfcore.estimate.models import Models
-from osfcore.estimate.moves import lying_there, shoved, shoved_together
+from osfcore.estimate.moves import lying_there, rolled_in_place, shoved, shoved_together
 from osfcore.estimate.polish import Descent, polish
 from osfcore.estimate.rivals import challenged, pose_losses, turned, with_pose
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import POSE, Guess
 from osfcore.estimate.trust import gather, judged, object_residuals
-from osfcore.estimate.views import FINE_SIDE, Views, around, views_of
+from osfcore.estimate.views import FINE_SIDE, Views, around, near, views_of
 from osfcore.estimate.whole import loss_of, residuals, whole_loss
 from osfcore.poses import Pose
 from osfcore.progress import Progress
@@ -36,30 +38,37 @@ class TrackEffort:
 
     Attributes:
         fits_below: residual of an object [radiance] up to which it counts as standing where it was expected.
+        fits_finely_below: the same in images of full resolution, in which what is right fits better.
         lamp_above: residual of everything but the objects [radiance] from which the lamp may have moved.
         lamp_hint: share of the loss to which the best of few other lights must lower it before more are tried.
         lamp_gain: share of the loss to which another light must lower it to be believed.
-        sweeps: of the descent over objects that moved.
+        rough_sweeps: of the descent over objects that moved, first in images of a quarter of the resolution,
+        sweeps: then of half of it,
+        fine_sweeps: then of that with more rays a pixel,
+        closest_sweeps: and of full resolution for those that do not fit in it.
         population: candidates per generation of the search for objects that do not fit.
         generations: of that search.
         shift: its spread [m].
         turn: its spread about the vertical [rad]; a quarter of it about other axes.
-        turned_within: loss of an object turned about the vertical, over its own, up to which it is looked at closely.
+        turned_within: loss of an object turned about the vertical, over its own, up to which it may be turned wrongly.
         reach: how far around an object's expected place images are looked at [m].
     """
 
-    fits_below: float = 0.045
+    fits_below: float = 0.05
+    fits_finely_below: float = 0.04
     lamp_above: float = 0.03
     lamp_hint: float = 0.9
     lamp_gain: float = 0.7
-    sweeps: int = 8
-    fine_sweeps: int = 4
+    rough_sweeps: int = 4
+    sweeps: int = 5
+    fine_sweeps: int = 2
+    closest_sweeps: int = 3
     population: int = 14
     generations: int = 5
     shift: float = 0.01
     turn: float = 0.2
+    turned_within: float = 1.8
     reach: float = 0.03
-    turned_within: float = 4.0
 
 
 def estimate_next(
@@ -96,6 +105,7 @@ class _Track:
         self._guess = Guess.of(expected, observation.pusher)
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._fine = views_of(observation, FINE_SIDE, samples=2)
+        self._sharp = views_of(observation, FINE_SIDE)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._push = _push(expected.pusher, observation.pusher)
@@ -111,13 +121,17 @@ class _Track:
         if misfit.any():
             at = yield from self._descend(at, misfit, self._coarse, 1)
             misfit, _ = self._misfits(at.guess)
-        searched = misfit
-        for look in (self._search, self._recover):
+        moved = misfit
+        for look in (self._shove, self._search):
             if misfit.any():
                 at = yield from look(at, misfit)
                 at = yield from self._settle(at, misfit)
                 misfit, _ = self._misfits(at.guess)
-        at = yield from self._turn_round(at, searched & ~misfit)
+        if misfit.any():
+            at = yield from self._recover(at, misfit)
+            at = yield from self._descend(at, misfit, self._middle, self._effort.fine_sweeps)
+            misfit, _ = self._misfits(at.guess)
+        at = yield from self._look_closely(at, moved & ~misfit)
         at = yield from self._descend(at, np.ones_like(misfit), self._middle, 1)
         yield self._finish(at)
 
@@ -149,22 +163,32 @@ class _Track:
 
     def _settle(self, at: Descent, moving: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
         """Descend as far as it goes; coarse images lead near, finer ones decide."""
-        for views, sweeps in ((self._coarse, self._effort.sweeps), (self._middle, self._effort.fine_sweeps)):
+        e = self._effort
+        for views, sweeps in (
+            (self._rough, e.rough_sweeps), (self._coarse, e.sweeps), (self._middle, e.fine_sweeps),
+        ):  # fmt: skip
             at = replace(at, dampings=Descent.at(at.guess).dampings)  # old ones tell nothing of where it is now
             at = yield from self._descend(at, moving, views, sweeps)
         return at
 
-    def _search(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
-        """How the push moved them together, then each by CMA."""
+    def _shove(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """How the push moved them together, then each alone."""
         numbers = np.flatnonzero(misfit).tolist()
         at = replace(at, guess=self._together(at.guess, numbers))
         for n in numbers:
             views = around(self._coarse, self._models, at.guess, n, reach=self._effort.reach)
             tried = shoved(self._models, at.guess, n, self._push)
             losses = pose_losses(self._models, views, at.guess, n, tried)
-            k = int(losses.argmin())
-            guess = with_pose(at.guess, n, tried[k])
-            at = yield from self._search_one(replace(at, guess=guess), n, views)
+            at = replace(at, guess=with_pose(at.guess, n, tried[int(losses.argmin())]))
+            at = replace(at, guess=self._rolled(at.guess, n))
+            yield self._step("together", f"{at.guess.names[n]}: where it was pushed", at)
+        return at
+
+    def _search(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """Each by CMA."""
+        for n in np.flatnonzero(misfit).tolist():
+            views = around(self._coarse, self._models, at.guess, n, reach=self._effort.reach)
+            at = yield from self._search_one(at, n, views)
         return at
 
     def _together(self, guess: Guess, numbers: list[int]) -> Guess:
@@ -173,6 +197,12 @@ class _Track:
         batch = replace(guess.moved(np.zeros((len(positions), guess.size))), positions=positions)
         best = int(whole_loss(residuals(self._models, self._coarse, batch)).argmin())
         return replace(guess, positions=positions[best])
+
+    def _rolled(self, guess: Guess, n: int) -> Guess:
+        """The guess with an object rolled farther or less far in place; how far it slipped nobody knows."""
+        tried = rolled_in_place(self._models, guess, n, self._push)
+        losses = pose_losses(self._models, around(self._middle, self._models, guess, n), guess, n, tried)
+        return with_pose(guess, n, tried[int(losses.argmin())])
 
     def _search_one(self, at: Descent, n: int, views: Views) -> Iterator[EstimateStep]:  # returns the Descent
         """CMA over one object's pose."""
@@ -195,31 +225,41 @@ class _Track:
 
     def _recover(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
         """What still does not fit may lie in quite another way where it is."""
-        for n in np.flatnonzero(misfit):
-            at, self._rivals[int(n)] = challenged(
-                self._models, self._middle, self._middle, at, int(n), lying_there(self._models, at.guess, int(n))
-            )
+        for n in np.flatnonzero(misfit).tolist():
+            at = self._challenge(at, n, lying_there(self._models, at.guess, n))
             yield self._step("together", f"{at.guess.names[n]}: lying in another way", at)
         return at
 
-    def _turn_round(self, at: Descent, moved: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
-        """What was found anew may be found half a turn off: the labels of cans tell at full resolution only."""
-        for n in np.flatnonzero(moved):
-            others = turned(self._models, at.guess, int(n))
-            own = around(self._middle, self._models, at.guess, int(n))
-            tried = Pose.joined(at.guess.state().poses[int(n)][None], others)
-            here, *there = pose_losses(self._models, own, at.guess, int(n), tried)
-            if min(there) > self._effort.turned_within * here:
-                continue
-            at, self._rivals[int(n)] = challenged(self._models, self._middle, self._fine, at, int(n), others)
-            yield self._step("together", f"{at.guess.names[n]}: the other way round", at)
+    def _look_closely(self, at: Descent, moved: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
+        """What does not fit in fine images is refined in them; then it may still be turned wrongly."""
+        bad = self._fine_misfits(at.guess)
+        if bad.any():
+            at = yield from self._descend(at, bad, self._fine, self._effort.closest_sweeps)
+            bad &= self._fine_misfits(at.guess)
+        for n in np.flatnonzero(bad | moved).tolist():
+            others = turned(self._models, at.guess, n)
+            if bad[n] or self._looks_turned(at.guess, n, others):
+                others = Pose.joined(others, lying_there(self._models, at.guess, n))
+                at = self._challenge(at, n, others)
+                yield self._step("together", f"{at.guess.names[n]}: the other way round", at)
+        return at
+
+    def _fine_misfits(self, guess: Guess) -> Bool[np.ndarray, "N"]:
+        return object_residuals(gather(self._models, self._fine, guess)) > self._effort.fits_finely_below
+
+    def _looks_turned(self, guess: Guess, n: int, others: Pose) -> bool:
+        """Whether an object looks no better than turned about the vertical: what is right looks far better."""
+        tried = Pose.joined(guess.state().poses[n][None], others)
+        here, *there = pose_losses(self._models, near(self._sharp, self._models, guess, n), guess, n, tried)
+        return min(there) < self._effort.turned_within * here
+
+    def _challenge(self, at: Descent, n: int, others: Pose) -> Descent:
+        at, self._rivals[n] = challenged(self._models, self._coarse, self._sharp, self._fine, at, n, others)
         return at
 
     def _finish(self, at: Descent) -> EstimateStep:
-        evidence = gather(self._models, self._middle, at.guess)
-        estimate = judged(
-            at.guess, at.normals, evidence, self._rivals, light_held=True, most_residual=self._effort.fits_below
-        )
+        evidence = gather(self._models, self._fine, at.guess)
+        estimate = judged(at.guess, at.normals, evidence, self._rivals, light_held=True)
         self._done = self._total - 1
         step = self._step("done", "Done" if estimate.trusted else estimate.reason, at)
         return replace(step, estimate=estimate)

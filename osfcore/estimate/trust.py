@@ -20,7 +20,7 @@ from osfcore.render.scene_renderer import SceneBatch
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
-MOST_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
+_MOST_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
 _LEAST_OVERLAP = 0.75  # of silhouette and mask
 _FEW_PX = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
@@ -72,7 +72,7 @@ def object_residuals(evidence: Evidence) -> Float[np.ndarray, "N"]:
 
 
 def judged(guess: Guess, normals: Sequence[np.ndarray], evidence: Evidence, rivals: dict[int, float],
-           *, light_held: bool = False, most_residual: float = MOST_RESIDUAL) -> EstimatedState:  # fmt: skip
+           *, light_held: bool = False) -> EstimatedState:  # fmt: skip
     """A guess with its uncertainty and the doubts about it.
 
     Args:
@@ -81,7 +81,6 @@ def judged(guess: Guess, normals: Sequence[np.ndarray], evidence: Evidence, riva
         evidence: how well it explains the images.
         rivals: by object, the best loss of a different orientation over the loss of the one chosen.
         light_held: the light was given, not searched.
-        most_residual: of an object [radiance] that is not doubted; coarser images differ by more.
     """
     count = len(guess.names)
     deviations = _deviations(normals, evidence.spread, count)
@@ -89,9 +88,7 @@ def judged(guess: Guess, normals: Sequence[np.ndarray], evidence: Evidence, riva
     position = _POSITION_FACTOR * np.sqrt((poses[:, 0] ** 2).mean(axis=1))
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
     light = 0.0 if light_held else _LIGHT_FACTOR * float(np.sqrt((deviations[-LIGHT:] ** 2).mean()))
-    doubts = tuple(
-        _doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf), most_residual) for n in range(count)
-    )
+    doubts = tuple(_doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf)) for n in range(count))
     doubtful = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
     return EstimatedState(guess.state(), position, rotation, light, doubts, "; ".join(doubtful))
 
@@ -108,15 +105,14 @@ def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.
     return np.concatenate(found)
 
 
-def _doubt(evidence: Evidence, n: int, position_std: float, rotation_std: float, rival: float,
-           most_residual: float) -> str:  # fmt: skip
+def _doubt(evidence: Evidence, n: int, position_std: float, rotation_std: float, rival: float) -> str:
     pixels = evidence.pixels[:, n]
     if pixels.sum() < _FEW_PX:
         return "it is hardly visible"
     residual = object_residuals(evidence)[n]
     if evidence.overlap[n] < _LEAST_OVERLAP:
         return f"its silhouette covers its masks by {evidence.overlap[n]:.0%} only"
-    if residual > most_residual:
+    if residual > _MOST_RESIDUAL:
         return f"its images differ from what was rendered by {residual:.2f}"
     if rival < _CLOSE_CALL:
         return "another orientation explains the images as well"

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.estimate.moves import lying_there, shoved, shoved_together
+from osfcore.estimate.moves import lying_there, rolled_in_place, shoved, shoved_together
 from osfcore.poses import rotate, rotation_angle
 from tests.core.estimate.scenes import guess_of, lying, scene
 
@@ -42,7 +42,7 @@ def test_a_ball_rolls_without_slipping(plain):
     before = guess.positions[0] + rotate(guess.quaternions[0], centre)
     after = rolled.position + rotate(rolled.quaternion, centre)
     # They began where they had already been shoved along the push.
-    path = np.linalg.norm(after - before + PUSH, axis=1)
+    path = (after - before + PUSH) @ PUSH / np.linalg.norm(PUSH)  # what is beside is no farther along
     np.testing.assert_allclose(rotation_angle(rolled.quaternion, guess.quaternions[0]), path / before[2], rtol=1e-9)
     up = np.array([0.0, 0.0, 1.0])
     turned = rotate(slid.quaternion, rotate(guess.quaternions[0] * [1, -1, -1, -1], up))
@@ -68,3 +68,30 @@ def test_every_way_of_lying_is_on_the_table_in_the_same_place(models, truth):
     here = guess.positions[1] + rotate(guess.quaternions[1], resting.centre)
     np.testing.assert_allclose(centres[:, :2], np.tile(here[:2], (len(centres), 1)), atol=1e-12)
     np.testing.assert_allclose(centres[:, 2], resting.heights, atol=1e-12)
+
+
+def test_a_ball_may_have_rolled_any_way(plain):
+    guess = guess_of(scene({"ball": lying(plain, "ball", 0, 0.0, 0.0)}))
+    tried, centre = rolled_in_place(plain, guess, 0, PUSH), plain.resting("ball").centre
+    assert len(tried.position) == 18
+    here = guess.positions[0] + rotate(guess.quaternions[0], centre)
+    np.testing.assert_allclose(tried.position + rotate(tried.quaternion, centre), np.tile(here, (18, 1)), atol=1e-12)
+    along = PUSH / np.linalg.norm(PUSH)
+    across = np.array([-along[1], along[0], 0.0])
+    axis = rotate(guess.quaternions[0] * [1, -1, -1, -1], across)  # of the roll, in the ball
+    np.testing.assert_allclose(rotate(tried.quaternion, axis), np.tile(across, (18, 1)), atol=1e-12)
+    np.testing.assert_allclose(tried.quaternion[0], guess.quaternions[0])
+
+
+def test_what_stands_on_a_face_does_not_roll(models, truth):
+    """Nothing of it is tried but sliding, and its own pose."""
+    guess = guess_of(truth)
+    assert len(shoved(models, guess, 0, PUSH).position) == 27
+    alone = rolled_in_place(models, guess, 0, PUSH)
+    np.testing.assert_allclose(alone.position, guess.positions[:1], atol=1e-12)
+    np.testing.assert_allclose(alone.quaternion, guess.quaternions[:1], atol=1e-12)
+
+
+def test_nothing_rolls_without_a_push(plain):
+    guess = guess_of(scene({"ball": lying(plain, "ball", 0, 0.0, 0.0)}))
+    assert len(rolled_in_place(plain, guess, 0, np.zeros(3)).position) == 1

@@ -50,7 +50,7 @@ def test_turned_in_place_about_the_vertical(models, truth, flips):
 
 def test_a_flipped_object_is_turned_round(models, truth, coarse, fine, flips):
     wrong = flipped(guess_of(truth), flips)
-    at, ratio = challenged(models, coarse, fine, Descent.at(wrong), 0, turned(models, wrong, 0))
+    at, ratio = challenged(models, coarse, coarse, fine, Descent.at(wrong), 0, turned(models, wrong, 0))
     shift, turn, _ = apart(at.guess, truth)
     assert shift[0] < 0.002
     assert turn[0] < np.deg2rad(2)
@@ -60,7 +60,7 @@ def test_a_flipped_object_is_turned_round(models, truth, coarse, fine, flips):
 
 def test_the_right_pose_stays(models, truth, coarse, fine, flips):
     before = Descent.at(guess_of(truth))
-    at, ratio = challenged(models, coarse, fine, before, 0, flips)
+    at, ratio = challenged(models, coarse, coarse, fine, before, 0, flips)
     assert at is before
     assert ratio > 1.5
 
@@ -71,12 +71,12 @@ def test_a_ball_of_one_colour_is_a_close_call(plain):
     views = own_views(plain, guess, default_cameras(48)[:2])
     noise = np.random.default_rng(0).normal(0, 0.02, views.images.shape).astype(np.float32)
     views = replace(views, images=views.images + noise)
-    _, ratio = challenged(plain, views, views, Descent.at(guess), 0, turned(plain, guess, 0))
+    _, ratio = challenged(plain, views, views, views, Descent.at(guess), 0, turned(plain, guess, 0))
     assert 1 <= ratio < 1.05
 
 
 def test_poses_much_like_its_own_are_no_rivals(models, truth, coarse, fine):
     before = Descent.at(guess_of(truth))
-    at, ratio = challenged(models, coarse, fine, before, 0, truth.poses[[0, 0]])
+    at, ratio = challenged(models, coarse, coarse, fine, before, 0, truth.poses[[0, 0]])
     assert at is before
     assert ratio == np.inf

@@ -68,6 +68,15 @@ def test_what_fell_over_is_found_lying_in_another_way(models, truth):
     assert np.rad2deg(turn).max() < 4
 
 
+def test_what_was_taken_the_wrong_way_round_is_turned(models, truth):
+    wrong = pushed(truth, (0.0, 0.0), np.pi)
+    estimate = followed(models, truth, wrong)[-1].estimate
+    shift, turn, _ = apart(estimate.state, truth)
+    assert shift.max() < 0.002
+    assert np.rad2deg(turn).max() < 2
+    assert estimate.trusted
+
+
 def test_objects_that_moved_are_no_moved_lamp(models, truth):
     steps = followed(models, pushed(truth, (0.05, 0.05), 0.5), truth)
     assert "light" not in [step.stage for step in steps]
