@@ -25,7 +25,8 @@ PLANAR = (0, 1, 5)  # among an object's numbers: x, y and the turn about the ver
 ANYHOW = tuple(range(POSE))
 _SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of the differences
 _MOST_SHIFT_M, _MOST_TURN_RAD, _MOST_LIGHT_RAD = 0.03, 0.4, 0.3
-_DAMPINGS = np.array([0.1, 1.0, 10.0, 100.0])  # tried at once, times the last good one
+_DAMPINGS = np.array([0.1, 0.1, 0.1, 1.0, 10.0, 100.0])  # tried at once, times the last good one
+_STRETCHES = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)  # far from the solution, texture makes Gauss-Newton's steps too short
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e6
 _SETTLED = 0.97  # share of its loss before a sweep from which more sweeps promise little
 _TINY = 1e-9
@@ -102,9 +103,9 @@ def _block(models: Models, views: Views, at: Descent, block: int, numbers: Int[n
     gradient = slopes @ (weights * errors[0])
     dampings = at.dampings[block] * _DAMPINGS
     steps = np.zeros((len(dampings), guess.size))
-    for row, damping in enumerate(dampings):
+    for row, (damping, stretch) in enumerate(zip(dampings, _STRETCHES, strict=True)):
         damped = normal + np.diag(damping * np.diag(normal) + _TINY)
-        steps[row, numbers] = -np.linalg.solve(damped, gradient)
+        steps[row, numbers] = -stretch * np.linalg.solve(damped, gradient)
     steps /= np.maximum(1, (np.abs(steps) / _most(len(guess.names))).max(axis=1, keepdims=True))
     here = float(whole_loss(errors[:1])[0])
     losses = whole_loss(residuals(models, views, guess.moved(steps)))

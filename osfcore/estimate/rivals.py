@@ -17,8 +17,8 @@ from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
 _SIFTED = 64  # rivals that are ranked again in coarse images
-_TRIED, _KEPT = 8, 2  # of these, so many that differ are refined, and of them so many further
-_ITERATIONS, _FINE_ITERATIONS = 2, 2
+_TRIED = 8  # of these, so many that differ are refined
+_ITERATIONS, _FINE_ITERATIONS = 2, 3
 _CLOSE = 1.5  # a rival's loss, over that of the pose, up to which it is refined on fine images
 _SAME_RAD = np.deg2rad(12.0)
 
@@ -39,8 +39,8 @@ def challenged(
 
     Args:
         models: fields.
-        rough: images in which rivals are ranked.
-        coarse: images in which the first of them are ranked again and refined.
+        rough: images in which rivals are ranked, and refined at first, since they lead there from afar.
+        coarse: images in which the first of them are ranked again and refined further.
         fine: images in which the best of them is compared.
         at: the scene so far.
         number: of the object.
@@ -54,11 +54,10 @@ def challenged(
     far = far[np.argsort(pose_losses(models, own, at.guess, number, far))[:_SIFTED]]
     own = around(coarse, models, at.guess, number)
     far = far[np.argsort(pose_losses(models, own, at.guess, number, far))]
-    tried = [_refined(models, coarse, at, number, far[k], _ITERATIONS) for k in _distinct(far)]
-    best = sorted(tried, key=lambda descent: loss_of(models, own, descent.guess))[:_KEPT]
-    refined = [_refined(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in best]
-    ends = [loss_of(models, own, descent.guess) for descent in refined]
-    rival = refined[int(np.argmin(ends))]
+    tried = [_refined(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct(far)]
+    tried = [_refined(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in tried]
+    ends = [loss_of(models, own, descent.guess) for descent in tried]
+    rival = tried[int(np.argmin(ends))]
     if min(ends) < _CLOSE * loss_of(models, own, at.guess):
         rival = _refined(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
     own = around(fine, models, at.guess, number)

@@ -24,7 +24,7 @@ from osfcore.estimate.polish import Descent, polish
 from osfcore.estimate.rivals import challenged, pose_losses, turned, with_pose
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import POSE, Guess
-from osfcore.estimate.trust import gather, judged, object_residuals
+from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
 from osfcore.estimate.views import FINE_SIDE, Views, around, near, views_of
 from osfcore.estimate.whole import loss_of, residuals, whole_loss
 from osfcore.poses import Pose
@@ -37,7 +37,8 @@ class TrackEffort:
     """How a later frame is estimated.
 
     Attributes:
-        fits_below: residual of an object [radiance] up to which it counts as standing where it was expected.
+        stays_below: residual of an object [radiance] up to which it counts as standing where it was expected.
+        fits_below: the same for one that was found anew: then it may fit better.
         fits_finely_below: the same in images of full resolution, in which what is right fits better.
         lamp_above: residual of everything but the objects [radiance] from which the lamp may have moved.
         lamp_hint: share of the loss to which the best of few other lights must lower it before more are tried.
@@ -54,13 +55,14 @@ class TrackEffort:
         reach: how far around an object's expected place images are looked at [m].
     """
 
-    fits_below: float = 0.05
+    stays_below: float = 0.05
+    fits_below: float = 0.045
     fits_finely_below: float = 0.04
     lamp_above: float = 0.03
     lamp_hint: float = 0.9
     lamp_gain: float = 0.7
-    rough_sweeps: int = 4
-    sweeps: int = 5
+    rough_sweeps: int = 3
+    sweeps: int = 4
     fine_sweeps: int = 2
     closest_sweeps: int = 3
     population: int = 14
@@ -110,36 +112,40 @@ class _Track:
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._push = _push(expected.pusher, observation.pusher)
         self._rivals: dict[int, float] = {}
+        self._looked: tuple[Guess, Evidence] | None = None
         self._done, self._total = 0, 4
 
     def steps(self) -> Iterator[EstimateStep]:
         at = Descent.at(self._guess)
-        misfit, lamp = self._misfits(at.guess)
-        if lamp:
+        before = self._at_half(at.guess)
+        if before.surroundings > self._effort.lamp_above:
             at = yield from self._search_light(at)
-            misfit, _ = self._misfits(at.guess)
+            before = self._at_half(at.guess)
+        misfit = object_residuals(before) > self._effort.stays_below
         if misfit.any():
             at = yield from self._descend(at, misfit, self._coarse, 1)
-            misfit, _ = self._misfits(at.guess)
+            misfit &= self._misfits(at.guess)
         moved = misfit
         for look in (self._shove, self._search):
             if misfit.any():
                 at = yield from look(at, misfit)
                 at = yield from self._settle(at, misfit)
-                misfit, _ = self._misfits(at.guess)
+                misfit = misfit & self._misfits(at.guess)
         if misfit.any():
             at = yield from self._recover(at, misfit)
             at = yield from self._descend(at, misfit, self._middle, self._effort.fine_sweeps)
-            misfit, _ = self._misfits(at.guess)
+            misfit = misfit & self._misfits(at.guess)
+        at = yield from self._descend(at, ~moved, self._middle, 1)
         at = yield from self._look_closely(at, moved & ~misfit)
-        at = yield from self._descend(at, np.ones_like(misfit), self._middle, 1)
         yield self._finish(at)
 
-    def _misfits(self, guess: Guess) -> tuple[Bool[np.ndarray, "N"], bool]:
-        """Which objects do not stand where they are guessed, and whether the light is not where it is guessed."""
-        evidence = gather(self._models, self._middle, guess)
-        misfit = object_residuals(evidence) > self._effort.fits_below
-        return misfit, evidence.surroundings > self._effort.lamp_above
+    def _at_half(self, guess: Guess) -> Evidence:
+        """How well a guess explains the images of half resolution."""
+        return gather(self._models, self._middle, guess)
+
+    def _misfits(self, guess: Guess) -> Bool[np.ndarray, "N"]:
+        """Which objects do not fit where they were found."""
+        return object_residuals(self._at_half(guess)) > self._effort.fits_below
 
     def _search_light(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
         """The light that explains the images with the objects as expected, if it does so far better than the last."""
@@ -224,9 +230,10 @@ class _Track:
         return replace(at, guess=best)
 
     def _recover(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
-        """What still does not fit may lie in quite another way where it is."""
+        """What still does not fit may lie in quite another way, where it is or where it was before searches led astray."""
         for n in np.flatnonzero(misfit).tolist():
-            at = self._challenge(at, n, lying_there(self._models, at.guess, n))
+            others = Pose.joined(*(lying_there(self._models, guess, n) for guess in (at.guess, self._guess)))
+            at = self._challenge(at, n, others)
             yield self._step("together", f"{at.guess.names[n]}: lying in another way", at)
         return at
 
@@ -245,7 +252,13 @@ class _Track:
         return at
 
     def _fine_misfits(self, guess: Guess) -> Bool[np.ndarray, "N"]:
-        return object_residuals(gather(self._models, self._fine, guess)) > self._effort.fits_finely_below
+        return object_residuals(self._closely(guess)) > self._effort.fits_finely_below
+
+    def _closely(self, guess: Guess) -> Evidence:
+        """How well a guess explains the fine images; they are rendered again only for another guess."""
+        if self._looked is None or self._looked[0] is not guess:
+            self._looked = guess, gather(self._models, self._fine, guess)
+        return self._looked[1]
 
     def _looks_turned(self, guess: Guess, n: int, others: Pose) -> bool:
         """Whether an object looks no better than turned about the vertical: what is right looks far better."""
@@ -258,8 +271,7 @@ class _Track:
         return at
 
     def _finish(self, at: Descent) -> EstimateStep:
-        evidence = gather(self._models, self._fine, at.guess)
-        estimate = judged(at.guess, at.normals, evidence, self._rivals, light_held=True)
+        estimate = judged(at.guess, at.normals, self._closely(at.guess), self._rivals, light_held=True)
         self._done = self._total - 1
         step = self._step("done", "Done" if estimate.trusted else estimate.reason, at)
         return replace(step, estimate=estimate)
