@@ -230,7 +230,7 @@ class _Track:
         return replace(at, guess=best)
 
     def _recover(self, at: Descent, misfit: Bool[np.ndarray, "N"]) -> Iterator[EstimateStep]:  # returns the Descent
-        """What still does not fit may lie in quite another way, where it is or where it was before searches led astray."""
+        """What still does not fit may lie in another way, where it is or where it was before searches led astray."""
         for n in np.flatnonzero(misfit).tolist():
             others = Pose.joined(*(lying_there(self._models, guess, n) for guess in (at.guess, self._guess)))
             at = self._challenge(at, n, others)
