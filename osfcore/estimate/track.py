@@ -207,6 +207,8 @@ class _Track:
     def _rolled(self, guess: Guess, n: int) -> Guess:
         """The guess with an object rolled farther or less far in place; how far it slipped nobody knows."""
         tried = rolled_in_place(self._models, guess, n, self._push)
+        if len(tried.position) == 1:
+            return guess
         losses = pose_losses(self._models, around(self._middle, self._models, guess, n), guess, n, tried)
         return with_pose(guess, n, tried[int(losses.argmin())])
 
