@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from osfcore.estimate.lamp import find_light, hemisphere
 from osfcore.estimate.models import Models
@@ -42,6 +42,26 @@ def assembled(
         sightings: of each object.
     """
     yield from _Assembly(models, rough, coarse, sightings).scenes(start)
+
+
+def reseated(models: Models, views: Views, guess: Guess, sightings: list[Sightings]) -> Guess:
+    """In turn each object at the sighting that explains whole images better than its pose does; the same if none."""
+    for n, found in enumerate(sightings):
+        guess, _ = placed(models, views, guess, n, found)
+    return guess
+
+
+def placed(models: Models, views: Views, guess: Guess, n: int, found: Sightings) -> tuple[Guess, float]:
+    """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
+    own, losses = loss_of(models, views, guess), _losses(models, views, guess, n, found)
+    if losses.min(initial=np.inf) >= own:
+        return guess, own
+    return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
+
+
+def _losses(models: Models, views: Views, guess: Guess, n: int, found: Sightings) -> Float[np.ndarray, "K"]:
+    """Loss of the guess with an object at each of its sightings."""
+    return pose_losses(models, views, guess, n, found.poses) if len(found.scores) else np.zeros(0)
 
 
 def count_of_scenes(objects: int) -> int:
@@ -74,7 +94,7 @@ class _Assembly:
     def _alternated(self, guess: Guess, views: Views) -> tuple[Guess, float]:
         """In turn each object at its best sighting, and the light."""
         for n, found in enumerate(self._sightings):
-            guess, _ = self._placed(guess, n, found, views)
+            guess, _ = placed(self._models, views, guess, n, found)
         guess = replace(guess, light=find_light(self._models, self._rough, views, guess))
         return guess, loss_of(self._models, views, guess)
 
@@ -87,7 +107,7 @@ class _Assembly:
         others = others.chosen(self._ranking(without, second)[:_SECOND])
         for k in self._best_places(without, first):
             one = with_pose(without, first, self._sightings[first].pose(k))
-            both, loss = self._placed(one, second, others, self._coarse)
+            both, loss = placed(self._models, self._coarse, one, second, others)
             if loss < least:
                 best, least = both, loss
         return best, least
@@ -103,16 +123,4 @@ class _Assembly:
         return kept
 
     def _ranking(self, guess: Guess, n: int) -> Int[np.ndarray, "K"]:
-        return np.argsort(self._losses(guess, n, self._sightings[n], self._coarse))
-
-    def _placed(self, guess: Guess, n: int, found: Sightings, views: Views) -> tuple[Guess, float]:
-        """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
-        own, losses = loss_of(self._models, views, guess), self._losses(guess, n, found, views)
-        if losses.min(initial=np.inf) >= own:
-            return guess, own
-        return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
-
-    def _losses(self, guess: Guess, n: int, found: Sightings, views: Views) -> np.ndarray:
-        if not len(found.scores):
-            return np.zeros(0)
-        return pose_losses(self._models, views, guess, n, found.poses)
+        return np.argsort(_losses(self._models, self._coarse, guess, n, self._sightings[n]))

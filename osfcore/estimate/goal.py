@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes
+from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes, reseated
 from osfcore.estimate.models import Models
 from osfcore.estimate.polish import PLANAR, Descent, polish
 from osfcore.estimate.resting import about_z
@@ -43,7 +43,8 @@ class GoalEffort:
         side: of the image that templates are slid over [px].
         planar_iterations: of the descent while objects stay flat on the table.
         free_iterations: of the descent over whole poses.
-        widen_above: residual of an object [radiance] above which every way it can lie is tried.
+        widen_above: residual of an object [radiance] above which every way it can lie is tried, as it is if the object
+            is doubted for another reason.
     """
 
     side: int = FINE_SIDE
@@ -94,15 +95,15 @@ class _Goal:
         self._rivals: dict[int, float] = {}
 
     def steps(self) -> Iterator[EstimateStep]:
-        count = len(self._names)
         sightings: list[Sightings] = []
         for n, name in enumerate(self._names):
             sightings.append(self._as_it_lies(n))
             yield self._step("orientations", f"{name}: where it may be", self._first(sightings), sightings)
         guess = yield from self._assemble(self._first(sightings), sightings)
         at = yield from self._descend(guess, sightings)
+        at = yield from self._reseat(at, sightings)
         evidence = gather(self._models, self._fine, at.guess)
-        bad = [n for n in range(count) if object_residuals(evidence)[n] > self._effort.widen_above]
+        bad = self._doubtful(at, evidence)
         if bad:
             self._total += len(bad) + self._pass
             for n in bad:
@@ -110,9 +111,16 @@ class _Goal:
                 yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
             other = yield from self._assemble(at.guess, sightings)
             other = yield from self._descend(other, sightings)
+            other = yield from self._reseat(other, sightings)
             at = other if other.losses[-1] < at.losses[-1] else at
             evidence = gather(self._models, self._fine, at.guess)
         yield self._finish(at, evidence)
+
+    def _doubtful(self, at: Descent, evidence: Evidence) -> list[int]:
+        """Objects that do not fit, or hide where nothing tells how they lie."""
+        doubts = judged(at.guess, at.normals, evidence, {}).doubts
+        fits = object_residuals(evidence) <= self._effort.widen_above
+        return [n for n, doubt in enumerate(doubts) if doubt or not fits[n]]
 
     def _as_it_lies(self, n: int) -> Sightings:
         pose = self._prior.pose(self._names[n])
@@ -158,6 +166,19 @@ class _Goal:
             if rotation_angle(before, at.guess.quaternions).max() < _TURNED_RAD:
                 break  # nobody was turned round, so nobody else looks different now
         return at
+
+    def _reseat(self, at: Descent, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the Descent
+        """Objects where they were seen instead, if that explains the image better.
+
+        A descent may have drawn an object into another's shadow or behind it, where it explains little and spoils
+        little, while the place where it stands goes unexplained.
+        """
+        guess = reseated(self._models, self._coarse, at.guess, sightings)
+        if guess is at.guess:
+            return at
+        yield self._step("together", "Objects seen elsewhere", guess, sightings)
+        other = yield from self._descend(guess, sightings)
+        return other if other.losses[-1] < at.losses[-1] else at
 
     def _challenge(self, at: Descent, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the Descent
         """Turn each object round where that explains the image better, and descend over whole poses.

@@ -17,7 +17,8 @@ from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
 _SIFTED = 64  # rivals that are ranked again in coarse images
-_TRIED = 8  # of these, so many that differ are refined
+_TRIED = 8  # of these, so many that differ are refined in rough images
+_KEPT = 3  # of these, so many are refined in coarse ones
 _ITERATIONS, _FINE_ITERATIONS = 2, 3
 _CLOSE = 1.5  # a rival's loss, over that of the pose, up to which it is refined on fine images
 _SAME_RAD = np.deg2rad(12.0)
@@ -40,7 +41,7 @@ def challenged(
     Args:
         models: fields.
         rough: images in which rivals are ranked, and refined at first, since they lead there from afar.
-        coarse: images in which the first of them are ranked again and refined further.
+        coarse: images in which the first of them are ranked again, and the best refined further.
         fine: images in which the best of them is compared.
         at: the scene so far.
         number: of the object.
@@ -55,6 +56,7 @@ def challenged(
     own = around(coarse, models, at.guess, number)
     far = far[np.argsort(pose_losses(models, own, at.guess, number, far))]
     tried = [_refined(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct(far)]
+    tried = sorted(tried, key=lambda one: loss_of(models, own, one.guess))[:_KEPT]
     tried = [_refined(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in tried]
     ends = [loss_of(models, own, descent.guess) for descent in tried]
     rival = tried[int(np.argmin(ends))]

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes
+from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes, reseated
 from osfcore.estimate.rivals import with_pose
 from osfcore.estimate.sliding import Sightings
 from osfcore.estimate.views import views_of
@@ -63,3 +63,15 @@ def test_what_nobody_sighted_stays_away(models, truth, views, empty):
     guess, _ = list(assembled(models, *views, empty, sightings))[-1]
     np.testing.assert_array_equal(guess.positions[1], AWAY.position)
     np.testing.assert_array_equal(guess.positions[0], truth.poses.position[0])
+
+
+def test_what_hides_is_put_where_it_was_seen(models, truth, views):
+    sightings = sightings_at(truth, (0.07, 0, 0), (0, 0, 0))
+    hidden = with_pose(guess_of(truth), 1, AWAY)
+    guess = reseated(models, views[1], hidden, sightings)
+    assert apart(guess, guess_of(truth))[0].max() == 0
+
+
+def test_what_explains_the_image_stays(models, truth, views):
+    right = guess_of(truth)
+    assert reseated(models, views[1], right, sightings_at(truth, (0.07, 0, 0), (0.01, 0, 0))) is right
