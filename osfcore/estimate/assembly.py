@@ -7,7 +7,7 @@ replaced two at a time: one that stands in another's place keeps it from there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import combinations
 
@@ -69,14 +69,19 @@ def count_of_scenes(objects: int) -> int:
     return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
 
 
+def without(guess: Guess, numbers: Iterable[int]) -> Guess:
+    """The guess with some objects away."""
+    for n in numbers:
+        guess = with_pose(guess, n, AWAY)
+    return guess
+
+
 class _Assembly:
     def __init__(self, models: Models, rough: Views, coarse: Views, sightings: list[Sightings]) -> None:
         self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, sightings
 
     def scenes(self, start: Guess) -> Iterator[tuple[Guess, float]]:
-        empty = start
-        for n in range(len(self._sightings)):
-            empty = with_pose(empty, n, AWAY)
+        empty = without(start, range(len(self._sightings)))
         scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
         for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
             found: list[tuple[Guess, float]] = []
@@ -102,11 +107,11 @@ class _Assembly:
         """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
         best, least = guess, loss
         first, second = pair
-        without = with_pose(with_pose(guess, first, AWAY), second, AWAY)
+        rest = without(guess, pair)
         others = self._sightings[second]
-        others = others.chosen(self._ranking(without, second)[:_SECOND])
-        for k in self._best_places(without, first):
-            one = with_pose(without, first, self._sightings[first].pose(k))
+        others = others.chosen(self._ranking(rest, second)[:_SECOND])
+        for k in self._best_places(rest, first):
+            one = with_pose(rest, first, self._sightings[first].pose(k))
             both, loss = placed(self._models, self._coarse, one, second, others)
             if loss < least:
                 best, least = both, loss

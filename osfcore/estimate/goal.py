@@ -11,17 +11,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
-from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes, reseated
+from osfcore.estimate.assembly import AWAY, assembled, count_of_scenes, reseated, without
 from osfcore.estimate.models import Models
 from osfcore.estimate.polish import PLANAR, Descent, polish
 from osfcore.estimate.resting import about_z
 from osfcore.estimate.rivals import challenged, turned
-from osfcore.estimate.sliding import Sightings, sight
+from osfcore.estimate.sliding import Sightings, scene_errors, sight
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import Guess
-from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
+from osfcore.estimate.trust import gather, judged, object_residuals
 from osfcore.estimate.views import FINE_SIDE, views_of
 from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 from osfcore.progress import Progress
@@ -33,6 +34,7 @@ _FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the tab
 _SHOWN = 24
 _CHALLENGES, _TURNED_RAD = 2, np.deg2rad(30.0)
 _BESIDE_M = 0.04
+_ROUNDS = 2  # in which doubted objects are put where they were seen: the first may stand in the second's place
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +91,8 @@ class _Goal:
         self._slide = views_of(observation, effort.side)
         self._done = 0
         challenge = len(self._names) + effort.free_iterations
-        self._pass = (count_of_scenes(len(self._names)) + effort.planar_iterations + _FINE_PLANAR
-                      + _CHALLENGES * challenge)  # fmt: skip
+        self._descent = effort.planar_iterations + _FINE_PLANAR + _CHALLENGES * challenge
+        self._pass = count_of_scenes(len(self._names)) + self._descent
         self._total = len(self._names) + self._pass + 1
         self._rivals: dict[int, float] = {}
 
@@ -102,37 +104,72 @@ class _Goal:
         guess = yield from self._assemble(self._first(sightings), sightings)
         at = yield from self._descend(guess, sightings)
         at = yield from self._reseat(at, sightings)
-        evidence = gather(self._models, self._fine, at.guess)
-        bad = self._doubtful(at, evidence)
+        bad = self._doubtful(at)
         if bad:
-            self._total += len(bad) + self._pass
-            for n in bad:
-                sightings[n] = self._any_way(n)
-                yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
-            other = yield from self._assemble(at.guess, sightings)
-            other = yield from self._descend(other, sightings)
-            other = yield from self._reseat(other, sightings)
-            at = other if other.losses[-1] < at.losses[-1] else at
-            evidence = gather(self._models, self._fine, at.guess)
-        yield self._finish(at, evidence)
+            at = yield from self._look_again(at, bad, sightings)
+            bad = self._doubtful(at)
+        if bad:
+            at = yield from self._widen(at, bad, sightings)
+        yield self._finish(at)
 
-    def _doubtful(self, at: Descent, evidence: Evidence) -> list[int]:
+    def _doubtful(self, at: Descent) -> list[int]:
         """Objects that do not fit, or hide where nothing tells how they lie."""
+        evidence = gather(self._models, self._fine, at.guess)
         doubts = judged(at.guess, at.normals, evidence, {}).doubts
         fits = object_residuals(evidence) <= self._effort.widen_above
         return [n for n, doubt in enumerate(doubts) if doubt or not fits[n]]
 
-    def _as_it_lies(self, n: int) -> Sightings:
+    def _look_again(
+        self, at: Descent, bad: list[int], sightings: list[Sightings]
+    ) -> Iterator[EstimateStep]:  # returns the Descent
+        """Doubted objects are looked for in what the others leave unexplained, now that the light is known.
+
+        Then a bare table is not free to be any grey, and what is as grey as a shadow stands out.
+        """
+        self._total += len(bad) + 1 + self._descent
+        guess = without(at.guess, bad)
+        behind = scene_errors(self._models, self._slide, guess)
+        for n in bad:
+            sightings[n] = self._as_it_lies(n, behind)
+            yield self._step("orientations", f"{self._names[n]}: in what is unexplained", at.guess, sightings)
+        for _ in range(_ROUNDS):
+            guess = reseated(self._models, self._coarse, guess, sightings)
+        yield self._step("together", "Doubted objects seen elsewhere", guess, sightings)
+        return (yield from self._better(at, guess, sightings))
+
+    def _widen(
+        self, at: Descent, bad: list[int], sightings: list[Sightings]
+    ) -> Iterator[EstimateStep]:  # returns the Descent
+        """Doubted objects are looked for in every way they can lie."""
+        self._total += len(bad) + self._pass
+        behind = scene_errors(self._models, self._coarse, without(at.guess, bad))
+        for n in bad:
+            sightings[n] = self._any_way(n, behind)
+            yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
+        guess = yield from self._assemble(at.guess, sightings)
+        return (yield from self._better(at, guess, sightings))
+
+    def _better(
+        self, at: Descent, guess: Guess, sightings: list[Sightings]
+    ) -> Iterator[EstimateStep]:  # returns the Descent
+        """The descent from another guess, if it ends lower."""
+        other = yield from self._descend(guess, sightings)
+        other = yield from self._reseat(other, sightings)
+        return other if other.losses[-1] < at.losses[-1] else at
+
+    def _as_it_lies(self, n: int, behind: Float[np.ndarray, "h w"] | None = None) -> Sightings:
         pose = self._prior.pose(self._names[n])
         turns = about_z(np.arange(_YAWS) * 2 * np.pi / _YAWS)
         quaternions = quaternion_multiply(turns, pose.quaternion[None])
         heights = np.full(_YAWS, pose.position[2])
-        return sight(self._models, self._slide, self._names[n], quaternions, heights, most=_SIGHTINGS)
+        return sight(self._models, self._slide, self._names[n], quaternions, heights, most=_SIGHTINGS,
+                     behind=behind)  # fmt: skip
 
-    def _any_way(self, n: int) -> Sightings:
+    def _any_way(self, n: int, behind: Float[np.ndarray, "h w"]) -> Sightings:
         resting = self._models.resting(self._names[n])
         heights = resting.heights - rotate(resting.quaternions, resting.centre)[:, 2]
-        return sight(self._models, self._coarse, self._names[n], resting.quaternions, heights, most=2 * _SIGHTINGS)
+        return sight(self._models, self._coarse, self._names[n], resting.quaternions, heights, most=2 * _SIGHTINGS,
+                     behind=behind)  # fmt: skip
 
     def _first(self, sightings: list[Sightings]) -> Guess:
         """The best sighting of each object; those not seen, or not looked for yet, are away."""
@@ -176,6 +213,7 @@ class _Goal:
         guess = reseated(self._models, self._coarse, at.guess, sightings)
         if guess is at.guess:
             return at
+        self._total += 1 + self._descent
         yield self._step("together", "Objects seen elsewhere", guess, sightings)
         other = yield from self._descend(guess, sightings)
         return other if other.losses[-1] < at.losses[-1] else at
@@ -197,7 +235,8 @@ class _Goal:
             yield self._polishing("The last millimetres", at)
         return at
 
-    def _finish(self, at: Descent, evidence: Evidence) -> EstimateStep:
+    def _finish(self, at: Descent) -> EstimateStep:
+        evidence = gather(self._models, self._fine, at.guess)
         estimate = judged(at.guess, at.normals, evidence, self._rivals)
         self._done = self._total - 1
         step = self._polishing("Done" if estimate.trusted else estimate.reason, at)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from osfcore.estimate.models import QUALITY, Models
+from osfcore.estimate.tangent import Guess
 from osfcore.estimate.views import Views, window
 from osfcore.poses import Pose, rotate
 from osfcore.render.scene_renderer import SceneBatch
@@ -70,10 +71,28 @@ def table_errors(models: Models, views: Views) -> Float[np.ndarray, "h w"]:
     return np.minimum((errors**2).sum(axis=-1), _MOST_TABLE_ERROR**2)
 
 
+def scene_errors(models: Models, views: Views, guess: Guess) -> Float[np.ndarray, "h w"]:
+    """Squared error of the first view's pixels where a scene is thought to be known."""
+    rendered = models.together.render(guess.moved(np.zeros((1, guess.size))), views.cameras[:1], quality=QUALITY)
+    return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MOST_TABLE_ERROR**2)
+
+
 def sight(models: Models, views: Views, name: str, quaternions: Float[np.ndarray, "K 4"],
-          heights: Float[np.ndarray, "K"], *, most: int) -> Sightings:  # fmt: skip
-    """Look for an object in the first view, in given orientations and at given heights of its origin [m]."""
-    camera, image, table = views.cameras[0], views.images[0], table_errors(models, views)
+          heights: Float[np.ndarray, "K"], *, most: int, behind: Float[np.ndarray, "h w"] | None = None,
+          ) -> Sightings:  # fmt: skip
+    """Look for an object in the first view, in given orientations and at given heights of its origin [m].
+
+    Args:
+        models: fields.
+        views: what was observed.
+        name: of the object.
+        quaternions: of the orientations.
+        heights: for each of them.
+        most: how many sightings are kept.
+        behind: squared errors of the pixels without the object; `table_errors` by default.
+    """
+    camera, image = views.cameras[0], views.images[0]
+    table = table_errors(models, views) if behind is None else behind
     grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
     found = [_around(models, camera, image, table, name, quaternions, heights, (x, y)) for x in grid for y in grid]
     positions, turns, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
