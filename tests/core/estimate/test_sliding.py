@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimate.sliding import Sightings, sight, table_errors
+from osfcore.estimate.assembly import without
+from osfcore.estimate.sliding import Sightings, scene_errors, sight, table_errors
 from osfcore.estimate.views import views_of
 from osfcore.poses import rotate, rotation_angle
 from osfcore.scene import Camera, goal_camera
-from tests.core.estimate.scenes import BOTTLE, BOX, lying, observe, scene
+from tests.core.estimate.scenes import BOTTLE, BOX, guess_of, lying, observe, scene
 
 
 def image_of(models, state, side=48, camera=None):
@@ -56,6 +57,20 @@ def test_a_bare_table_has_no_errors_in_whatever_light(models):
     assert errors.max() > 0.01
     dim = replace(shadow, images=shadow.images * np.float32(0.8))
     np.testing.assert_allclose(table_errors(models, dim)[errors < 1e-4], 0, atol=2e-4)
+
+
+def test_what_a_known_scene_leaves_unexplained(models, truth):
+    views = image_of(models, truth, side=96)
+    names, guess = truth.names, guess_of(truth)
+    missing = names.index(BOX)
+    explained, unexplained = (scene_errors(models, views, g) for g in (guess, without(guess, [missing])))
+    assert explained.mean() < 0.3 * unexplained.mean()  # what is left are edges
+    quaternions = truth.poses.quaternion[[missing]]
+    heights = truth.poses.position[[missing], 2]
+    found = sight(models, views, BOX, quaternions, heights, most=20, behind=unexplained)
+    assert np.linalg.norm(found.positions[0] - truth.poses.position[missing]) < 0.02
+    nothing_left = sight(models, views, BOX, quaternions, heights, most=20, behind=explained)
+    assert nothing_left.scores.max() < 0.3 * found.scores[0]
 
 
 @pytest.mark.parametrize("target", [(0, -3.0, 3.0), (3.0, 0.5, 0.5), (0, -2.0, 0.0)])
