@@ -135,7 +135,8 @@ class _Goal:
         for _ in range(_ROUNDS):
             guess = reseated(self._models, self._coarse, guess, sightings)
         yield self._step("together", "Doubted objects seen elsewhere", guess, sightings)
-        return (yield from self._better(at, guess, sightings))
+        at = yield from self._better(at, guess, sightings)
+        return (yield from self._reseat(at, sightings))
 
     def _widen(
         self, at: Descent, bad: list[int], sightings: list[Sightings]
@@ -147,15 +148,19 @@ class _Goal:
             sightings[n] = self._any_way(n, behind)
             yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, sightings)
         guess = yield from self._assemble(at.guess, sightings)
-        return (yield from self._better(at, guess, sightings))
+        at = yield from self._better(at, guess, sightings)
+        return (yield from self._reseat(at, sightings))
 
     def _better(
         self, at: Descent, guess: Guess, sightings: list[Sightings]
     ) -> Iterator[EstimateStep]:  # returns the Descent
         """The descent from another guess, if it ends lower."""
+        rivals = dict(self._rivals)
         other = yield from self._descend(guess, sightings)
-        other = yield from self._reseat(other, sightings)
-        return other if other.losses[-1] < at.losses[-1] else at
+        if other.losses[-1] < at.losses[-1]:
+            return other
+        self._rivals = rivals
+        return at
 
     def _as_it_lies(self, n: int, behind: Float[np.ndarray, "h w"] | None = None) -> Sightings:
         pose = self._prior.pose(self._names[n])
@@ -215,8 +220,7 @@ class _Goal:
             return at
         self._total += 1 + self._descent
         yield self._step("together", "Objects seen elsewhere", guess, sightings)
-        other = yield from self._descend(guess, sightings)
-        return other if other.losses[-1] < at.losses[-1] else at
+        return (yield from self._better(at, guess, sightings))
 
     def _challenge(self, at: Descent, sightings: list[Sightings]) -> Iterator[EstimateStep]:  # returns the Descent
         """Turn each object round where that explains the image better, and descend over whole poses.
