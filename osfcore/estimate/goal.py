@@ -22,8 +22,9 @@ from osfcore.estimate.rivals import challenged, turned
 from osfcore.estimate.sliding import Sightings, scene_errors, sight
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import Guess
-from osfcore.estimate.trust import gather, judged, object_residuals
+from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
 from osfcore.estimate.views import FINE_SIDE, views_of
+from osfcore.estimated import EstimatedState
 from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
@@ -115,7 +116,7 @@ class _Goal:
     def _doubtful(self, at: Descent) -> list[int]:
         """Objects that do not fit, or hide where nothing tells how they lie."""
         evidence = gather(self._models, self._fine, at.guess)
-        doubts = judged(at.guess, at.normals, evidence, {}).doubts
+        doubts = self._judged(at, evidence, {}).doubts
         fits = object_residuals(evidence) <= self._effort.widen_above
         return [n for n, doubt in enumerate(doubts) if doubt or not fits[n]]
 
@@ -241,10 +242,16 @@ class _Goal:
 
     def _finish(self, at: Descent) -> EstimateStep:
         evidence = gather(self._models, self._fine, at.guess)
-        estimate = judged(at.guess, at.normals, evidence, self._rivals)
+        estimate = self._judged(at, evidence, self._rivals)
         self._done = self._total - 1
         step = self._polishing("Done" if estimate.trusted else estimate.reason, at)
         return replace(step, stage="done", estimate=estimate)
+
+    def _judged(self, at: Descent, evidence: Evidence, rivals: dict[int, float]) -> EstimatedState:
+        """One view hardly tells how far away an object is; that it stands on the table does."""
+        poses = at.guess.state().poses
+        lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
+        return judged(at.guess, at.normals, evidence, rivals, lowest=lowest)
 
     def _polishing(self, note: str, at: Descent) -> EstimateStep:
         return self._step("polish", note, at.guess, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))

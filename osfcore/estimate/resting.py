@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.poses import quaternion_exp, quaternion_multiply
+from osfcore.poses import Pose, quaternion_exp, quaternion_multiply
 
 _OPAQUE_G = 2.0  # density feature above which a corner counts as solid
 _DIRECTIONS = 3000
@@ -33,12 +33,18 @@ class Resting:
         heights: of the centre of mass above the table [m].
         centre: the centre of mass of a solid body of that shape, in the object's frame [m].
         radius: of the sphere around that centre that holds the object [m].
+        hull: vertices of the convex hull, in the object's frame [m].
     """
 
     quaternions: Float[np.ndarray, "K 4"]
     heights: Float[np.ndarray, "K"]
     centre: Float[np.ndarray, "3"]
     radius: float
+    hull: Float[np.ndarray, "H 3"]
+
+    def lowest(self, pose: Pose) -> float:
+        """Height of the lowest point of the object in a pose [m]."""
+        return float(pose.apply(self.hull)[:, 2].min())
 
 
 def resting_orientations(field: KiloOSF, *, yaws: int = _YAWS) -> Resting:
@@ -51,7 +57,7 @@ def resting_orientations(field: KiloOSF, *, yaws: int = _YAWS) -> Resting:
     turns = about_z(np.arange(yaws) * 2 * np.pi / yaws)
     quaternions = quaternion_multiply(turns[None], lying[:, None]).reshape(-1, 4)
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
-    return Resting(quaternions, np.repeat(heights[down], yaws), centre, radius)
+    return Resting(quaternions, np.repeat(heights[down], yaws), centre, radius, vertices)
 
 
 def sphere(count: int) -> Float[np.ndarray, "count 3"]:

@@ -25,6 +25,7 @@ _LEAST_OVERLAP = 0.75  # of silhouette and mask
 _FEW_PX = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
 _CLOSE_CALL = 1.05
+_MOST_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths were within -1 and 4 mm
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,7 +73,7 @@ def object_residuals(evidence: Evidence) -> Float[np.ndarray, "N"]:
 
 
 def judged(guess: Guess, normals: Sequence[np.ndarray], evidence: Evidence, rivals: dict[int, float],
-           *, light_held: bool = False) -> EstimatedState:  # fmt: skip
+           *, light_held: bool = False, lowest: Float[np.ndarray, "N"] | None = None) -> EstimatedState:  # fmt: skip
     """A guess with its uncertainty and the doubts about it.
 
     Args:
@@ -81,6 +82,7 @@ def judged(guess: Guess, normals: Sequence[np.ndarray], evidence: Evidence, riva
         evidence: how well it explains the images.
         rivals: by object, the best loss of a different orientation over the loss of the one chosen.
         light_held: the light was given, not searched.
+        lowest: height of each object's lowest point [m], if objects can only stand on the table.
     """
     count = len(guess.names)
     deviations = _deviations(normals, evidence.spread, count)
@@ -88,7 +90,11 @@ def judged(guess: Guess, normals: Sequence[np.ndarray], evidence: Evidence, riva
     position = _POSITION_FACTOR * np.sqrt((poses[:, 0] ** 2).mean(axis=1))
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
     light = 0.0 if light_held else _LIGHT_FACTOR * float(np.sqrt((deviations[-LIGHT:] ** 2).mean()))
-    doubts = tuple(_doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf)) for n in range(count))
+    heights = np.zeros(count) if lowest is None else lowest
+    doubts = tuple(
+        _doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf)) or _floating(heights[n])
+        for n in range(count)
+    )
     doubtful = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
     return EstimatedState(guess.state(), position, rotation, light, doubts, "; ".join(doubtful))
 
@@ -119,3 +125,9 @@ def _doubt(evidence: Evidence, n: int, position_std: float, rotation_std: float,
     if position_std > _MOST_POSITION_STD_M or rotation_std > _MOST_ROTATION_STD_RAD:
         return f"its pose is known to {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg only"
     return ""
+
+
+def _floating(height: float) -> str:
+    if abs(height) <= _MOST_HEIGHT_M:
+        return ""
+    return f"it would {'float above' if height > 0 else 'sink into'} the table by {1000 * abs(height):.0f} mm"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.estimate.resting import about_z, resting_orientations, sphere
-from osfcore.poses import rotate, rotation_angle
+from osfcore.poses import Pose, rotate, rotation_angle
 from tests.core.render.scenes import ball, block
 
 HALF = np.array([0.06, 0.045, 0.09])
@@ -71,6 +71,8 @@ def test_the_lowest_solid_corner_is_on_the_table():
     for quaternion, height in zip(resting.quaternions, resting.heights, strict=True):
         z = rotate(quaternion, points - resting.centre)[:, 2]
         assert z.min() + height == pytest.approx(0, abs=1e-6)
+        lifted = Pose(np.array([0.3, -0.2, height + 0.05]) - rotate(quaternion, resting.centre), quaternion)
+        assert resting.lowest(lifted) == pytest.approx(0.05, abs=1e-6)
 
 
 def test_real_objects_lie_in_a_few_ways(models):

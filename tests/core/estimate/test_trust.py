@@ -121,6 +121,13 @@ def test_each_doubt_is_told():
         assert estimate.reason == (f"object0: {words}" if words else "")
 
 
+def test_what_cannot_stand_there_is_doubted_where_that_matters():
+    words = {0.001: "", 0.02: "it would float above the table by 20 mm", -0.01: "it would sink into the table by 10 mm"}
+    for height, doubt in words.items():
+        assert judged(guess(), normals(), evidence_of(), {}, lowest=np.array([height])).doubts == (doubt,)
+    assert judged(guess(), normals(), evidence_of(), {}).trusted
+
+
 def test_all_doubts_make_the_reason():
     estimate = judged(guess(3), normals(3), evidence_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0})
     assert estimate.doubts[1] == ""
