@@ -22,7 +22,7 @@ from osfcore.estimate.rivals import challenged, turned
 from osfcore.estimate.sliding import Sightings, scene_errors, sight
 from osfcore.estimate.steps import EstimateStep, Stage
 from osfcore.estimate.tangent import Guess
-from osfcore.estimate.trust import Evidence, gather, judged, object_residuals
+from osfcore.estimate.trust import gather, judged
 from osfcore.estimate.views import FINE_SIDE, views_of
 from osfcore.estimated import EstimatedState
 from osfcore.poses import Pose, quaternion_multiply, rotate, rotation_angle
@@ -46,14 +46,13 @@ class GoalEffort:
         side: of the image that templates are slid over [px].
         planar_iterations: of the descent while objects stay flat on the table.
         free_iterations: of the descent over whole poses.
-        widen_above: residual of an object [radiance] above which every way it can lie is tried, as it is if the object
-            is doubted for another reason.
+        widen_all: look again for every object, and in every way it can lie, also where none is doubted.
     """
 
     side: int = FINE_SIDE
     planar_iterations: int = 5
     free_iterations: int = 8
-    widen_above: float = 0.045
+    widen_all: bool = False
 
 
 def estimate_goal(
@@ -115,10 +114,8 @@ class _Goal:
 
     def _doubtful(self, at: Descent) -> list[int]:
         """Objects that do not fit, or hide where nothing tells how they lie."""
-        evidence = gather(self._models, self._fine, at.guess)
-        doubts = self._judged(at, evidence, {}).doubts
-        fits = object_residuals(evidence) <= self._effort.widen_above
-        return [n for n, doubt in enumerate(doubts) if doubt or not fits[n]]
+        doubts = self._judged(at, {}).doubts
+        return [n for n, doubt in enumerate(doubts) if doubt or self._effort.widen_all]
 
     def _look_again(
         self, at: Descent, bad: list[int], sightings: list[Sightings]
@@ -241,15 +238,14 @@ class _Goal:
         return at
 
     def _finish(self, at: Descent) -> EstimateStep:
-        evidence = gather(self._models, self._fine, at.guess)
-        estimate = self._judged(at, evidence, self._rivals)
+        estimate = self._judged(at, self._rivals)
         self._done = self._total - 1
         step = self._polishing("Done" if estimate.trusted else estimate.reason, at)
         return replace(step, stage="done", estimate=estimate)
 
-    def _judged(self, at: Descent, evidence: Evidence, rivals: dict[int, float]) -> EstimatedState:
+    def _judged(self, at: Descent, rivals: dict[int, float]) -> EstimatedState:
         """One view hardly tells how far away an object is; that it stands on the table does."""
-        poses = at.guess.state().poses
+        evidence, poses = gather(self._models, self._fine, at.guess), at.guess.state().poses
         lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
         return judged(at.guess, at.normals, evidence, rivals, lowest=lowest)
 

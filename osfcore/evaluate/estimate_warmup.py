@@ -31,7 +31,7 @@ _FIRST = Effort(
 )
 # Thresholds of 0 make both search as they do where an object does not fit.
 _NEXT = TrackEffort(fits_below=0.0, lamp_above=0.0, sweeps=1, generations=1)
-_GOAL = GoalEffort(planar_iterations=1, free_iterations=1, widen_above=0.0)
+_GOAL = GoalEffort(planar_iterations=1, free_iterations=1, widen_all=True)
 
 
 def warm_models(

@@ -14,7 +14,7 @@ EFFORT = Effort(
     fine_iterations=1,
 )  # fmt: skip
 TRACK = TrackEffort(sweeps=1, population=4, generations=1)
-GOAL = GoalEffort(side=64, planar_iterations=1, free_iterations=1, widen_above=10.0)
+GOAL = GoalEffort(side=64, planar_iterations=1, free_iterations=1)
 
 
 def quick(out: Path, **settings: Any) -> EvaluateEstimate:
