@@ -104,7 +104,7 @@ def _check_field(path: Path) -> Report:
 
 
 def _check_pushes(path: Path) -> Report:
-    from osfcore.world.push_file import read_pushes
+    from osfcore.pushfile import read_pushes
 
     episodes = read_pushes(path)
     if not episodes:

@@ -15,13 +15,14 @@ import numpy as np
 from osfcore.errors import CannotWrite, InvalidInput, WorkerDied
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import rotation_angle
+from osfcore.pushfile import EpisodeFolder, PushEpisode, load_episode, save_episode
 from osfcore.scene import DEFAULT_IMAGE_SIDE, MAX_OBJECTS, SceneState, default_cameras
 from osfcore.world.policies import DirectedPolicy, PaperPolicy, PolicyName
-from osfcore.world.push_file import EpisodeFolder, PushEpisode, load_episode, save_episode
 from osfcore.world.tabletop import Renderer, SceneRequest, Tabletop
 
 MOVED_M = 1e-3
 MOVED_RAD = np.deg2rad(0.5)
+SUBSTATES = 4  # poses recorded within an action: dynamics learns from them what contact does in between
 _MAX_EPISODES, _MAX_STEPS = 1_000_000, 1000
 
 
@@ -210,10 +211,12 @@ def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> P
     world.arrange(seed)
     rng = np.random.default_rng((config.seed, index, 1))
     policy = PaperPolicy(rng) if config.policy == "paper" else DirectedPolicy(world.assets, rng)
-    states, contacts, actions, frames = [world.truth()], [], [], [_frame(world, config)]
+    states, contacts, actions, within = [world.truth()], [], [], []
+    frames = [_frame(world, config)]
     for _ in range(config.steps):
         actions.append(policy.action(states[-1]))
-        touched = world.act_contacts(actions[-1])
+        touched, poses = world.act_recorded(actions[-1], SUBSTATES)
+        within.append(poses)
         contacts.append([name in touched for name in world.names])
         states.append(world.truth())
         frames.append(_frame(world, config))
@@ -225,6 +228,8 @@ def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> P
         pusher=np.array([_pusher(s) for s in states]),
         actions=np.array(actions),
         contact=np.array(contacts, bool),
+        sub_positions=np.array([poses.position for poses in within]),
+        sub_quaternions=np.array([poses.quaternion for poses in within]),
         frames=np.concatenate(frames) if config.images else None,
     )
     save_episode(path, episode)

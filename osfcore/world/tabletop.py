@@ -155,13 +155,12 @@ class Tabletop:
 
     def truth(self) -> SceneState:
         """The true state, for drawing and evaluation; estimators must not see it."""
-        bodies = self._bodies
-        poses = [bodies.pose(name) for name in self._names]
-        stacked = Pose(
-            np.array([p.position for p in poses]).reshape(-1, 3),
-            np.array([p.quaternion for p in poses]).reshape(-1, 4),
-        )
-        return SceneState(self._names, stacked, self._light, bodies.pusher)
+        return SceneState(self._names, self._poses(), self._light, self._bodies.pusher)
+
+    def _poses(self) -> Pose:
+        poses = [self._bodies.pose(name) for name in self._names]
+        positions = np.array([p.position for p in poses]).reshape(-1, 3)
+        return Pose(positions, np.array([p.quaternion for p in poses]).reshape(-1, 4))
 
     def arrange(self, seed: int) -> None:
         """Like `reset`, without taking images.
@@ -233,6 +232,21 @@ class Tabletop:
         """Like `act`; returns the objects that the pusher touched meanwhile."""
         velocity = check_action(action)
         return frozenset().union(*(self._advance(velocity) for _ in range(SUBSTEPS)))
+
+    def act_recorded(self, action: Float[np.ndarray, "3"], instants: int) -> tuple[frozenset[str], Pose]:
+        """Like `act_contacts`, with the objects' poses (instants, N) on the way, equally spaced, the last at the end.
+
+        Raises:
+            InvalidInput: if the action is outside its limits; the world is unchanged.
+        """
+        velocity = check_action(action)
+        stride = SUBSTEPS // instants
+        touched, poses = frozenset[str](), []
+        for step in range(1, SUBSTEPS + 1):
+            touched |= self._advance(velocity)
+            if step % stride == 0:
+                poses.append(self._poses())
+        return touched, Pose(np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses]))
 
     def settle(self, rate_hz: float = 60.0) -> Iterator[SceneState]:
         """Let everything come to rest, at most 3 s, telling the state on the way."""

@@ -10,10 +10,10 @@ from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.estimated import EstimatedState
 from osfcore.observationfile import write_observation
 from osfcore.poses import Pose
+from osfcore.pushfile import EpisodeFolder, PushEpisode, save_episode
 from osfcore.scene import Light, Observation, SceneState, default_cameras
 from osfcore.statefile import write_estimated
 from osfcore.world.collect_images import CollectTable, collect_table
-from osfcore.world.push_file import EpisodeFolder, PushEpisode, save_episode
 from tests.core.fields.sets import edit, turn_cameras, write_set
 
 

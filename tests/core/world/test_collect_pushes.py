@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
+from osfcore.pushfile import PushEpisode, read_pushes
 from osfcore.scene import STEP_S
-from osfcore.world.collect_pushes import CollectPushes, collect_pushes
-from osfcore.world.push_file import PushEpisode, read_pushes
+from osfcore.world.collect_pushes import SUBSTATES, CollectPushes, collect_pushes
 
 
 def collect(library, out, executor=None, **settings) -> tuple[PushEpisode, ...]:
@@ -37,6 +37,10 @@ def test_episodes_have_the_stated_shapes_and_tell_the_truth(library, tmp_path):
         assert e.positions.shape == (21, 3, 3)
         assert e.quaternions.shape == (21, 3, 4)
         assert e.contact.shape == (20, 3)
+        assert e.sub_positions is not None and e.sub_quaternions is not None
+        assert e.sub_positions.shape == (20, SUBSTATES, 3, 3)
+        np.testing.assert_array_equal(e.sub_positions[:, -1], e.positions[1:])
+        np.testing.assert_allclose(e.sub_quaternions[:, -1], e.quaternions[1:], atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(e.quaternions, axis=-1), 1, atol=1e-6)
         inner = np.abs(e.pusher[1:, :2]).max(axis=1) < 0.349
         np.testing.assert_allclose(np.diff(e.pusher, axis=0)[inner], STEP_S * e.actions[inner], atol=1e-9)

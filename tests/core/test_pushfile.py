@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.world.push_file import EpisodeFolder, PushEpisode, load_episode, read_pushes, save_episode
+from osfcore.pushfile import EpisodeFolder, PushEpisode, load_episode, read_pushes, save_episode
 
 
 def episode(seed: int, *, frames: bool = False) -> PushEpisode:
@@ -16,13 +16,15 @@ def episode(seed: int, *, frames: bool = False) -> PushEpisode:
         rng.normal(size=(4, 3)),
         rng.normal(size=(3, 3)),
         rng.random((3, 2)) < 0.5,
+        rng.normal(size=(3, 4, 2, 3)) if seed % 2 else None,
+        rng.normal(size=(3, 4, 2, 4)) if seed % 2 else None,
         rng.integers(0, 255, (4, 8, 8, 3), np.uint8) if frames else None,
     )
 
 
 def assert_same(a: PushEpisode, b: PushEpisode) -> None:
     assert (a.names, a.seed) == (b.names, b.seed)
-    for name in ("positions", "quaternions", "pusher", "actions", "contact", "frames"):
+    for name in ("positions", "quaternions", "pusher", "actions", "contact", "sub_positions", "frames"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 

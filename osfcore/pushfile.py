@@ -31,6 +31,8 @@ class PushEpisode:
         pusher: centre of the pusher, likewise [m].
         actions: commanded velocities (vx, vy, 0) [m/s].
         contact: whether the pusher touched the object during the action.
+        sub_positions: of the objects at M equally spaced instants of each action, the last its end [m]; or None.
+        sub_quaternions: likewise.
         frames: images of one camera, likewise, or None.
     """
 
@@ -41,10 +43,13 @@ class PushEpisode:
     pusher: Float[np.ndarray, "T1 3"]
     actions: Float[np.ndarray, "T 3"]
     contact: Bool[np.ndarray, "T N"]
+    sub_positions: Float[np.ndarray, "T M N 3"] | None = None
+    sub_quaternions: Float[np.ndarray, "T M N 4"] | None = None
     frames: UInt8[np.ndarray, "T1 h w 3"] | None = None
 
 
 _ARRAYS = ("positions", "quaternions", "pusher", "actions", "contact")
+_OPTIONAL = ("sub_positions", "sub_quaternions", "frames")
 
 
 class EpisodeFolder:
@@ -128,9 +133,7 @@ def _is_whole(path: Path) -> bool:
 
 def save_episode(path: Path, episode: PushEpisode) -> None:
     """Write one episode; the file appears complete or not at all."""
-    arrays = {name: getattr(episode, name) for name in _ARRAYS}
-    if episode.frames is not None:
-        arrays["frames"] = episode.frames
+    arrays = _arrays(episode)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
         np.savez_compressed(file, names=np.array(episode.names), seed=episode.seed, **arrays)
@@ -142,9 +145,14 @@ def save_episode(path: Path, episode: PushEpisode) -> None:
 def load_episode(path: Path) -> PushEpisode:
     """Read what `save_episode` wrote."""
     with path.open("rb") as file, np.load(file) as data:
-        arrays = {name: data[name] for name in _ARRAYS}
-        frames = data.get("frames")
-        return PushEpisode(tuple(data["names"].tolist()), int(data["seed"]), **arrays, frames=frames)
+        arrays = {name: data[name] for name in _ARRAYS} | {name: data[name] for name in _OPTIONAL if name in data}
+        return PushEpisode(tuple(data["names"].tolist()), int(data["seed"]), **arrays)
+
+
+def _arrays(episode: PushEpisode) -> dict[str, np.ndarray]:
+    """All arrays that an episode has, by name."""
+    found = {name: getattr(episode, name) for name in (*_ARRAYS, *_OPTIONAL)}
+    return {name: array for name, array in found.items() if array is not None}
 
 
 def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
@@ -163,14 +171,11 @@ def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
 def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
     group.attrs["seed"] = episode.seed
     group.create_dataset("names", data=list(episode.names), dtype=h5py.string_dtype())
-    for name in _ARRAYS:
-        group.create_dataset(name, data=getattr(episode, name), compression="gzip", shuffle=True)
-    if episode.frames is not None:
-        group.create_dataset("frames", data=episode.frames, compression="gzip", shuffle=True)
+    for name, array in _arrays(episode).items():
+        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
 
 
 def _from_group(group: h5py.Group) -> PushEpisode:
-    arrays = {name: np.asarray(group[name]) for name in _ARRAYS}
+    arrays = {name: np.asarray(group[name]) for name in (*_ARRAYS, *(n for n in _OPTIONAL if n in group))}
     names = tuple(name.decode() for name in np.asarray(group["names"]).tolist())
-    frames = np.asarray(group["frames"]) if "frames" in group else None
-    return PushEpisode(names, int(np.asarray(group.attrs["seed"])), **arrays, frames=frames)
+    return PushEpisode(names, int(np.asarray(group.attrs["seed"])), **arrays)

@@ -1,0 +1,169 @@
+"""Who can touch whom: paper eq. 8, refined by outlines.
+
+Deviation: eq. 8 compares a squared distance with a length; we compare the distance of two objects with
+kappa = the longest half-extents of both + one step of pusher travel. Among the pairs that pass, and between pusher and
+objects, outlines seen from above then tell which can touch within one substep. Only objects that the pusher can touch,
+or that move, or that can be touched by one of these, take part; all others stay exactly where they are.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from osfcore.dynamics import turns
+from osfcore.dynamics.motion import Motion, Sweep
+from osfcore.dynamics.outline import Gap, circle, gap_between, gap_to_point
+from osfcore.dynamics.shapes import ShapeTable
+from osfcore.scene import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
+
+TRAVEL_M = MAX_SPEED_M_S * STEP_S  # of the pusher in one step, per axis
+OUTLINE = 64  # corners of an outline
+_PAIR_STRIDE = 2  # pairs are compared with every second corner
+TOUCH_M = 0.008  # a substep's sweep is sampled at three points: nothing nearer than this is missed
+PAIR_REACH_M = 0.025  # objects closer than this may touch within a substep
+
+
+class Graph(NamedTuple):
+    """Objects that may move in a substep, in coordinates along the pusher's heading, with its centre as the origin.
+
+    Attributes:
+        scene: scene of each of the A objects.
+        slot: its place among the scene's objects.
+        number: its shape.
+        frame: rotation from the world to the heading's frame.
+        rotation: from the object's frame to the heading's.
+        centre: of mass [m].
+        linear: displacement of the last substep [m].
+        angular: rotation vector of the last substep [rad].
+        outline: seen from above [m].
+        shift: of the pusher in this substep [m].
+        touched: which objects the pusher can touch.
+        before, halfway, after: gaps to the pusher's rim at its start, halfway and at its end, if nothing moved.
+        receiver, sender: numbers among the A objects, for each of the E ordered pairs that can touch.
+        pair: gap of each such pair.
+    """
+
+    scene: Int[Tensor, "A"]
+    slot: Int[Tensor, "A"]
+    number: Int[Tensor, "A"]
+    frame: Float[Tensor, "A 3 3"]
+    rotation: Float[Tensor, "A 3 3"]
+    centre: Float[Tensor, "A 3"]
+    linear: Float[Tensor, "A 3"]
+    angular: Float[Tensor, "A 3"]
+    outline: Float[Tensor, "A K 2"]
+    shift: Float[Tensor, "A 2"]
+    touched: Bool[Tensor, "A"]
+    before: Gap
+    halfway: Gap
+    after: Gap
+    receiver: Int[Tensor, "E"]
+    sender: Int[Tensor, "E"]
+    pair: Gap
+
+
+def adjacency(
+    position: Float[Tensor, "B N 3"], half_extent: Float[Tensor, "B N"], travel_m: float = TRAVEL_M
+) -> Bool[Tensor, "B N N"]:
+    """Which objects could collide during a step (paper eq. 8, see the module for the deviation)."""
+    distance = (position[:, :, None] - position[:, None]).norm(dim=-1)
+    kappa = half_extent[:, :, None] + half_extent[:, None] + travel_m
+    return (distance < kappa) & ~torch.eye(position.shape[1], dtype=torch.bool, device=position.device)
+
+
+def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Graph:
+    """The objects that may move in this substep, and the pairs of them that may touch."""
+    radius = table.radius[number]
+    moving = (motion.linear.abs().amax(dim=2) > 0) | (motion.angular.abs().amax(dim=2) > 0)
+    near = _clearance(motion, sweep) < radius + PUSHER_RADIUS_M + TOUCH_M
+    couples = adjacency(motion.centre, table.half_extent[number])
+    reach = radius[:, :, None] + radius[:, None] + PAIR_REACH_M
+    couples &= (motion.centre[:, :, None, :2] - motion.centre[:, None, :, :2]).norm(dim=-1) < reach
+    possible = _spread(near | moving, couples)
+    graph = _gather(table, number, motion, sweep, possible)
+    index = possible.new_full(possible.shape, 0, dtype=torch.long)
+    index[graph.scene, graph.slot] = torch.arange(len(graph.scene), device=index.device)
+    scene, i, j = (couples & possible[:, :, None] & possible[:, None]).triu().nonzero().unbind(1)
+    first, second = index[scene, i], index[scene, j]
+    thin = graph.outline[:, ::_PAIR_STRIDE]
+    gap = gap_between(thin[first], thin[second])
+    close = gap.distance < PAIR_REACH_M
+    first, second, gap = first[close], second[close], Gap(*(part[close] for part in gap))
+    touching = torch.zeros_like(couples)
+    touching[graph.scene[first], graph.slot[first], graph.slot[second]] = True
+    awake = torch.zeros_like(possible)
+    awake[graph.scene, graph.slot] = graph.touched | moving[graph.scene, graph.slot]
+    awake = _spread(awake, touching | touching.transpose(1, 2))
+    return _keep(graph, first, second, gap, awake[graph.scene, graph.slot])
+
+
+def _clearance(motion: Motion, sweep: Sweep) -> Float[Tensor, "B N"]:
+    """Horizontal distance of the centres from the stretch that the pusher's centre travels [m]."""
+    away = motion.centre[..., :2] - motion.pusher[:, None]
+    shift = sweep.shift[:, None]
+    along = (away * shift).sum(dim=-1) / (shift.square().sum(dim=-1) + 1e-12)
+    return (away - along.clamp(0, 1)[..., None] * shift).norm(dim=-1)
+
+
+def _spread(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N"]:
+    """Everything that is linked to a seed over any number of links."""
+    for _ in range(seed.shape[1] - 1):
+        seed = seed | (links & seed[:, None]).any(dim=2)
+    return seed
+
+
+def _gather(
+    table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep, chosen: Bool[Tensor, "B N"]
+) -> Graph:
+    """The chosen objects side by side, without pairs yet."""
+    scene, slot = chosen.nonzero().unbind(1)
+    hx, hy = sweep.heading[scene].unbind(1)
+    zero, one = torch.zeros_like(hx), torch.ones_like(hx)
+    frame = torch.stack([hx, hy, zero, -hy, hx, zero, zero, zero, one], dim=1).view(-1, 3, 3)
+    rotation = frame @ turns.matrix(motion.quaternion[scene, slot])
+    origin = torch.nn.functional.pad(motion.pusher[scene], (0, 1))
+    vectors = torch.stack(
+        [
+            motion.centre[scene, slot] - origin,
+            motion.linear[scene, slot],
+            motion.angular[scene, slot],
+            torch.nn.functional.pad(sweep.shift[scene], (0, 1)),
+        ],
+        dim=2,
+    )
+    centre, linear, angular, shift = (frame @ vectors).unbind(2)
+    which = number[scene, slot]
+    flat = torch.nn.functional.pad(circle(OUTLINE, hx.device), (0, 1))
+    outline = table.farthest(which, rotation, flat)[..., :2] + centre[:, None, :2]
+    shift = shift[:, :2]
+    gaps = [gap_to_point(outline, share * shift) for share in (0.0, 0.5, 1.0)]
+    before, halfway, after = (gap._replace(distance=gap.distance - PUSHER_RADIUS_M) for gap in gaps)
+    touched = torch.stack([before.distance, halfway.distance, after.distance]).amin(dim=0) < TOUCH_M
+    none = scene[:0]
+    pair = Gap(centre[:0, 0], centre[:0, :2], centre[:0, :2])
+    return Graph(scene, slot, which, frame, rotation, centre, linear, angular, outline, shift, touched, before, halfway,
+                 after, none, none, pair)  # fmt: skip
+
+
+def _keep(graph: Graph, first: Tensor, second: Tensor, gap: Gap, kept: Bool[Tensor, "A"]) -> Graph:
+    """The objects kept, and the pairs among them in both orders."""
+    renumbered = kept.long().cumsum(0) - 1
+    both = kept[first] & kept[second]
+    first, second, gap = first[both], second[both], Gap(*(part[both] for part in gap))
+    opposite = gap.point + gap.distance[:, None] * gap.normal
+    pair = Gap(
+        torch.cat([gap.distance, gap.distance]),
+        torch.cat([gap.normal, -gap.normal]),
+        torch.cat([gap.point, opposite]),
+    )
+    parts = {
+        name: Gap(*(p[kept] for p in value)) if isinstance(value, Gap) else value[kept]
+        for name, value in graph._asdict().items()
+        if name not in ("receiver", "sender", "pair")
+    }
+    first, second = renumbered[first], renumbered[second]
+    return Graph(**parts, receiver=torch.cat([first, second]), sender=torch.cat([second, first]), pair=pair)

@@ -1,0 +1,66 @@
+"""The state of B scenes of N objects while they are rolled out, and what the pusher does in them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from osfcore.dynamics import turns
+from osfcore.dynamics.shapes import ShapeTable
+
+
+class Motion(NamedTuple):
+    """Where everything is and how it moved last, in world coordinates.
+
+    Attributes:
+        centre: centres of mass [m].
+        quaternion: orientations, unit.
+        linear: displacement of the centres during the last substep [m].
+        angular: rotation vectors of the last substep [rad].
+        pusher: horizontal position of the pusher's centre [m].
+        floor: how low the lowest point of each object may come: 0, or less where it was estimated lower [m].
+    """
+
+    centre: Float[Tensor, "B N 3"]
+    quaternion: Float[Tensor, "B N 4"]
+    linear: Float[Tensor, "B N 3"]
+    angular: Float[Tensor, "B N 3"]
+    pusher: Float[Tensor, "B 2"]
+    floor: Float[Tensor, "B N"]
+
+
+class Sweep(NamedTuple):
+    """What the pusher does in one substep.
+
+    Attributes:
+        heading: unit vector of its commanded velocity; any where it stands still.
+        shift: its displacement [m]; shorter than commanded where its reach ends.
+    """
+
+    heading: Float[Tensor, "B 2"]
+    shift: Float[Tensor, "B 2"]
+
+
+def lowest_point(
+    table: ShapeTable, number: Int[Tensor, "A"], centre: Float[Tensor, "A 3"], quaternion: Float[Tensor, "A 4"]
+) -> Float[Tensor, "A"]:
+    """Height of the lowest point of each object over the table's top [m]."""
+    down = centre.new_tensor([[0.0, 0.0, -1.0]])
+    return centre[:, 2] + table.farthest(number, turns.matrix(quaternion), down)[:, 0, 2]
+
+
+def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B 2"]:
+    """Directions of the pusher's velocities; where it stands still, of the fastest object, so that nothing else counts.
+
+    Everything the network sees is turned into this direction: turning the scene turns the prediction.
+    """
+    speed = velocity.norm(dim=1, keepdim=True)
+    fastest = motion.linear[..., :2].norm(dim=2).argmax(dim=1)
+    rows = torch.arange(len(velocity), device=velocity.device)
+    other = motion.linear[rows, fastest, :2]
+    other = other / other.norm(dim=1, keepdim=True).clamp(min=1e-9)
+    other = torch.where(other.norm(dim=1, keepdim=True) > 0.5, other, other.new_tensor([1.0, 0.0]))
+    return torch.where(speed > 1e-6, velocity / speed.clamp(min=1e-6), other)

@@ -1,0 +1,129 @@
+"""What dynamics knows of an object's shape, all of it from its field.
+
+The paper thresholds the KiloOSF's density on a grid of points (section 4.3). We take the points where the density
+crosses the threshold along the grid's edges, which places the surface within about a millimetre instead of a voxel, and
+keep the support function of their convex hull: the farthest point in every direction. Contact, footprint, height and
+size all follow from it, for any orientation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+from torch import Tensor
+
+from osfcore.errors import OsfError
+from osfcore.fields.kiloosf import KiloOSF
+
+SURFACE_G = -1.5  # density feature at which fields and collision shapes of the shipped objects agree best
+MAP_SIDE = 64  # of the octahedral map of directions
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectShape:
+    """The convex hull of what is solid in a field.
+
+    Attributes:
+        half_extents: half the sides of its bounding box, in the object's frame [m].
+        centre: centre of mass of the solid, of uniform density, in the object's frame [m].
+        radius: of the sphere around the centre that holds the object [m].
+        support: farthest point from the centre in each direction of the octahedral map, relative to the centre [m].
+    """
+
+    half_extents: Float[np.ndarray, "3"]
+    centre: Float[np.ndarray, "3"]
+    radius: float
+    support: Float32[np.ndarray, "D 3"]
+
+
+def object_shape(field: KiloOSF) -> ObjectShape:
+    """The shape that a field describes.
+
+    Raises:
+        OsfError: if nothing in the field is solid.
+    """
+    surface = _surface(field.density.astype(float))
+    if len(surface) < 4 or np.ptp(surface, axis=0).min() <= 0:
+        raise OsfError("A field without any solid part has no shape to predict the motion of.")
+    surface = field.origin + field.voxel * surface
+    corners = surface[ConvexHull(surface).vertices]
+    solid = ndimage.binary_fill_holes(field.density > SURFACE_G)
+    centre = field.origin + field.voxel * np.argwhere(solid).mean(axis=0)
+    around = (corners - centre).astype(np.float32)
+    directions = octahedral_directions(MAP_SIDE).astype(np.float32)
+    return ObjectShape(
+        half_extents=np.ptp(corners, axis=0) / 2,
+        centre=centre,
+        radius=float(np.linalg.norm(around, axis=1).max()),
+        support=around[np.argmax(directions @ around.T, axis=1)],
+    )
+
+
+def _surface(density: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
+    """Where the density crosses the threshold along the edges of the grid, in voxels; empty space surrounds it."""
+    density = np.pad(density, 1, constant_values=float(density.min()))
+    points = []
+    for axis in range(3):
+        along = np.moveaxis(density, axis, 0)
+        low, high = along[:-1], along[1:]
+        crossing = (low > SURFACE_G) != (high > SURFACE_G)
+        place = np.argwhere(crossing).astype(float)
+        place[:, 0] += (SURFACE_G - low[crossing]) / (high[crossing] - low[crossing])
+        order = [1, 2]
+        order.insert(axis, 0)
+        points.append(place[:, order])
+    return np.concatenate(points) - 1
+
+
+def octahedral_directions(side: int) -> Float[np.ndarray, "D 3"]:
+    """The unit vector of each cell of an octahedral map: the sphere unfolded into a square of `side` x `side`."""
+    u = (np.arange(side) + 0.5) / side * 2 - 1
+    x, y = np.meshgrid(u, u, indexing="ij")
+    z = 1 - np.abs(x) - np.abs(y)
+    x, y = (
+        np.where(z < 0, (1 - np.abs(y)) * np.sign(x), x),
+        np.where(z < 0, (1 - np.abs(x)) * np.sign(y), y),
+    )
+    d = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def octahedral_index(directions: Float[Tensor, "*batch 3"], side: int) -> Tensor:
+    """The cell of each direction, of any length but 0."""
+    d = directions / directions.abs().sum(dim=-1, keepdim=True)
+    x, y, z = d.unbind(-1)
+    folded_x = torch.where(z < 0, (1 - y.abs()) * torch.where(x < 0, -1.0, 1.0), x)
+    folded_y = torch.where(z < 0, (1 - x.abs()) * torch.where(y < 0, -1.0, 1.0), y)
+    i = ((folded_x + 1) * (side / 2)).long().clamp(0, side - 1)
+    j = ((folded_y + 1) * (side / 2)).long().clamp(0, side - 1)
+    return i * side + j
+
+
+class ShapeTable:
+    """The shapes of some objects side by side, for lookups by number.
+
+    Args:
+        shapes: of the objects, in the order of their numbers.
+        device: that looks them up.
+    """
+
+    def __init__(self, shapes: tuple[ObjectShape, ...], device: torch.device | str = "cpu") -> None:
+        self.support = torch.as_tensor(np.concatenate([s.support for s in shapes]), device=device)
+        self.centre = torch.as_tensor(np.array([s.centre for s in shapes]), device=device)
+        self.radius = torch.as_tensor(np.array([s.radius for s in shapes]), dtype=torch.float32, device=device)
+        extents = np.array([s.half_extents.max() for s in shapes])
+        self.half_extent = torch.as_tensor(extents, dtype=torch.float32, device=device)
+
+    def farthest(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
+        """Farthest points of A objects in D directions of the world, relative to their centres of mass (A, D, 3) [m].
+
+        The points are those of the nearest direction on the map; the height over them errs by 0.1 mm at most.
+        """
+        local = directions @ rotation  # R^T d for every d
+        cell = octahedral_index(local, MAP_SIDE) + number[:, None] * MAP_SIDE**2
+        return self.support[cell] @ rotation.transpose(1, 2)

@@ -1,0 +1,190 @@
+"""Pieces of recorded pushes as tensors: what training and evaluation roll out and compare with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
+from osfcore.dynamics.shapes import ObjectShape, ShapeTable
+from osfcore.dynamics.step import SUBSTEPS
+from osfcore.errors import InvalidInput
+from osfcore.poses import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply, rotate
+from osfcore.pushfile import PushEpisode
+from osfcore.scene import PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
+
+_MOVED_M = 1e-3
+_EDGE_M = TABLE_SIDE_M / 2 - 0.05  # what comes nearer to the table's edge may fall: nothing to learn from
+
+
+class Targets(NamedTuple):
+    """Where the objects of B windows truly are after each substep.
+
+    Attributes:
+        centre: centres of mass [m].
+        quaternion: orientations.
+    """
+
+    centre: Float[Tensor, "S B N 3"]
+    quaternion: Float[Tensor, "S B N 4"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Recording:
+    """Episodes of one length and number of objects, substep by substep.
+
+    Attributes:
+        number: shape of each object.
+        centre: centres of mass before the first substep and after each one [m].
+        quaternion: orientations, likewise.
+        pusher: its centre, likewise [m].
+        velocity: commanded in each action [m/s].
+        starts: episode and action at which windows of `length` actions may start.
+        is_busy: whether something moves or is touched in such a window.
+        length: of the windows [actions].
+    """
+
+    number: Int[Tensor, "E N"]
+    centre: Float[Tensor, "E S1 N 3"]
+    quaternion: Float[Tensor, "E S1 N 4"]
+    pusher: Float[Tensor, "E S1 2"]
+    velocity: Float[Tensor, "E T 2"]
+    starts: Int[np.ndarray, "W 2"]
+    is_busy: Bool[np.ndarray, "W"]
+    length: int
+
+
+def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], length: int) -> Recording:
+    """Episodes as tensors, with the windows that can be learned from.
+
+    Raises:
+        InvalidInput: if the episodes were recorded without substeps, differ in length or number of objects, or are
+            shorter than a window.
+    """
+    order = {name: number for number, name in enumerate(sorted(shapes))}
+    sizes = {(len(e.actions), len(e.names)) for e in episodes}
+    if len(sizes) != 1 or min(sizes)[0] < length:
+        raise InvalidInput("steps and objects of the episodes", sorted(sizes), f"equal, with at least {length} steps")
+    number = np.array([[order[name] for name in e.names] for e in episodes])
+    poses = [_substates(e) for e in episodes]
+    position, quaternion = np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses])
+    centres = np.array([shapes[name].centre for name in sorted(shapes)])
+    centre = position + rotate(quaternion, centres[number][:, None])
+    velocity = np.stack([e.actions[:, :2] for e in episodes])
+    pusher = np.stack([pusher_path(e.pusher[0, :2], e.actions[:, :2]) for e in episodes])
+    starts, is_busy = _windows(episodes, length)
+
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
+
+    return Recording(torch.as_tensor(number), tensor(centre), tensor(quaternion), tensor(pusher), tensor(velocity),
+                     starts, is_busy, length)  # fmt: skip
+
+
+def pusher_path(
+    start: Float[np.ndarray, "*batch 2"], velocity: Float[np.ndarray, "*batch T 2"]
+) -> Float[np.ndarray, "*batch S1 2"]:
+    """Where the pusher's centre is before the first and after each substep [m]; it stops where its reach ends."""
+    place = np.array(start, float)
+    reach = np.maximum(PUSHER_REACH_M, np.abs(place))
+    path = [place]
+    for step in range(velocity.shape[-2]):
+        for _ in range(SUBSTEPS):
+            place = np.clip(place + velocity[..., step, :] * (STEP_S / SUBSTEPS), -reach, reach)
+            path.append(place)
+    return np.stack(path, axis=-2)
+
+
+def _substates(episode: PushEpisode) -> Pose:
+    """All poses of an episode, substep by substep."""
+    if episode.sub_positions is None or episode.sub_quaternions is None or episode.sub_positions.shape[1] != SUBSTEPS:
+        raise InvalidInput("push file", "without poses within its actions", "one that 'osf collect pushes' wrote")
+    positions = np.concatenate([episode.positions[:1], episode.sub_positions.reshape(-1, *episode.positions.shape[1:])])
+    turned = episode.sub_quaternions.reshape(-1, *episode.quaternions.shape[1:])
+    return Pose(positions, np.concatenate([episode.quaternions[:1], turned]))
+
+
+def _windows(episodes: Sequence[PushEpisode], length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Starts of windows in which nothing falls off the table, and whether anything happens in them."""
+    starts, busy = [], []
+    for number, e in enumerate(episodes):
+        last = len(e.actions) - length
+        safe = (np.abs(e.positions[..., :2]).max(axis=(1, 2)) < _EDGE_M) & (e.positions[..., 2].min(axis=1) > -0.02)
+        moved = np.linalg.norm(np.diff(e.positions, axis=0), axis=-1).max(axis=1) > _MOVED_M
+        happens = moved | e.contact.any(axis=1)
+        for start in range(last + 1):
+            if safe[start : start + length + 1].all():
+                starts.append((number, start))
+                busy.append(happens[start : start + length].any())
+    return np.array(starts, int).reshape(-1, 2), np.array(busy, bool)
+
+
+class Batch(NamedTuple):
+    """B windows ready to be rolled out.
+
+    Attributes:
+        number: shape of each object.
+        motion: at their start.
+        shifts: of the pusher in each substep [m].
+        velocity: commanded in each action [m/s].
+        targets: the truth.
+    """
+
+    number: Int[Tensor, "B N"]
+    motion: Motion
+    shifts: Float[Tensor, "S B 2"]
+    velocity: Float[Tensor, "T B 2"]
+    targets: Targets
+
+    def sweep(self, substep: int, motion: Motion) -> Sweep:
+        """What the pusher does in a substep, with the motion before it."""
+        return Sweep(headings(self.velocity[substep // SUBSTEPS], motion), self.shifts[substep])
+
+
+def batch(
+    recording: Recording, table: ShapeTable, windows: Int[np.ndarray, "B"], device: torch.device | str = "cpu"
+) -> Batch:
+    """Windows by their numbers in `recording.starts`, with true velocities at their starts."""
+    episode, start = (torch.as_tensor(column) for column in recording.starts[windows].T)
+    first = start * SUBSTEPS
+    steps = first[:, None] + torch.arange(recording.length * SUBSTEPS + 1)
+    centre, quaternion = recording.centre[episode[:, None], steps], recording.quaternion[episode[:, None], steps]
+    before = (first - 1).clamp(min=0)
+    linear = centre[:, 0] - recording.centre[episode, before]
+    angular = _turn(recording.quaternion[episode, before], quaternion[:, 0])
+    pusher = recording.pusher[episode[:, None], steps]
+    actions = start[:, None] + torch.arange(recording.length)
+    number = recording.number[episode].to(device)
+
+    def put(tensor: Tensor) -> Tensor:
+        return tensor.to(device)
+
+    lowest = lowest_point(
+        table, number.flatten(), put(centre[:, 0].flatten(0, 1)), put(quaternion[:, 0].flatten(0, 1))
+    ).view(number.shape)
+    motion = Motion(put(centre[:, 0]), put(quaternion[:, 0]), put(linear), put(angular), put(pusher[:, 0]),
+                    lowest.clamp(max=0))  # fmt: skip
+    motion = sleeping(motion)
+    shifts = put(pusher.diff(dim=1).transpose(0, 1))
+    targets = Targets(put(centre[:, 1:].transpose(0, 1)), put(quaternion[:, 1:].transpose(0, 1)))
+    return Batch(number, motion, shifts, put(recording.velocity[episode[:, None], actions].transpose(0, 1)), targets)
+
+
+def sleeping(motion: Motion) -> Motion:
+    """The same with objects that hardly move at rest."""
+    from osfcore.dynamics.step import SLEEP_M, SLEEP_RAD
+
+    awake = (motion.linear.norm(dim=-1) > SLEEP_M) | (motion.angular.norm(dim=-1) > SLEEP_RAD)
+    return motion._replace(linear=motion.linear * awake[..., None], angular=motion.angular * awake[..., None])
+
+
+def _turn(first: Tensor, second: Tensor) -> Tensor:
+    """Rotation vectors from one orientation to another [rad]."""
+    a, b = first.double().numpy(), second.double().numpy()
+    return torch.as_tensor(quaternion_log(quaternion_multiply(b, quaternion_conjugate(a))), dtype=torch.float32)
