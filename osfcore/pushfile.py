@@ -136,7 +136,7 @@ def save_episode(path: Path, episode: PushEpisode) -> None:
     arrays = _arrays(episode)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
-        np.savez_compressed(file, names=np.array(episode.names), seed=episode.seed, **arrays)
+        np.savez_compressed(file, allow_pickle=False, names=np.array(episode.names), seed=episode.seed, **arrays)
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)

@@ -25,6 +25,7 @@ PUSHER_CENTRE_Z_M = PUSHER_CLEARANCE_M + PUSHER_HEIGHT_M / 2
 PUSHER_REACH_M = 0.35  # |x|, |y| of the pusher's centre; the robot stops there
 MAX_SPEED_M_S = 0.3
 STEP_S = 0.2
+ACTION_ALLOWED = f"(vx, vy, 0), finite, with |vx| and |vy| at most {MAX_SPEED_M_S}"
 AMBIENT = 0.25
 DIFFUSE = 0.75
 MIN_LIGHT_ELEVATION_DEG = 5.0
@@ -214,7 +215,7 @@ def check_action(action: object) -> Float[np.ndarray, "3"]:
     """
     velocity = finite_vector(action, 3, "action [m/s]")
     if np.any(np.abs(velocity) > MAX_SPEED_M_S + 1e-9) or velocity[2] != 0:
-        raise InvalidInput("action [m/s]", velocity.tolist(), f"(vx, vy, 0) with |vx| and |vy| at most {MAX_SPEED_M_S}")
+        raise InvalidInput("action [m/s]", velocity.tolist(), ACTION_ALLOWED)
     return velocity
 
 

@@ -26,6 +26,8 @@ ROOMS = (
     "statefile",
     "observationfile",
     "pushfile",
+    "rollouts",
+    "rolloutfile",
     "fields",
     "render",
     "estimate",

@@ -87,6 +87,8 @@ class CollectPushesCommand:
     """Keep frames of camera 0 as well."""
     renderer: Literal["embree", "tiny"] = "embree"
     """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
+    names: tuple[str, ...] | None = None
+    """Objects to choose from; by default all that were fetched."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Where fetched objects are."""
     json: bool = False
@@ -97,9 +99,8 @@ class CollectPushesCommand:
         from osfcore.objects.library import AssetLibrary
         from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
-        config = CollectPushes(
-            self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images, self.renderer
-        )
+        config = CollectPushes(self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images,
+                               self.renderer, self.names)  # fmt: skip
         with worker_pool(self.workers) as executor:
             last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, self.workers + 2))
         result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}

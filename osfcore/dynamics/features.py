@@ -1,17 +1,24 @@
-"""What the network sees of a graph: numbers along the pusher's heading, relative to each object's centre of mass."""
+"""What the network sees of a graph: numbers along each object's own direction of push, from its centre of mass.
+
+Every object has a frame of its own: x points along the normal of the contact that pushes it most directly, z up. All
+vectors that reach an object are told in its frame and so is its answer, so a scene that is turned or shifted gives the
+same numbers.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
-from osfcore.dynamics.graph import OUTLINE, Graph
-from osfcore.dynamics.outline import direction_index
+from osfcore.dynamics.graph import Graph
+from osfcore.dynamics.outline import Gap, direction_index, dot
 from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.sliding import lever, slide
 from osfcore.scene import PUSHER_RADIUS_M
 
 _AROUND = 16  # horizontal directions in which an object's extent is told
@@ -20,107 +27,172 @@ LENGTH_M = 0.05  # that becomes 1
 SHIFT_M = 0.01  # displacement that becomes 1
 TURN_RAD = 0.1  # rotation that becomes 1
 _GAP_M = 0.004  # near contact, gaps count in these
-NODE_FEATURES = _AROUND + 2 * _SLANTED + 2 + 1 + 3 + 3 + 2
-EDGE_FEATURES = 28
+_CLOSE_M = 0.01  # an object this close gives the direction, rather than the motion
+NODE_FEATURES = _AROUND + 2 * _SLANTED + 2 + 1 + 3 + 3 + 2 + 3
+EDGE_FEATURES = 35
 
 
-def node_features(table: ShapeTable, graph: Graph) -> Float[Tensor, "A F"]:
-    """Of each object: its extent in 34 directions, its height over the table, its motion, the pusher's motion."""
-    around = graph.outline[:, :: OUTLINE // _AROUND] - graph.centre[:, None, :2]
-    directions = _horizontal(_AROUND, graph.centre)
-    extents = (around * directions[:, :2]).sum(dim=-1)
-    slanted = _horizontal(_SLANTED, graph.centre)
+class Inputs(NamedTuple):
+    """A graph in numbers.
+
+    Attributes:
+        nodes: of each object.
+        edges: from the pusher to the objects it can touch, then between objects.
+        receiver: object at the end of each edge.
+        sender: object at the beginning of each edge between objects.
+        frame: rotation from the world to each object's frame.
+        guess: how the pusher would make each object slide without inertia: x, y, turn, in units of the answer.
+    """
+
+    nodes: Float[Tensor, "A F"]
+    edges: Float[Tensor, "E G"]
+    receiver: Int[Tensor, "E"]
+    sender: Int[Tensor, "S"]
+    frame: Float[Tensor, "A 3 3"]
+    guess: Float[Tensor, "A 3"]
+
+
+def inputs(table: ShapeTable, graph: Graph) -> Inputs:
+    """All that the network needs."""
+    turn = _about_z(_directions(graph))
+    guess = _give_way(graph, graph.after, turn)
+    pushed = graph.touched.nonzero()[:, 0]
+    edges = torch.cat([_from_pusher(graph, pushed, turn), _between(graph, turn)])
+    nodes = _nodes(table, graph, turn, guess)
+    return Inputs(nodes, edges, torch.cat([pushed, graph.receiver]), graph.sender, turn @ graph.frame, guess)
+
+
+def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
+    """Where each object is being pushed to: by the pusher, else by the closest object, else where it is moving."""
+    flat = graph.linear[:, :2]
+    speed = flat.norm(dim=1, keepdim=True)
+    moving = torch.where(speed > 1e-6, flat / speed.clamp(min=1e-6), flat.new_tensor([1.0, 0.0]))
+    closest = speed.new_full((len(speed),), 1.0).scatter_reduce(0, graph.receiver, graph.pair.distance, "amin")
+    is_closest = graph.pair.distance <= closest[graph.receiver]
+    neighbour = moving.index_put((graph.receiver[is_closest],), -graph.pair.normal[is_closest])
+    by_neighbour = (closest < _CLOSE_M)[:, None] | ((closest < 1.0)[:, None] & (speed <= 1e-6))
+    direction = torch.where(by_neighbour, neighbour, moving)
+    return torch.where(graph.touched[:, None], -graph.after.normal, direction)
+
+
+def _about_z(forward: Float[Tensor, "A 2"]) -> Float[Tensor, "A 3 3"]:
+    """Rotations that take a horizontal direction to +x."""
+    x, y = forward.unbind(1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    return torch.stack([x, y, zero, -y, x, zero, zero, zero, one], dim=1).view(-1, 3, 3)
+
+
+def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Tensor, "A 3"]:
+    """Sliding at a contact, so far that the pusher's last position is free."""
+    centre = graph.centre[:, :2]
+    depth = (-graph.after.distance).clamp(min=0)
+    way = slide(gap.point - centre, -gap.normal, depth, graph.shift, lever(graph.outline - centre[:, None]))
+    along = (turn[:, :2, :2] @ way[:, :2, None])[..., 0]
+    return torch.cat([along / SHIFT_M, way[:, 2:] / TURN_RAD], dim=1)
+
+
+def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, guess: Tensor) -> Float[Tensor, "A F"]:
+    """Extents in 34 directions, height over the table, motion, the pusher's motion, and how it would slide."""
+    slanted = functional.pad(_fan_of(_SLANTED, turn), (0, 1))
     vertical = slanted.new_tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     half = math.sqrt(0.5)
-    rest = torch.cat([half * (slanted + vertical[0]), half * (slanted + vertical[1]), vertical])
-    farther = (table.farthest(graph.number, graph.rotation, rest) * rest).sum(dim=-1)
-    height = graph.centre[:, 2:] - farther[:, -2:-1]
-    lengths = torch.cat([extents, farther, 5 * height], dim=1) / LENGTH_M
-    return torch.cat([lengths, graph.linear / SHIFT_M, graph.angular / TURN_RAD, graph.shift / SHIFT_M], dim=1)
+    flat = functional.pad(_fan_of(_AROUND, turn), (0, 1))
+    directions = torch.cat([flat, half * (slanted + vertical[0]), half * (slanted + vertical[1]), vertical])
+    extents = table.extents(graph.number, turn @ graph.rotation, directions)
+    height = graph.centre[:, 2:] - extents[:, -2:-1]
+    motion = torch.stack([graph.linear, graph.angular, functional.pad(graph.shift, (0, 1))], dim=2)
+    linear, angular, shift = (turn @ motion).unbind(2)
+    lengths = torch.cat([extents, 5 * height], dim=1) / LENGTH_M
+    return torch.cat([lengths, linear / SHIFT_M, angular / TURN_RAD, shift[:, :2] / SHIFT_M, guess], dim=1)
 
 
-def _horizontal(count: int, like: Tensor) -> Float[Tensor, "D 3"]:
+def _fan_of(count: int, like: Tensor) -> Float[Tensor, "D 2"]:
     angles = torch.arange(count, device=like.device) * (2 * math.pi / count)
-    return torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], dim=1)
+    return torch.stack([angles.cos(), angles.sin()], dim=1)
 
 
-def edge_features(graph: Graph) -> tuple[Float[Tensor, "E F"], Tensor]:
-    """Of each edge: first those from the pusher to the objects it can touch, then those between objects.
-
-    Returns:
-        The features, and the receiver of each edge; senders of the latter part are `graph.sender`.
-    """
-    pushed = graph.touched.nonzero()[:, 0]
-    return torch.cat([_from_pusher(graph, pushed), _between(graph)]), torch.cat([pushed, graph.receiver])
-
-
-def _from_pusher(graph: Graph, pushed: Tensor) -> Tensor:
+def _from_pusher(graph: Graph, pushed: Tensor, turn: Tensor) -> Tensor:
     centre = graph.centre[pushed]
-    before, halfway, after = graph.before, graph.halfway, graph.after
-    shift = torch.nn.functional.pad(graph.shift[pushed], (0, 1))
-    normal = before.normal[pushed]
+    before, halfway, after = (
+        Gap(*(part[pushed] for part in gap)) for gap in (graph.before, graph.halfway, graph.after)
+    )
+    shift = functional.pad(graph.shift[pushed], (0, 1))
+    rim = -PUSHER_RADIUS_M * before.normal - centre[:, :2]
     return _edge(
+        turn[pushed],
         is_pusher=1.0,
+        slide=_give_way(graph, graph.before, turn)[pushed],
         away=-centre,
-        shift=shift,
-        turn=torch.zeros_like(shift),
-        gaps=(before.distance[pushed], halfway.distance[pushed], after.distance[pushed]),
-        normals=(normal, after.normal[pushed]),
-        points=(before.point[pushed] - centre[:, :2], after.point[pushed] - centre[:, :2]),
-        ends=_face(graph.outline[pushed], normal) - centre[:, None, :2],
-        other_ends=(-PUSHER_RADIUS_M * normal - centre[:, :2])[:, None].expand(-1, 2, -1),
+        motion=(shift, torch.zeros_like(shift)),
+        gaps=(before.distance, halfway.distance, after.distance),
+        points=[
+            *(before.point - centre[:, :2], after.point - centre[:, :2]),
+            *_face(graph.outline[pushed], before.normal, centre),
+            *(rim, rim),
+        ],
+        directions=[before.normal, after.normal, shift[:, :2] / SHIFT_M],
     )
 
 
-def _between(graph: Graph) -> Tensor:
+def _between(graph: Graph, turn: Tensor) -> Tensor:
     i, j = graph.receiver, graph.sender
     centre, normal, distance = graph.centre[i], graph.pair.normal, graph.pair.distance
     motion = graph.linear[j] - graph.linear[i]
-    later = distance + (motion[:, :2] * normal).sum(dim=-1)
+    later = distance + dot(motion[:, :2], normal)
     point = graph.pair.point - centre[:, :2]
     return _edge(
+        turn[i],
         is_pusher=0.0,
+        slide=torch.zeros_like(centre),
         away=graph.centre[j] - centre,
-        shift=graph.linear[j],
-        turn=graph.angular[j],
+        motion=(graph.linear[j], graph.angular[j]),
         gaps=(distance, (distance + later) / 2, later),
-        normals=(normal, normal),
-        points=(point, point + motion[:, :2]),
-        ends=_face(graph.outline[i], normal) - centre[:, None, :2],
-        other_ends=_face(graph.outline[j], -normal) - centre[:, None, :2],
+        points=[
+            *(point, point + motion[:, :2]),
+            *_face(graph.outline[i], normal, centre),
+            *_face(graph.outline[j], -normal, centre),
+        ],
+        directions=[normal, normal, turn[j, 0, :2]],
     )
 
 
 def _edge(
+    turn: Float[Tensor, "E 3 3"],
     *,
     is_pusher: float,
+    slide: Tensor,
     away: Tensor,
-    shift: Tensor,
-    turn: Tensor,
+    motion: tuple[Tensor, Tensor],
     gaps: tuple[Tensor, ...],
-    normals: tuple[Tensor, Tensor],
-    points: tuple[Tensor, Tensor],
-    ends: Tensor,
-    other_ends: Tensor,
+    points: list[Tensor],
+    directions: list[Tensor],
 ) -> Tensor:
     gap = torch.stack(gaps, dim=1)
-    levers = [p[:, :1] * n[:, 1:] - p[:, 1:] * n[:, :1] for p, n in zip(points, normals, strict=True)]
-    lengths = torch.cat([away, *levers, ends.flatten(1), other_ends.flatten(1)], dim=1) / LENGTH_M
+    solid = turn @ torch.stack([away / LENGTH_M, motion[0] / SHIFT_M, motion[1] / TURN_RAD], dim=2)
+    flat = turn[:, :2, :2] @ torch.stack([*(p / LENGTH_M for p in points), *directions], dim=2)
     near = (gap / _GAP_M).clamp(-4, 4)
     kind = torch.full_like(gap[:, :1], is_pusher)
-    return torch.cat([kind, lengths, near, *normals, shift / SHIFT_M, turn / TURN_RAD, gap[:, 2:] / LENGTH_M], dim=1)
+    parts = [
+        kind,
+        near,
+        gap[:, 2:] / LENGTH_M,
+        slide,
+        solid.transpose(1, 2).flatten(1),
+        flat.transpose(1, 2).flatten(1),
+    ]
+    return torch.cat(parts, dim=1)
 
 
-def _face(outline: Tensor, normal: Tensor) -> Float[Tensor, "A 2 2"]:
+def _face(outline: Tensor, normal: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
     """Both ends of the side of an outline that faces a direction; a corner gives about the same point twice."""
     count = outline.shape[1]
     middle = direction_index(normal, count)
     rows = torch.arange(len(outline), device=outline.device)
-    return torch.stack([outline[rows, (middle - 1) % count], outline[rows, (middle + 1) % count]], dim=1)
+    return tuple(outline[rows, (middle + step) % count] - centre[:, :2] for step in (-1, 1))  # pyright: ignore[reportReturnType]
 
 
 def mirrored(values: Tensor, flags: Tensor, kind: Literal["node", "edge", "motion"]) -> Tensor:
-    """Features or answers with those rows reflected along the heading whose flag is set: left becomes right."""
+    """Features or answers with those rows reflected along their x axis whose flag is set: left becomes right."""
     order, sign = _MIRRORS[kind]
     reflected = values[:, torch.tensor(order, device=values.device)] * values.new_tensor(sign)
     return torch.where(flags[:, None], reflected, values)
@@ -140,12 +212,12 @@ def _fan(count: int) -> tuple[list[int], list[float]]:
     return [-k % count for k in range(count)], [1.0] * count
 
 
-_SCALAR, _POLAR, _AXIAL, _PLANE = ([0], [1.0]), ([0, 1, 2], [1.0, -1, 1]), ([0, 1, 2], [-1.0, 1, -1]), ([0, 1], [1.0, -1])
-_LEVER = ([0], [-1.0])
+_SCALAR, _PLANE = ([0], [1.0]), ([0, 1], [1.0, -1])
+_POLAR, _AXIAL = ([0, 1, 2], [1.0, -1, 1]), ([0, 1, 2], [-1.0, 1, -1])
+_SLIDE = ([0, 1, 2], [1.0, -1, -1])
 _ENDS = ([2, 3, 0, 1], [1.0, -1, 1, -1])
 _MIRRORS = {
-    "node": _mirror(_fan(_AROUND), _fan(_SLANTED), _fan(_SLANTED), *[_SCALAR] * 3, _POLAR, _AXIAL, _PLANE),
-    "edge": _mirror(_SCALAR, _POLAR, _LEVER, _LEVER, _ENDS, _ENDS, *[_SCALAR] * 3, _PLANE, _PLANE, _POLAR, _AXIAL,
-                    _SCALAR),
+    "node": _mirror(_fan(_AROUND), _fan(_SLANTED), _fan(_SLANTED), *[_SCALAR] * 3, _POLAR, _AXIAL, _PLANE, _SLIDE),
+    "edge": _mirror(*[_SCALAR] * 5, _SLIDE, _POLAR, _POLAR, _AXIAL, _PLANE, _PLANE, _ENDS, _ENDS, *[_PLANE] * 3),
     "motion": _mirror(_POLAR, _AXIAL),
-}  # fmt: skip
+}

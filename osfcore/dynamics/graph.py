@@ -8,7 +8,7 @@ or that move, or that can be touched by one of these, take part; all others stay
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,6 +24,7 @@ TRAVEL_M = MAX_SPEED_M_S * STEP_S  # of the pusher in one step, per axis
 OUTLINE = 64  # corners of an outline
 _PAIR_STRIDE = 2  # pairs are compared with every second corner
 TOUCH_M = 0.008  # a substep's sweep is sampled at three points: nothing nearer than this is missed
+_NODE_PARTS = 14  # of a graph: those that belong to objects; the last three belong to pairs
 PAIR_REACH_M = 0.025  # objects closer than this may touch within a substep
 
 
@@ -160,10 +161,6 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, gap: Gap, kept: Bool[Tens
         torch.cat([gap.normal, -gap.normal]),
         torch.cat([gap.point, opposite]),
     )
-    parts = {
-        name: Gap(*(p[kept] for p in value)) if isinstance(value, Gap) else value[kept]
-        for name, value in graph._asdict().items()
-        if name not in ("receiver", "sender", "pair")
-    }
+    nodes: list[Any] = [Gap(*(p[kept] for p in part)) if isinstance(part, Gap) else part[kept] for part in graph[:_NODE_PARTS]]
     first, second = renumbered[first], renumbered[second]
-    return Graph(**parts, receiver=torch.cat([first, second]), sender=torch.cat([second, first]), pair=pair)
+    return Graph(*nodes, torch.cat([first, second]), torch.cat([second, first]), pair)

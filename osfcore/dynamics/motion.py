@@ -11,6 +11,9 @@ from torch import Tensor
 from osfcore.dynamics import turns
 from osfcore.dynamics.shapes import ShapeTable
 
+SLEEP_M = 1e-4  # an object that moves less than this in a substep, and turns less than that, rests
+SLEEP_RAD = 2e-3
+
 
 class Motion(NamedTuple):
     """Where everything is and how it moved last, in world coordinates.
@@ -64,3 +67,9 @@ def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B
     other = other / other.norm(dim=1, keepdim=True).clamp(min=1e-9)
     other = torch.where(other.norm(dim=1, keepdim=True) > 0.5, other, other.new_tensor([1.0, 0.0]))
     return torch.where(speed > 1e-6, velocity / speed.clamp(min=1e-6), other)
+
+
+def sleeping(motion: Motion) -> Motion:
+    """The same with objects that hardly move at rest."""
+    awake = (motion.linear.norm(dim=-1) > SLEEP_M) | (motion.angular.norm(dim=-1) > SLEEP_RAD)
+    return motion._replace(linear=motion.linear * awake[..., None], angular=motion.angular * awake[..., None])

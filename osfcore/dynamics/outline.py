@@ -34,17 +34,22 @@ def circle(count: int, device: torch.device | None = None) -> Float[Tensor, "K 2
     return torch.stack([angles.cos(), angles.sin()], dim=-1)
 
 
+def dot(a: Float[Tensor, "*batch 2"], b: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+    """Scalar products; written out, for sums over a short last axis are slow."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
 def gap_to_point(outline: Float[Tensor, "A K 2"], point: Float[Tensor, "A 2"]) -> Gap:
     """From outlines to one point each."""
     side = outline.roll(-1, dims=1) - outline
     away = point[:, None] - outline
-    along = (away * side).sum(dim=-1) / (side.square().sum(dim=-1) + 1e-12)
+    along = dot(away, side) / (dot(side, side) + 1e-12)
     rest = away - along.clamp(0, 1)[..., None] * side
-    nearest = rest.square().sum(dim=-1).argmin(dim=1)
+    nearest = dot(rest, rest).argmin(dim=1)
     rest = rest[torch.arange(len(rest), device=rest.device), nearest]
-    length = (rest.square().sum(dim=-1) + 1e-14).sqrt()
+    length = (dot(rest, rest) + 1e-14).sqrt()
     directions = circle(outline.shape[1], outline.device)
-    beyond = (away * directions).sum(dim=-1).amax(dim=1)  # over the support lines: negative only inside
+    beyond = dot(away, directions).amax(dim=1)  # over the support lines: negative only inside
     sign = torch.where(beyond < 0, -1.0, 1.0)
     return Gap(sign * length, (sign / length)[:, None] * rest, point - rest)
 
@@ -67,9 +72,9 @@ def gap_between(first: Float[Tensor, "E K 2"], second: Float[Tensor, "E K 2"]) -
 def _separation(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Largest separation along the normals of the first outlines' sides, and that normal."""
     side = first.roll(-1, dims=1) - first
-    length = (side.square().sum(dim=-1) + 1e-16).sqrt()
+    length = (dot(side, side) + 1e-16).sqrt()
     normal = torch.stack([side[..., 1], -side[..., 0]], dim=-1) / length[..., None]
-    reach = torch.matmul(normal, second.transpose(1, 2)).amin(dim=2) - (normal * first).sum(dim=-1)
+    reach = torch.matmul(normal, second.transpose(1, 2)).amin(dim=2) - dot(normal, first)
     reach = torch.where(length > 1e-4, reach, -1.0)  # repeated points have no side between them
     best = reach.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)

@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 from torch import Tensor
+from torch.nn import functional
 
 from osfcore.errors import OsfError
 from osfcore.fields.kiloosf import KiloOSF
@@ -52,7 +53,7 @@ def object_shape(field: KiloOSF) -> ObjectShape:
         raise OsfError("A field without any solid part has no shape to predict the motion of.")
     surface = field.origin + field.voxel * surface
     corners = surface[ConvexHull(surface).vertices]
-    solid = ndimage.binary_fill_holes(field.density > SURFACE_G)
+    solid = np.asarray(ndimage.binary_fill_holes(field.density > SURFACE_G))
     centre = field.origin + field.voxel * np.argwhere(solid).mean(axis=0)
     around = (corners - centre).astype(np.float32)
     directions = octahedral_directions(MAP_SIDE).astype(np.float32)
@@ -95,10 +96,11 @@ def octahedral_directions(side: int) -> Float[np.ndarray, "D 3"]:
 
 def octahedral_index(directions: Float[Tensor, "*batch 3"], side: int) -> Tensor:
     """The cell of each direction, of any length but 0."""
-    d = directions / directions.abs().sum(dim=-1, keepdim=True)
-    x, y, z = d.unbind(-1)
-    folded_x = torch.where(z < 0, (1 - y.abs()) * torch.where(x < 0, -1.0, 1.0), x)
-    folded_y = torch.where(z < 0, (1 - x.abs()) * torch.where(y < 0, -1.0, 1.0), y)
+    x, y, z = directions.unbind(-1)
+    length = x.abs() + y.abs() + z.abs()
+    x, y = x / length, y / length
+    folded_x = torch.where(z < 0, torch.copysign(1 - y.abs(), x), x)
+    folded_y = torch.where(z < 0, torch.copysign(1 - x.abs(), y), y)
     i = ((folded_x + 1) * (side / 2)).long().clamp(0, side - 1)
     j = ((folded_y + 1) * (side / 2)).long().clamp(0, side - 1)
     return i * side + j
@@ -125,5 +127,14 @@ class ShapeTable:
         The points are those of the nearest direction on the map; the height over them errs by 0.1 mm at most.
         """
         local = directions @ rotation  # R^T d for every d
+        return self._support(number, local) @ rotation.transpose(1, 2)
+
+    def extents(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
+        """How far A objects reach in D directions of the world from their centres of mass (A, D) [m]."""
+        local = directions @ rotation
+        reach = self._support(number, local) * local
+        return reach[..., 0] + reach[..., 1] + reach[..., 2]
+
+    def _support(self, number: Tensor, local: Float[Tensor, "A D 3"]) -> Float[Tensor, "A D 3"]:
         cell = octahedral_index(local, MAP_SIDE) + number[:, None] * MAP_SIDE**2
-        return self.support[cell] @ rotation.transpose(1, 2)
+        return functional.embedding(cell, self.support)

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from osfcore.dynamics import turns
-from osfcore.dynamics.features import SHIFT_M, TURN_RAD, edge_features, mirrored, node_features
+from osfcore.dynamics.features import SHIFT_M, TURN_RAD, inputs, mirrored
 from osfcore.dynamics.graph import build_graph
-from osfcore.dynamics.motion import Motion, Sweep, lowest_point
+from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, Sweep, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.shapes import ShapeTable
-
-SUBSTEPS = 4  # of one action: the pusher travels 6 cm in one, too far to see contact coming at once
-SLEEP_M = 1e-4  # an object that moves less than this in a substep, and turns less than that, rests
-SLEEP_RAD = 2e-3
 
 
 def advance(
@@ -43,16 +39,17 @@ def advance(
     )
     if not len(graph.scene):
         return rest
-    nodes = node_features(table, graph)
-    edges, receiver = edge_features(graph)
+    seen = inputs(table, graph)
     if mirror is None:
-        answer = network(nodes, edges, receiver, graph.sender)
+        answer = network(seen.nodes, seen.edges, seen.receiver, seen.sender)
     else:
         flags = mirror[graph.scene]
-        nodes, edges = mirrored(nodes, flags, "node"), mirrored(edges, flags[receiver], "edge")
-        answer = mirrored(network(nodes, edges, receiver, graph.sender), flags, "motion")
+        nodes, edges = mirrored(seen.nodes, flags, "node"), mirrored(seen.edges, flags[seen.receiver], "edge")
+        answer = mirrored(network(nodes, edges, seen.receiver, seen.sender), flags, "motion")
+    push = seen.guess
+    answer = answer + torch.cat([push[:, :2], torch.zeros_like(answer[:, :3]), push[:, 2:]], dim=1)
     scale = answer.new_tensor([SHIFT_M] * 3 + [TURN_RAD] * 3)
-    vectors = (answer * scale).view(-1, 2, 3) @ graph.frame
+    vectors = (answer * scale).view(-1, 2, 3) @ seen.frame
     linear, angular = vectors.unbind(1)
     awake = (linear.norm(dim=1) > SLEEP_M) | (angular.norm(dim=1) > SLEEP_RAD)
     linear, angular = linear * awake[:, None], angular * awake[:, None]

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
+from osfcore.dynamics.motion import Motion, lowest_point, sleeping
+from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
-from osfcore.dynamics.step import SUBSTEPS
 from osfcore.errors import InvalidInput
 from osfcore.poses import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply, rotate
 from osfcore.pushfile import PushEpisode
-from osfcore.scene import PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
+from osfcore.scene import TABLE_SIDE_M
 
 _MOVED_M = 1e-3
 _EDGE_M = TABLE_SIDE_M / 2 - 0.05  # what comes nearer to the table's edge may fall: nothing to learn from
@@ -87,20 +87,6 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
                      starts, is_busy, length)  # fmt: skip
 
 
-def pusher_path(
-    start: Float[np.ndarray, "*batch 2"], velocity: Float[np.ndarray, "*batch T 2"]
-) -> Float[np.ndarray, "*batch S1 2"]:
-    """Where the pusher's centre is before the first and after each substep [m]; it stops where its reach ends."""
-    place = np.array(start, float)
-    reach = np.maximum(PUSHER_REACH_M, np.abs(place))
-    path = [place]
-    for step in range(velocity.shape[-2]):
-        for _ in range(SUBSTEPS):
-            place = np.clip(place + velocity[..., step, :] * (STEP_S / SUBSTEPS), -reach, reach)
-            path.append(place)
-    return np.stack(path, axis=-2)
-
-
 def _substates(episode: PushEpisode) -> Pose:
     """All poses of an episode, substep by substep."""
     if episode.sub_positions is None or episode.sub_quaternions is None or episode.sub_positions.shape[1] != SUBSTEPS:
@@ -131,20 +117,14 @@ class Batch(NamedTuple):
     Attributes:
         number: shape of each object.
         motion: at their start.
-        shifts: of the pusher in each substep [m].
         velocity: commanded in each action [m/s].
         targets: the truth.
     """
 
     number: Int[Tensor, "B N"]
     motion: Motion
-    shifts: Float[Tensor, "S B 2"]
     velocity: Float[Tensor, "T B 2"]
     targets: Targets
-
-    def sweep(self, substep: int, motion: Motion) -> Sweep:
-        """What the pusher does in a substep, with the motion before it."""
-        return Sweep(headings(self.velocity[substep // SUBSTEPS], motion), self.shifts[substep])
 
 
 def batch(
@@ -158,7 +138,6 @@ def batch(
     before = (first - 1).clamp(min=0)
     linear = centre[:, 0] - recording.centre[episode, before]
     angular = _turn(recording.quaternion[episode, before], quaternion[:, 0])
-    pusher = recording.pusher[episode[:, None], steps]
     actions = start[:, None] + torch.arange(recording.length)
     number = recording.number[episode].to(device)
 
@@ -168,20 +147,10 @@ def batch(
     lowest = lowest_point(
         table, number.flatten(), put(centre[:, 0].flatten(0, 1)), put(quaternion[:, 0].flatten(0, 1))
     ).view(number.shape)
-    motion = Motion(put(centre[:, 0]), put(quaternion[:, 0]), put(linear), put(angular), put(pusher[:, 0]),
-                    lowest.clamp(max=0))  # fmt: skip
-    motion = sleeping(motion)
-    shifts = put(pusher.diff(dim=1).transpose(0, 1))
+    start = (centre[:, 0], quaternion[:, 0], linear, angular, recording.pusher[episode, first])
+    motion = sleeping(Motion(*[put(part) for part in start], floor=lowest.clamp(max=0)))
     targets = Targets(put(centre[:, 1:].transpose(0, 1)), put(quaternion[:, 1:].transpose(0, 1)))
-    return Batch(number, motion, shifts, put(recording.velocity[episode[:, None], actions].transpose(0, 1)), targets)
-
-
-def sleeping(motion: Motion) -> Motion:
-    """The same with objects that hardly move at rest."""
-    from osfcore.dynamics.step import SLEEP_M, SLEEP_RAD
-
-    awake = (motion.linear.norm(dim=-1) > SLEEP_M) | (motion.angular.norm(dim=-1) > SLEEP_RAD)
-    return motion._replace(linear=motion.linear * awake[..., None], angular=motion.angular * awake[..., None])
+    return Batch(number, motion, put(recording.velocity[episode[:, None], actions].transpose(0, 1)), targets)
 
 
 def _turn(first: Tensor, second: Tensor) -> Tensor:

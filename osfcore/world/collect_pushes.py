@@ -39,6 +39,7 @@ class CollectPushes:
         seed: of everything.
         images: whether to keep frames of camera "0" as well.
         renderer: what takes the frames.
+        names: objects to choose from; all of the library if None.
     """
 
     out: Path
@@ -49,6 +50,7 @@ class CollectPushes:
     seed: int = 0
     images: bool = False
     renderer: Renderer = "embree"
+    names: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +94,9 @@ def collect_pushes(
         OsfError: if there are too few objects.
     """
     _check(config)
-    Tabletop(library, request=SceneRequest(count=config.objects)).close()  # refuses before anything is written
+    Tabletop(
+        library, request=SceneRequest(count=config.objects, among=config.names)
+    ).close()  # refuses before anything is written
     settings = {
         "steps": config.steps,
         "objects": config.objects,
@@ -100,7 +104,7 @@ def collect_pushes(
         "seed": config.seed,
         "images": config.images,
         "renderer": config.renderer,
-        "available": list(library.names()),
+        "available": list(library.names() if config.names is None else config.names),
     }
     try:
         config.out.parent.mkdir(parents=True, exist_ok=True)
@@ -198,16 +202,16 @@ def _episodes(
 
 
 @functools.lru_cache(maxsize=2)
-def _tabletop(root: Path, objects: int, renderer: Renderer) -> Tabletop:
+def _tabletop(root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer) -> Tabletop:
     """One simulator per process and setting: its meshes stay loaded from episode to episode."""
-    request = SceneRequest(count=objects)
+    request = SceneRequest(count=objects, among=names)
     return Tabletop(AssetLibrary(root), cameras=default_cameras()[:1], request=request, renderer=renderer)
 
 
 def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> Path:
     """Simulate one episode, which depends on nothing but the settings and its index, and save it."""
     seed = int(np.random.SeedSequence((config.seed, index)).generate_state(1)[0])
-    world = _tabletop(root, config.objects, config.renderer)
+    world = _tabletop(root, config.objects, config.names, config.renderer)
     world.arrange(seed)
     rng = np.random.default_rng((config.seed, index, 1))
     policy = PaperPolicy(rng) if config.policy == "paper" else DirectedPolicy(world.assets, rng)

@@ -51,11 +51,13 @@ class SceneRequest:
         names: the objects, or None for a random choice.
         count: how many objects, where `names` is None.
         light: the light, or None for a random one at least 10 deg above the table.
+        among: what to choose from, where `names` is None; all objects of the library if None.
     """
 
     names: tuple[str, ...] | None = None
     count: int = 3
     light: Light | None = None
+    among: tuple[str, ...] | None = None
 
 
 class Tabletop:
@@ -171,7 +173,7 @@ class Tabletop:
         rng = np.random.default_rng(seed)
         names = self._request.names
         if names is None:
-            available = self._library.names()
+            available = self._library.names() if self._request.among is None else self._request.among
             names = tuple(available[i] for i in rng.choice(len(available), self._request.count, replace=False))
         self._load_objects(names)
         place_randomly(self._bodies, self.assets, rng)
@@ -393,8 +395,12 @@ def _check_request(library: AssetLibrary, request: SceneRequest) -> None:
         return
     if not 1 <= request.count <= MAX_OBJECTS:
         raise InvalidInput("number of objects", request.count, f"between 1 and {MAX_OBJECTS}")
-    available = len(library.names())
+    for name in request.among or ():
+        _check_object(library, name)
+    available = len(library.names() if request.among is None else request.among)
     if available == 0:
         raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
     if request.count > available:
-        raise InvalidInput("number of objects", request.count, f"at most {available}, as many as were fetched")
+        raise InvalidInput(
+            "number of objects", request.count, f"at most {available}, as many as there are to choose from"
+        )

@@ -1,0 +1,89 @@
+"""Pushing without learning: quasi-static sliding with an ellipsoidal limit surface.
+
+Objects are their outlines seen from above and slide so slowly that friction with the table balances every push (Mason
+1986). Friction force and moment lie on an ellipsoid (Howe and Cutkosky 1996), so that a push through a contact decides
+the whole motion, sticking or sliding along the contact (Lynch, Maekawa and Tanie 1992). Nothing rolls, tilts, topples
+or goes on by itself. An object pushed by another one is moved out of its way along the contact's normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from osfcore.dynamics import turns
+from osfcore.dynamics.graph import OUTLINE
+from osfcore.dynamics.motion import Motion
+from osfcore.dynamics.outline import circle, gap_between, gap_to_point
+from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.sliding import lever, slide
+from osfcore.scene import PUSHER_RADIUS_M
+
+_STRETCH_M = 0.0025  # the pusher travels at most this far between two looks at contacts
+
+
+def push(
+    table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, shifts: Float[Tensor, "S B 2"]
+) -> Iterator[Motion]:
+    """The scenes after each of the pusher's displacements [m]."""
+    outline = _outlines(table, number, motion)
+    arm = lever(outline)
+    for shift in shifts:
+        parts = max(int(torch.ceil(shift.norm(dim=1).max() / _STRETCH_M)), 1)
+        for _ in range(parts):
+            motion, outline = _stretch(motion, outline, arm, shift / parts)
+        yield motion
+
+
+def _outlines(table: ShapeTable, number: Tensor, motion: Motion) -> Float[Tensor, "B N K 2"]:
+    """Outlines around the centres of mass."""
+    rotation = turns.matrix(motion.quaternion.flatten(0, 1))
+    flat = functional.pad(circle(OUTLINE, rotation.device), (0, 1))
+    return table.farthest(number.flatten(), rotation, flat)[..., :2].unflatten(0, number.shape)
+
+
+def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tuple[Motion, Tensor]:
+    """One short displacement of the pusher: first what it touches, then what these touch."""
+    pusher = motion.pusher + shift
+    count = motion.centre.shape[1]
+    pushed = torch.zeros_like(arm, dtype=torch.bool)
+    for i in range(count):
+        gap = gap_to_point(outline[:, i], pusher - motion.centre[:, i, :2])
+        depth = PUSHER_RADIUS_M - gap.distance
+        pushed[:, i] = depth > 0
+        way = slide(gap.point, -gap.normal, depth.clamp(min=0), shift, arm[:, i])
+        motion, outline = _moved(motion, outline, i, way)
+    for _ in range(count - 1):
+        before = pushed.clone()
+        for i in range(count):
+            for j in range(count):
+                if i != j:
+                    motion, outline = _shove(motion, outline, arm, (i, j), before, pushed)
+    return motion._replace(pusher=pusher), outline
+
+
+def _shove(motion: Motion, outline: Tensor, arm: Tensor, pair: tuple[int, int], before: Tensor, pushed: Tensor):  # noqa: ANN202
+    """Object j out of the way of a pushed object i; marks it as pushed."""
+    i, j = pair
+    offset = (motion.centre[:, i, :2] - motion.centre[:, j, :2])[:, None]
+    gap = gap_between(outline[:, j], outline[:, i] + offset)
+    depth = (-gap.distance) * (before[:, i] & ~before[:, j] & (gap.distance < 0))
+    pushed[:, j] |= depth > 0
+    way = slide(gap.point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[:, j])
+    return _moved(motion, outline, j, way)
+
+
+def _moved(motion: Motion, outline: Tensor, i: int, slide: Tensor) -> tuple[Motion, Tensor]:
+    """One object of each scene slid and turned."""
+    centre, quaternion, outline = motion.centre.clone(), motion.quaternion.clone(), outline.clone()
+    centre[:, i, :2] += slide[:, :2]
+    turn = functional.pad(slide[:, 2:], (2, 0))
+    quaternion[:, i] = turns.unit(turns.multiply(turns.exponential(turn), quaternion[:, i]))
+    cosine, sine = slide[:, 2].cos()[:, None], slide[:, 2].sin()[:, None]
+    x, y = outline[:, i].unbind(-1)
+    outline[:, i] = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
+    return motion._replace(centre=centre, quaternion=quaternion), outline

@@ -1,0 +1,172 @@
+"""Predicting what sequences of actions do to a scene (paper eq. 7, open loop)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from osfcore.dynamics import turns
+from osfcore.dynamics.motion import Motion, lowest_point
+from osfcore.dynamics.network import PropagationNetwork
+from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes import ObjectShape, ShapeTable
+from osfcore.dynamics.unroll import set_moving, unroll
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.poses import rotate
+from osfcore.rollouts import Rollouts, check_actions
+from osfcore.scene import SceneState, check_action
+
+_CHUNK = 4096  # sequences rolled out at once: more would not be faster
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Before:
+    """What was there one action ago: tells how fast things are now.
+
+    Attributes:
+        state: the same objects before that action.
+        action: velocity of the pusher since then [m/s].
+    """
+
+    state: SceneState
+    action: Float[np.ndarray, "3"]
+
+
+class PushModel:
+    """A trained network with the shapes of the objects it is asked about.
+
+    Args:
+        network: predicts the motion of one substep.
+        shapes: of all objects that may be asked about, by name.
+        device: that computes.
+    """
+
+    def __init__(
+        self,
+        network: PropagationNetwork,
+        shapes: Mapping[str, ObjectShape],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.device = torch.device(device)
+        self._network = network.to(self.device).eval()
+        self._names = tuple(sorted(shapes))
+        self._table = ShapeTable(tuple(shapes[name] for name in self._names), self.device)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Objects whose shapes are known."""
+        return self._names
+
+    def rollout(self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: Before | None = None) -> Rollouts:
+        """Where K sequences of T actions would lead.
+
+        Objects are put into the order of their names inside, so that the order in which they come never matters. What
+        nothing can touch keeps its pose bit by bit.
+
+        Args:
+            state: of the scene, with its pusher.
+            actions: velocities (vx, vy, 0) of the pusher [m/s], each held for 0.2 s.
+            before: the scene one action ago, if something may still be moving; else everything is at rest.
+
+        Raises:
+            InvalidInput: if there are no objects or no pusher, or actions have another shape, are too many, not finite
+                or beyond the limits; nothing is clipped.
+            UnknownName: if the shape of an object is not known.
+        """
+        actions = check_actions(actions)
+        self._check(state)
+        order = sorted(range(len(state.names)), key=state.names.__getitem__)
+        names = tuple(state.names[i] for i in order)
+        with torch.inference_mode():
+            start = self._start(state, order, names, before)
+            number = self._number(names)
+            parts = [self._unroll(number, start, actions[k : k + _CHUNK]) for k in range(0, len(actions), _CHUNK)]
+        centre, turned, moved = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        return self._told(state, order, centre, turned, moved, actions)
+
+    def _check(self, state: SceneState) -> None:
+        if not state.names:
+            raise InvalidInput("number of objects", 0, "at least 1")
+        if state.pusher is None:
+            raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
+        for name in state.names:
+            if name not in self._names:
+                raise UnknownName("shape", name, self._names)
+
+    def _number(self, names: tuple[str, ...]) -> Tensor:
+        return torch.tensor([self._names.index(name) for name in names], device=self.device)[None]
+
+    def _at_rest(self, state: SceneState, order: list[int], number: Tensor) -> Motion:
+        """One scene in which nothing moves."""
+        assert state.pusher is not None  # checked
+        quaternion = self._tensor(state.poses.quaternion[order])
+        centre = self._tensor(state.poses.position[order]) + turns.rotate(quaternion, self._table.centre[number[0]])
+        lowest = lowest_point(self._table, number[0], centre.float(), quaternion.float())
+        still = torch.zeros_like(centre, dtype=torch.float32)[None]
+        pusher = self._tensor(state.pusher[:2]).float()[None]
+        return Motion(centre.float()[None], quaternion.float()[None], still, still, pusher, lowest.clamp(max=0)[None])
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array, float), device=self.device)
+
+    def _start(self, state: SceneState, order: list[int], names: tuple[str, ...], before: Before | None) -> Motion:
+        """The state as it is, moving as it would after the action before, which is predicted as well."""
+        number = self._number(names)
+        start = self._at_rest(state, order, number)
+        if before is None:
+            return start
+        self._check(before.state)
+        if sorted(before.state.names) != list(names):
+            raise InvalidInput("objects one action ago", ", ".join(before.state.names), "those of the state")
+        earlier = sorted(range(len(names)), key=before.state.names.__getitem__)
+        former = self._at_rest(before.state, earlier, number)
+        velocity = torch.as_tensor(check_action(before.action)[None, :2], dtype=torch.float32, device=self.device)
+        return set_moving(self._network, self._table, number, former, velocity, start)
+
+    def _unroll(self, number: Tensor, start: Motion, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centres of mass, orientations and whether anything moved since the start, after each action."""
+        centres, turned, moved = [], [], []
+        has_moved = torch.zeros(len(actions), number.shape[1], dtype=torch.bool, device=self.device)
+        count = len(actions)
+        velocity = torch.as_tensor(actions[..., :2], dtype=torch.float32, device=self.device).transpose(0, 1)
+        scenes = Motion(*(part.expand(count, *part.shape[1:]) for part in start))
+        motions = unroll(self._network, self._table, number.expand(count, -1), scenes, velocity)
+        for step, motion in enumerate(motions, start=1):
+            has_moved = has_moved | (motion.linear.abs().amax(dim=2) > 0) | (motion.angular.abs().amax(dim=2) > 0)
+            if step % SUBSTEPS == 0:
+                centres.append(motion.centre)
+                turned.append(motion.quaternion)
+                moved.append(has_moved)
+        return tuple(torch.stack(part, dim=1).cpu().numpy() for part in (centres, turned, moved))  # pyright: ignore[reportReturnType]
+
+    def _told(
+        self,
+        state: SceneState,
+        order: list[int],
+        centre: Float[np.ndarray, "K T N 3"],
+        turned: Float[np.ndarray, "K T N 4"],
+        moved: Bool[np.ndarray, "K T N"],
+        actions: Float[np.ndarray, "K T 3"],
+    ) -> Rollouts:
+        """Poses in the order of the state; the given ones where nothing moved."""
+        count, horizon = actions.shape[:2]
+        names = tuple(state.names[i] for i in order)
+        offsets = self._table.centre[self._number(names)[0]].cpu().numpy()
+        turned = turned.astype(float)
+        turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+        placed = centre.astype(float) - rotate(turned, offsets)
+        positions = np.broadcast_to(state.poses.position, (count, horizon + 1, len(order), 3)).copy()
+        quaternions = np.broadcast_to(state.poses.quaternion, (count, horizon + 1, len(order), 4)).copy()
+        for place, slot in enumerate(order):
+            here = moved[..., place]
+            positions[:, 1:, slot][here] = placed[..., place, :][here]
+            quaternions[:, 1:, slot][here] = turned[..., place, :][here]
+        assert state.pusher is not None
+        path = pusher_path(state.pusher[:2], actions[..., :2])[:, ::SUBSTEPS]
+        height = np.full((*path.shape[:2], 1), state.pusher[2])
+        return Rollouts(state.names, positions, quaternions, np.concatenate([path, height], axis=-1))

@@ -1,0 +1,61 @@
+"""Many scenes through many substeps (paper eq. 7, open loop)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from osfcore.dynamics.motion import Motion, Sweep, headings
+from osfcore.dynamics.network import PropagationNetwork
+from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.step import advance
+
+_REALLY_MOVED_M = 1e-3  # during the action before: what moved less is taken to be at rest
+
+
+def unroll(
+    network: PropagationNetwork,
+    table: ShapeTable,
+    number: Int[Tensor, "B N"],
+    motion: Motion,
+    velocity: Float[Tensor, "T B 2"],
+    mirror: Bool[Tensor, "B"] | None = None,
+) -> Iterator[Motion]:
+    """The scenes after each substep of T actions.
+
+    Args:
+        network: predicts the motion of what can move.
+        table: shapes of the objects.
+        number: which of them each object is.
+        motion: the scenes before the first action.
+        velocity: of the pusher in each action [m/s].
+        mirror: scenes to be seen in a mirror along the heading, in training.
+    """
+    path = pusher_path(motion.pusher.double().cpu().numpy(), velocity.transpose(0, 1).double().cpu().numpy())
+    shifts = torch.as_tensor(np.diff(path, axis=1), dtype=torch.float32, device=number.device)
+    for step in range(shifts.shape[1]):
+        sweep = Sweep(headings(velocity[step // SUBSTEPS], motion), shifts[:, step])
+        motion = advance(network, table, number, motion, sweep, mirror)
+        yield motion
+
+
+def set_moving(
+    network: PropagationNetwork,
+    table: ShapeTable,
+    number: Int[Tensor, "B N"],
+    former: Motion,
+    velocity: Float[Tensor, "B 2"],
+    motion: Motion,
+) -> Motion:
+    """The scenes with the velocities that they should have, after one action that began in the former scenes.
+
+    Velocities are predicted from the former scenes; what hardly moved meanwhile rests.
+    """
+    *_, last = unroll(network, table, number, former, velocity[None])
+    moved = (motion.centre - former.centre).norm(dim=-1, keepdim=True) > _REALLY_MOVED_M
+    return motion._replace(linear=last.linear * moved, angular=last.angular * moved)
