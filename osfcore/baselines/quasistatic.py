@@ -8,6 +8,7 @@ or goes on by itself. An object pushed by another one is moved out of its way al
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import torch
@@ -49,41 +50,58 @@ def _outlines(table: ShapeTable, number: Tensor, motion: Motion) -> Float[Tensor
 def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tuple[Motion, Tensor]:
     """One short displacement of the pusher: first what it touches, then what these touch."""
     pusher = motion.pusher + shift
+    radius = outline.square().sum(dim=-1).amax(dim=-1).sqrt()
     count = motion.centre.shape[1]
     pushed = torch.zeros_like(arm, dtype=torch.bool)
     for i in range(count):
-        gap = gap_to_point(outline[:, i], pusher - motion.centre[:, i, :2])
+        away = pusher - motion.centre[:, i, :2]
+        rows = (away.norm(dim=1) < radius[:, i] + PUSHER_RADIUS_M).nonzero()[:, 0]
+        if not len(rows):
+            continue
+        gap = gap_to_point(outline[rows, i], away[rows])
         depth = PUSHER_RADIUS_M - gap.distance
-        pushed[:, i] = depth > 0
-        way = slide(gap.point, -gap.normal, depth.clamp(min=0), shift, arm[:, i])
-        motion, outline = _moved(motion, outline, i, way)
+        pushed[rows, i] = depth > 0
+        way = slide(gap.point, -gap.normal, depth.clamp(min=0), shift[rows], arm[rows, i])
+        motion, outline = _moved(motion, outline, (rows, i), way)
     for _ in range(count - 1):
         before = pushed.clone()
-        for i in range(count):
-            for j in range(count):
-                if i != j:
-                    motion, outline = _shove(motion, outline, arm, (i, j), before, pushed)
+        for i, j in itertools.permutations(range(count), 2):
+            motion, outline = _shove(motion, outline, arm, (i, j), before, pushed, radius)
     return motion._replace(pusher=pusher), outline
 
 
-def _shove(motion: Motion, outline: Tensor, arm: Tensor, pair: tuple[int, int], before: Tensor, pushed: Tensor):  # noqa: ANN202
+def _shove(
+    motion: Motion,
+    outline: Tensor,
+    arm: Tensor,
+    pair: tuple[int, int],
+    before: Tensor,
+    pushed: Tensor,
+    radius: Tensor,
+) -> tuple[Motion, Tensor]:
     """Object j out of the way of a pushed object i; marks it as pushed."""
     i, j = pair
-    offset = (motion.centre[:, i, :2] - motion.centre[:, j, :2])[:, None]
-    gap = gap_between(outline[:, j], outline[:, i] + offset)
-    depth = (-gap.distance) * (before[:, i] & ~before[:, j] & (gap.distance < 0))
-    pushed[:, j] |= depth > 0
-    way = slide(gap.point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[:, j])
-    return _moved(motion, outline, j, way)
+    offset = motion.centre[:, i, :2] - motion.centre[:, j, :2]
+    meets = before[:, i] & ~before[:, j] & (offset.norm(dim=1) < radius[:, i] + radius[:, j])
+    rows = meets.nonzero()[:, 0]
+    if not len(rows):
+        return motion, outline
+    gap = gap_between(outline[rows, j], outline[rows, i] + offset[rows, None])
+    depth = (-gap.distance).clamp(min=0)
+    pushed[rows, j] |= depth > 0
+    way = slide(gap.point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[rows, j])
+    return _moved(motion, outline, (rows, j), way)
 
 
-def _moved(motion: Motion, outline: Tensor, i: int, slide: Tensor) -> tuple[Motion, Tensor]:
-    """One object of each scene slid and turned."""
+def _moved(
+    motion: Motion, outline: Tensor, place: tuple[Int[Tensor, "R"], int], way: Float[Tensor, "R 3"]
+) -> tuple[Motion, Tensor]:
+    """One object of some scenes slid and turned."""
     centre, quaternion, outline = motion.centre.clone(), motion.quaternion.clone(), outline.clone()
-    centre[:, i, :2] += slide[:, :2]
-    turn = functional.pad(slide[:, 2:], (2, 0))
-    quaternion[:, i] = turns.unit(turns.multiply(turns.exponential(turn), quaternion[:, i]))
-    cosine, sine = slide[:, 2].cos()[:, None], slide[:, 2].sin()[:, None]
-    x, y = outline[:, i].unbind(-1)
-    outline[:, i] = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
+    centre[place] = centre[place] + functional.pad(way[:, :2], (0, 1))
+    turn = functional.pad(way[:, 2:], (2, 0))
+    quaternion[place] = turns.unit(turns.multiply(turns.exponential(turn), quaternion[place]))
+    cosine, sine = way[:, 2].cos()[:, None], way[:, 2].sin()[:, None]
+    x, y = outline[place].unbind(-1)
+    outline[place] = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
     return motion._replace(centre=centre, quaternion=quaternion), outline

@@ -161,6 +161,8 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, gap: Gap, kept: Bool[Tens
         torch.cat([gap.normal, -gap.normal]),
         torch.cat([gap.point, opposite]),
     )
-    nodes: list[Any] = [Gap(*(p[kept] for p in part)) if isinstance(part, Gap) else part[kept] for part in graph[:_NODE_PARTS]]
+    nodes: list[Any] = [
+        Gap(*(p[kept] for p in part)) if isinstance(part, Gap) else part[kept] for part in graph[:_NODE_PARTS]
+    ]
     first, second = renumbered[first], renumbered[second]
     return Graph(*nodes, torch.cat([first, second]), torch.cat([second, first]), pair)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -64,3 +67,12 @@ def read_network(path: Path) -> PropagationNetwork:
 def shipped(name: str = "pushes") -> Path:
     """The file of a network that comes with the package."""
     return Path(str(files("osfcore.dynamics") / "shipped" / f"{name}.safetensors"))
+
+
+def read_metrics(path: Path) -> Mapping[str, Any]:
+    """What is known of how a network was trained, from the JSON beside its file; empty if that cannot be read."""
+    try:
+        content = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
