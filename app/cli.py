@@ -15,6 +15,7 @@ from app.commands.check import Check
 from app.commands.collect import Collect
 from app.commands.estimate import Estimate
 from app.commands.evaluate import Evaluate
+from app.commands.predict import Predict
 from app.commands.render import Render
 from app.commands.serve import Serve
 from app.commands.train import Train
@@ -38,9 +39,10 @@ Commands = Annotated[
     Annotated[Serve, tyro.conf.subcommand("serve", description="Start the service and its page.")]
     | Annotated[Assets, tyro.conf.subcommand("assets", description="List, fetch and add objects.")]
     | Annotated[Collect, tyro.conf.subcommand("collect", description="Collect image sets, pushes and observations.")]
-    | Annotated[Train, tyro.conf.subcommand("train", description="Train fields from image sets.")]
+    | Annotated[Train, tyro.conf.subcommand("train", description="Train fields from images, dynamics from pushes.")]
     | Annotated[Render, tyro.conf.subcommand("render", description="Render a scene through its fields.")]
     | Annotated[Estimate, tyro.conf.subcommand("estimate", description="Find poses and light in images.")]
+    | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
     | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],

@@ -12,7 +12,7 @@ from app.commands.progress_bar import follow
 from app.paths import default_data_dir
 
 _FIGURES, _PICTURE = "render.json", "render.png"
-_ESTIMATE_FIGURES = "estimate.json"
+_ESTIMATE_FIGURES, _DYNAMICS_FIGURES = "estimate.json", "dynamics.json"
 _SCENES = {"render": 60, "estimate": 5}
 
 
@@ -21,9 +21,10 @@ class Bench:
     """Measure what things cost. Run alone on the machine.
 
     render: new scenes against TinyRenderer, planning, growth. estimate: first frames, later frames and goals.
+    dynamics: 1,000 sequences of ten pushes among three objects.
     """
 
-    what: tyro.conf.Positional[Literal["render", "estimate"]]
+    what: tyro.conf.Positional[Literal["render", "estimate", "dynamics"]]
     """What to measure."""
     out: Path | None = None
     """Folder for the figures as JSON and, with render, a picture of scenes by TinyRenderer and by us."""
@@ -33,6 +34,8 @@ class Bench:
     """New scenes; by default 60 to render and 5 to estimate."""
     repeats: int = 5
     """With render: of everything else."""
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """With dynamics: what computes."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Where fetched objects and trained fields are."""
     json: bool = False
@@ -40,6 +43,8 @@ class Bench:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds figures and tables."""
+        if self.what == "dynamics":
+            return self._dynamics()
         scenes = _SCENES[self.what] if self.scenes is None else self.scenes
         return self._estimate(scenes) if self.what == "estimate" else self._render(scenes)
 
@@ -83,6 +88,31 @@ class Bench:
                 f"{result['scenes']} scenes of {result['objects']} objects, {result['threads']} threads, medians: "
                 f"first frame {result['first_s']:.1f} s, later frame {result['next_s']:.2f} s "
                 f"({result['refine_hz']:.1f} Hz), goal {result['goal_s']:.1f} s."
+            )
+        return result
+
+    def _dynamics(self) -> dict[str, Any]:
+        from dataclasses import asdict
+
+        from osfcore.dynamics.library import network_path
+        from osfcore.dynamics.shapes import object_shape
+        from osfcore.dynamics.weights import read_network
+        from osfcore.evaluate.bench_dynamics import BENCH_NAMES, HORIZON, SEQUENCES, bench_rollouts
+        from osfcore.fields.devices import pick_device
+        from osfcore.fields.library import FieldLibrary
+        from osfcore.files import write_json
+
+        self._check_places(_DYNAMICS_FIGURES)
+        library = FieldLibrary(self.data_dir)
+        shapes = {name: object_shape(library.load(name)) for name in BENCH_NAMES}
+        result = asdict(bench_rollouts(read_network(network_path(self.data_dir)), shapes, pick_device(self.device)))
+        if self.out is not None:
+            write_json(self.out / _DYNAMICS_FIGURES, result)
+        if not self.json:
+            print(
+                f"{SEQUENCES} sequences of {HORIZON} pushes among {len(BENCH_NAMES)} objects, {result['threads']} "
+                f"threads: {result['rollout_s']:.2f} s; {result['rollout_steps_per_s']:.0f} steps of scenes a second; "
+                f"something moves in {100 * result['touched_share']:.0f} % of the sequences."
             )
         return result
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from app.commands.progress_bar import follow
+from app.commands.workers import worker_pool
 from app.paths import default_data_dir
 from osfcore.errors import InvalidInput
 
@@ -23,14 +24,16 @@ _FOLDER = "evaluation"  # of the data directory
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure trained fields, or the estimators that use them, on random scenes under harsh lights.
+    """Measure trained fields, the estimators that use them, or predicted pushes, on what nothing was trained on.
 
     fields: each object alone on unseen views under unseen lights, and scenes of several. estimate: poses and light
     from first frames, along pushes without masks and of goals, what each ingredient is worth, and spoiled inputs.
+    dynamics: predicted pushes of two to six objects against the simulator, against a quasi-static model, and against
+    the constant pose; objects and pairs of objects that training never saw.
     Results are kept in the output folder: a killed evaluation goes on when started again, and may be run in pieces.
     """
 
-    what: tyro.conf.Positional[Literal["fields", "estimate"]]
+    what: tyro.conf.Positional[Literal["fields", "estimate", "dynamics"]]
     """What to evaluate."""
     out: Path | None = None
     """Folder for results and pictures; DATA_DIR/evaluation by default."""
@@ -46,6 +49,8 @@ class Evaluate:
     """With estimate: what to measure; first frames are in any case."""
     bad: int = 0
     """With estimate: number of spoiled inputs (100 gives ten of each kind)."""
+    workers: int = 2
+    """With dynamics: processes that simulate side by side."""
     data: Path | None = None
     """With --weights: measure on the test images of this set in the OSF format instead of the simulator's."""
     weights: Path | None = None
@@ -57,6 +62,8 @@ class Evaluate:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
+        if self.what == "dynamics":
+            return self._dynamics()
         last, show = self._estimates() if self.what == "estimate" else (follow(self._steps()), _show)
         assert last is not None
         assert last.report is not None, "the last step brings the report"
@@ -93,6 +100,24 @@ class Evaluate:
         config = EvaluateEstimate(self._folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         return follow(evaluate_estimate(config, fields, assets)), partial(_show_estimate, config.folder)
+
+    def _dynamics(self) -> dict[str, Any]:
+        """Measure predicted pushes."""
+        from osfcore.evaluate.dynamics import EvaluateDynamics, evaluate_dynamics
+        from osfcore.fields.library import FieldLibrary
+        from osfcore.objects.library import AssetLibrary
+
+        if self.data is not None or self.weights is not None:
+            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
+        config = EvaluateDynamics(self._folder, self.tasks, self.seed, self.names, self.data_dir)
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        with worker_pool(self.workers) as executor:
+            last = follow(evaluate_dynamics(config, fields, assets, executor))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        if not self.json:
+            _show_dynamics(config.folder, last.report)
+        return last.report
 
 
 def _show(result: dict[str, Any]) -> None:
@@ -152,6 +177,25 @@ def _show_estimate(folder: Path, result: dict[str, Any]) -> None:
             f"{result['bad_right']} right, {result['bad_confident_wrong']} wrong without a warning."
         )
     print(f"Pictures and figures: {folder}")
+
+
+def _show_dynamics(folder: Path, result: dict[str, Any]) -> None:
+    """The report for people, a line for each part."""
+    print(f"Three objects, {result['windows']} that moved within 4 steps of 0.2 s:")
+    for horizon in (1, 4, 10, 30):
+        mm, deg = result[f"median_mm_{horizon}"], result[f"median_deg_{horizon}"]
+        constant = f" (constant pose {_number(result[f'constant_mm_{horizon}'])}, "
+        others = f"{constant}quasi-static {_number(result[f'analytic_mm_{horizon}'])} mm)" if horizon > 1 else ""
+        print(f"  after {horizon}: median {_number(mm)} mm, {_number(deg)} deg{others}")
+    print(f"  what does not move drifts by {_number(result['still_drift_mm_30'], 2)} mm in 30 steps")
+    for count, row in result["by_objects"].items():
+        print(f"{count} objects: {_number(row['median_mm_4'])} mm, {_number(row['median_deg_4'])} deg after 4 steps")
+    if result["unseen_objects"]:
+        told = (
+            f"{_number(result['unseen_objects_mm_4'])} mm; having seen them {_number(result['seen_objects_mm_4'])} mm"
+        )
+        print(f"Objects never seen ({', '.join(result['unseen_objects'])}): {told}")
+    print(f"{result['rollout_steps_per_s']} steps of scenes a second. Pictures and figures: {folder}")
 
 
 def _errors(row: dict[str, Any]) -> str:

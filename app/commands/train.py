@@ -1,16 +1,17 @@
-"""`osf train`: fields from image sets."""
+"""`osf train`: fields from image sets, dynamics from pushes."""
 
 from __future__ import annotations
 
 import json as json_text
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from app.commands.progress_bar import follow
+from app.paths import default_data_dir
 
 if TYPE_CHECKING:
     from osfcore.fields.training import FieldStep
@@ -95,6 +96,65 @@ class TrainTableCommand:
         return {"out": str(self.out), **metrics}
 
 
+@dataclass(frozen=True)
+class TrainDynamicsCommand:
+    """What pushes do, from recorded ones. A killed training goes on when started again."""
+
+    data: tuple[Path, ...]
+    """Push files that 'osf collect pushes' wrote; one in twelve episodes is held out."""
+    out: Path
+    """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
+    iterations: int = 14_000
+    """Steps of descent, at most."""
+    patience: int = 6
+    """Measurements on held-out episodes without a better one after which training stops."""
+    without: tuple[str, ...] = ()
+    """Objects whose episodes are left out."""
+    hidden: int = 128
+    """Width of the network."""
+    batch: int = 192
+    """Windows of a single action in a step of descent; a third as many of three actions."""
+    rate: float = 2e-3
+    """Of learning, at its highest."""
+    short_share: float = 0.6
+    """Share of the steps with single actions, before those with three."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fields trained on this machine are: shapes come from fields."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        from osfcore.dynamics.shapes import object_shape
+        from osfcore.dynamics.training import TrainDynamics, train_dynamics
+        from osfcore.fields.library import FieldLibrary
+
+        config = TrainDynamics(
+            self.data,
+            self.out,
+            iterations=self.iterations,
+            short_share=self.short_share,
+            batch=self.batch,
+            hidden=self.hidden,
+            rate=self.rate,
+            patience=self.patience,
+            without=self.without,
+            device=self.device,
+            seed=self.seed,
+        )
+        library = FieldLibrary(self.data_dir)
+        follow(train_dynamics(config, {name: object_shape(library.load(name)) for name in library.names()}))
+        metrics = _metrics(self.out)
+        if not self.json:
+            mm, deg = metrics["validation_mm_4"], metrics["validation_deg_4"]
+            print(f"Wrote {self.out}: held out, {mm:.1f} mm and {deg:.1f} deg after 4 steps.")
+        return {"out": str(self.out), **metrics}
+
+
 def _progress(steps: Iterator[FieldStep]) -> Iterator[Progress]:
     for step in steps:
         yield step.progress
@@ -106,6 +166,7 @@ def _metrics(out: Path) -> dict[str, Any]:
 
 Train = Annotated[
     Annotated[TrainFieldCommand, tyro.conf.subcommand("field")]
-    | Annotated[TrainTableCommand, tyro.conf.subcommand("table")],
+    | Annotated[TrainTableCommand, tyro.conf.subcommand("table")]
+    | Annotated[TrainDynamicsCommand, tyro.conf.subcommand("dynamics")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

@@ -8,7 +8,7 @@ or that move, or that can be touched by one of these, take part; all others stay
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -161,8 +161,6 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, gap: Gap, kept: Bool[Tens
         torch.cat([gap.normal, -gap.normal]),
         torch.cat([gap.point, opposite]),
     )
-    nodes: list[Any] = [
-        Gap(*(p[kept] for p in part)) if isinstance(part, Gap) else part[kept] for part in graph[:_NODE_PARTS]
-    ]
+    nodes = [Gap(*(p[kept] for p in part)) if isinstance(part, Gap) else part[kept] for part in graph[:_NODE_PARTS]]
     first, second = renumbered[first], renumbered[second]
-    return Graph(*nodes, torch.cat([first, second]), torch.cat([second, first]), pair)
+    return Graph._make([*nodes, torch.cat([first, second]), torch.cat([second, first]), pair])

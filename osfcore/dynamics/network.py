@@ -25,10 +25,6 @@ class PropagationNetwork(nn.Module):
 
     def __init__(self, hidden: int = 128, steps: int = 3) -> None:
         super().__init__()
-        import os
-
-        global NORM
-        NORM = os.environ.get("NORM")
         self.hidden, self.steps = hidden, steps
         self.node_encoder = _two_layers(NODE_FEATURES, hidden)
         self.edge_encoder = _two_layers(EDGE_FEATURES, hidden)

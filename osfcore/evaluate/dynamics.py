@@ -19,7 +19,7 @@ from osfcore.dynamics.library import network_path
 from osfcore.dynamics.shapes import ObjectShape, object_shape
 from osfcore.dynamics.weights import read_metrics, read_network, shipped
 from osfcore.errors import InvalidInput, MissingAssets
-from osfcore.evaluate.bench_dynamics import rollout_rate
+from osfcore.evaluate.bench_dynamics import BENCH_NAMES, rollout_rate
 from osfcore.evaluate.dynamics_plots import write_gallery, write_plots
 from osfcore.evaluate.dynamics_report import DynamicsReport, Scored, report_json
 from osfcore.evaluate.dynamics_scores import analytic, constant, errors, learned, windows_of
@@ -123,7 +123,7 @@ def evaluate_dynamics(
         by_set={key: value for key, value in scored.items() if key != _UNSEEN},
         unseen=scored.get(_UNSEEN),
         unseen_names=unseen,
-        rollout_steps_per_s=rollout_rate(network, shapes),
+        rollout_steps_per_s=rollout_rate(network, {name: object_shape(fields.load(name)) for name in BENCH_NAMES}),
     )
     write_plots(config.folder, report)
     write_gallery(config.folder, report, shapes)

@@ -1,0 +1,90 @@
+"""Scenes to push things around in: real shapes on the table, and networks that have learned nothing."""
+
+import numpy as np
+import torch
+
+from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
+from osfcore.dynamics.network import PropagationNetwork
+from osfcore.dynamics.pusher import SUBSTEPS
+from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate
+from osfcore.scene import PUSHER_CENTRE_Z_M, STEP_S, Light, SceneState
+
+BOX, CAN, GELATIN, APPLE = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box", "013_apple")
+
+
+def hull(shape) -> np.ndarray:
+    """Points whose convex hull is the shape's, around its centre of mass (P, 3) [m]."""
+    return np.unique(shape.support, axis=0).astype(float)
+
+
+def on_table(shape, x: float, y: float, turn=(0.0, 0.0, 0.0)) -> Pose:
+    """An object turned by a rotation vector, its centre of mass over (x, y), touching the table."""
+    quaternion = quaternion_exp(np.asarray(turn, float))
+    height = -rotate(quaternion, hull(shape))[:, 2].min()
+    return Pose(np.array([x, y, height]) - rotate(quaternion, shape.centre), quaternion)
+
+
+def scene(shapes, placed: dict[str, tuple], pusher=(0.0, 0.0)) -> SceneState:
+    """A state of objects given as name: arguments of `on_table`."""
+    poses = [on_table(shapes[name], *where) for name, where in placed.items()]
+    pose = Pose(
+        np.array([p.position for p in poses]).reshape(-1, 3), np.array([p.quaternion for p in poses]).reshape(-1, 4)
+    )
+    return SceneState(tuple(placed), pose, Light(np.array([0.0, 0, 1])), np.array([*pusher, PUSHER_CENTRE_Z_M]))
+
+
+def crowd(shapes) -> SceneState:
+    """Three objects in a row before the pusher, a little tilted as real ones are, and one far away."""
+    return scene(
+        shapes,
+        {
+            CAN: (0.06, 0.01, (0.004, 0.006, 0.4)),
+            GELATIN: (0.15, 0.0, (0.003, -0.005, 1.0)),
+            APPLE: (0.24, 0.02, (0.1, 0.2, 0.3)),
+            BOX: (-0.25, 0.2, (0.005, 0.004, 0.2)),
+        },
+    )
+
+
+def moved_state(state: SceneState, angle: float, shift) -> SceneState:
+    """The whole scene turned about the vertical and then shifted."""
+    q, shift = quaternion_exp(np.array([0, 0, angle])), np.array([*shift, 0.0])
+    turned = quaternion_multiply(np.broadcast_to(q, state.poses.quaternion.shape), state.poses.quaternion)
+    return SceneState(
+        state.names, Pose(rotate(q, state.poses.position) + shift, turned), state.light, rotate(q, state.pusher) + shift
+    )
+
+
+def picked(state: SceneState, order) -> SceneState:
+    """The same objects in another order."""
+    return SceneState(tuple(state.names[i] for i in order), state.poses[list(order)], state.light, state.pusher)
+
+
+def network(seed: int = 0, hidden: int = 16, *, silent: bool = False) -> PropagationNetwork:
+    """A network as it is before it has learned anything; a silent one answers with the first guess alone."""
+    torch.manual_seed(seed)
+    made = PropagationNetwork(hidden)
+    if silent:
+        torch.nn.init.zeros_(made.decoder[-1].weight)
+        torch.nn.init.zeros_(made.decoder[-1].bias)
+    return made.eval()
+
+
+def start(table, shapes, state: SceneState) -> tuple[torch.Tensor, Motion]:
+    """Numbers of the objects and the state at rest as one scene."""
+    number = torch.tensor([[sorted(shapes).index(name) for name in state.names]])
+    centre = state.poses.position + rotate(
+        state.poses.quaternion, np.array([shapes[n].centre for n in state.names]).reshape(-1, 3)
+    )
+    centre = torch.as_tensor(centre, dtype=torch.float32)
+    quaternion = torch.as_tensor(state.poses.quaternion, dtype=torch.float32)
+    floor = lowest_point(table, number[0], centre, quaternion).clamp(max=0)
+    still = torch.zeros_like(centre)[None]
+    pusher = torch.as_tensor(state.pusher[None, :2], dtype=torch.float32)
+    return number, Motion(centre[None], quaternion[None], still, still, pusher, floor[None])
+
+
+def sweep_of(motion: Motion, velocity) -> Sweep:
+    """One substep of an action (vx, vy) [m/s]."""
+    velocity = torch.as_tensor(np.array([velocity]), dtype=torch.float32).expand(len(motion.pusher), 2)
+    return Sweep(headings(velocity, motion), velocity * (STEP_S / SUBSTEPS))

@@ -1,0 +1,271 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+import osfcore.dynamics.rollout as module
+from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
+from osfcore.dynamics.rollout import Before, PushModel
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle
+from osfcore.scene import SceneState
+from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, crowd, hull, moved_state, network, picked, scene
+
+PUSH = np.array([[0.3, 0.0, 0], [0.2, 0.05, 0], [0.1, -0.1, 0]])
+
+
+@pytest.fixture(scope="module", params=["first guess", "random"])
+def model(request, shapes):
+    return PushModel(network(silent=request.param == "first guess"), shapes)
+
+
+@pytest.fixture(scope="module")
+def state(shapes):
+    return crowd(shapes)
+
+
+def plans(count: int, horizon: int = 4, seed: int = 0) -> np.ndarray:
+    velocity = np.random.default_rng(seed).uniform(-0.15, 0.3, (count, horizon, 2))
+    return np.concatenate([velocity, np.zeros((count, horizon, 1))], axis=2)
+
+
+def assert_same(a, b, positions=0.0) -> None:
+    np.testing.assert_allclose(a.positions, b.positions, atol=positions, rtol=0)
+    np.testing.assert_allclose(a.quaternions, b.quaternions, atol=20 * positions, rtol=0)
+    np.testing.assert_array_equal(a.pusher, b.pusher)
+
+
+def test_shapes_and_beginnings(model, state):
+    found = model.rollout(state, plans(5))
+    assert found.names == state.names
+    assert found.positions.shape == (5, 5, 4, 3)
+    assert found.quaternions.shape == (5, 5, 4, 4)
+    assert found.pusher.shape == (5, 5, 3)
+    for k in range(5):
+        np.testing.assert_array_equal(found.positions[k, 0], state.poses.position)
+        np.testing.assert_array_equal(found.quaternions[k, 0], state.poses.quaternion)
+    np.testing.assert_allclose(np.linalg.norm(found.quaternions, axis=-1), 1, atol=1e-9)
+    assert np.abs(found.positions[:, -1, 0] - state.poses.position[0]).max() > 0.01  # something was pushed
+
+
+def test_the_pusher_goes_its_path_at_its_height(model, state):
+    actions = plans(5, 8)
+    found = model.rollout(state, actions)
+    path = pusher_path(state.pusher[:2], actions[..., :2])[:, ::SUBSTEPS]
+    np.testing.assert_array_equal(found.pusher[..., :2], path)
+    np.testing.assert_array_equal(found.pusher[..., 2], np.full((5, 9), state.pusher[2]))
+
+
+def test_what_nothing_can_touch_keeps_its_pose_bit_by_bit(model, state):
+    found = model.rollout(state, plans(20))
+    box = state.names.index(BOX)
+    assert np.all(found.positions[:, :, box] == state.poses.position[box])
+    assert np.all(found.quaternions[:, :, box] == state.poses.quaternion[box])
+
+
+def test_nothing_moves_before_it_can_be_reached(model, state):
+    found = model.rollout(state, np.array([[[-0.3, 0, 0], [-0.3, 0.0, 0], [0.3, 0.1, 0]]]))
+    assert np.all(found.positions == state.poses.position)
+
+
+@pytest.mark.parametrize("horizon", [1, 7])
+def test_standing_still_from_rest_changes_nothing(model, state, horizon):
+    found = model.rollout(picked(state, [0, 1, 2, 3]), np.zeros((2, horizon, 3)))
+    assert np.all(found.positions == state.poses.position)
+    assert np.all(found.quaternions == state.poses.quaternion)
+    assert np.all(found.pusher == state.pusher)
+
+
+def test_the_order_of_the_objects_permutes_rollouts_exactly(model, state):
+    actions = plans(4)
+    whole = model.rollout(state, actions)
+    for order in itertools.islice(itertools.permutations(range(4)), 1, None, 5):
+        found = model.rollout(picked(state, order), actions)
+        assert found.names == tuple(state.names[i] for i in order)
+        assert np.array_equal(found.positions, whole.positions[:, :, list(order)])
+        assert np.array_equal(found.quaternions, whole.quaternions[:, :, list(order)])
+
+
+@pytest.mark.parametrize(
+    ("angle", "shift"), [(0.5, (0, 0)), (-2.2, (0.03, -0.05)), (np.pi / 2, (0.01, 0.02)), (0, (-0.06, 0.07))]
+)
+def test_turning_and_shifting_the_scene_turns_and_shifts_the_rollout(model, state, angle, shift):
+    actions = PUSH[None] * 0.7
+    here = model.rollout(state, actions)
+    turn = quaternion_exp(np.array([0.0, 0, angle]))
+    there = model.rollout(moved_state(state, angle, shift), rotate(turn, actions) * [1, 1, 0])
+    expected = rotate(turn, here.positions) + [*shift, 0]
+    assert np.linalg.norm(there.positions - expected, axis=-1).max() < 1e-5
+    turned = quaternion_multiply(np.broadcast_to(turn, here.quaternions.shape), here.quaternions)
+    assert np.rad2deg(rotation_angle(turned, there.quaternions)).max() < 0.01
+    np.testing.assert_allclose(there.pusher, rotate(turn, here.pusher) + [*shift, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_sinks(shapes, state, seed):
+    """Not below the table, nor below where it was estimated to begin with; a cell of the map of directions is why
+    the hull itself may be a little lower than what the model takes for its lowest point."""
+    sunk = SceneState(
+        state.names, Pose(state.poses.position - [0, 0, 0.002], state.poses.quaternion), state.light, state.pusher
+    )
+    for begin, floor in ((state, 0.0), (sunk, -0.002)):
+        found = PushModel(network(seed), shapes).rollout(begin, plans(10, 5, seed))
+        for slot, name in enumerate(begin.names):
+            points = hull(shapes[name]) + shapes[name].centre
+            q = found.quaternions[:, :, slot].reshape(-1, 4)
+            heights = rotate(q[:, None], points[None])[..., 2].min(axis=1) + found.positions[:, :, slot, 2].ravel()
+            assert heights.min() > floor - 0.01
+
+
+def test_many_sequences_at_once_are_the_same_as_one_by_one(model, state):
+    actions = plans(12, 5)
+    together = model.rollout(state, actions)
+    for k in range(12):
+        alone = model.rollout(state, actions[k : k + 1])
+        np.testing.assert_allclose(together.positions[k], alone.positions[0], atol=1e-5)
+        assert rotation_angle(together.quaternions[k], alone.quaternions[0]).max() < 1e-3
+
+
+def test_chunks_do_not_show(model, state, monkeypatch):
+    actions = plans(7)
+    whole = model.rollout(state, actions)
+    monkeypatch.setattr(module, "_CHUNK", 3)
+    assert_same(model.rollout(state, actions), whole, positions=1e-5)
+
+
+def test_the_same_question_gets_the_same_answer(model, state):
+    assert_same(model.rollout(state, plans(3)), model.rollout(state, plans(3)))
+
+
+def test_a_longer_plan_begins_as_a_shorter_one(model, state):
+    actions = plans(3, 6)
+    long, short = model.rollout(state, actions), model.rollout(state, actions[:, :2])
+    np.testing.assert_array_equal(long.positions[:, :3], short.positions)
+
+
+def test_the_state_and_the_actions_are_left_alone(model, state):
+    actions, positions = plans(3), state.poses.position.copy()
+    copy = actions.copy()
+    model.rollout(state, actions)
+    np.testing.assert_array_equal(actions, copy)
+    np.testing.assert_array_equal(state.poses.position, positions)
+
+
+def test_before_without_any_motion_changes_nothing(model, state):
+    actions = plans(3)
+    before = Before(state, np.zeros(3))
+    assert_same(model.rollout(state, actions, before), model.rollout(state, actions))
+
+
+def test_before_in_another_order_is_the_same(model, state):
+    first = model.rollout(state, PUSH[None, :1])
+    poses = Pose(first.positions[0, -1], first.quaternions[0, -1])
+    now = SceneState(state.names, poses, state.light, first.pusher[0, -1])
+    here = model.rollout(now, plans(2), Before(state, PUSH[0]))
+    there = model.rollout(now, plans(2), Before(picked(state, [3, 1, 0, 2]), PUSH[0]))
+    assert_same(here, there)
+
+
+def test_before_makes_two_questions_one(model, state):
+    """One action, then told what was before: as if both actions had been asked for at once."""
+    actions = np.array([[[0.25, 0.02, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0]]])
+    whole = model.rollout(state, actions)
+    now = SceneState(state.names, Pose(whole.positions[0, 1], whole.quaternions[0, 1]), state.light, whole.pusher[0, 1])
+    rest = model.rollout(now, actions[:, 1:], Before(state, actions[0, 0]))
+    moved = np.linalg.norm(whole.positions[0, 1] - whole.positions[0, 0], axis=1) > 1.5e-3
+    assert moved.any()
+    error = np.linalg.norm(rest.positions[0] - whole.positions[0, 1:], axis=-1)
+    assert np.median(error) < 1e-4
+    assert error.max() < 5e-3
+
+
+def test_before_is_checked(model, state, shapes):
+    other = scene(shapes, {CAN: (0.06, 0.0)})
+    with pytest.raises(InvalidInput, match="objects one action ago"):
+        model.rollout(state, plans(1), Before(other, np.zeros(3)))
+    with pytest.raises(InvalidInput, match="action"):
+        model.rollout(state, plans(1), Before(state, np.array([0.31, 0, 0])))
+    gone = SceneState(state.names, state.poses, state.light, None)
+    with pytest.raises(InvalidInput, match="pusher"):
+        model.rollout(state, plans(1), Before(gone, np.zeros(3)))
+
+
+def bad(where, value) -> np.ndarray:
+    actions = plans(3)
+    actions[where] = value
+    return actions
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (bad((1, 2, 0), np.nan), "action 2 of sequence 1 .*nan"),
+        (bad((2, 0, 1), np.inf), "action 0 of sequence 2 .*inf"),
+        (bad((0, 1, 0), 0.31), "action 1 of sequence 0 .*0.31.*at most 0.3"),
+        (bad((0, 0, 1), -0.31), "action 0 of sequence 0"),
+        (bad((0, 3, 2), 0.01), r"action 3 of sequence 0 .*\(vx, vy, 0\)"),
+        (np.zeros((4, 3)), "shape of the actions is \\(4, 3\\)"),
+        (np.zeros((2, 4, 2)), "shape of the actions"),
+        (np.zeros((1, 2, 4, 3)), "shape of the actions"),
+        (np.zeros(3), "shape of the actions"),
+        (np.zeros((0, 4, 3)), "number of action sequences is 0"),
+        (np.zeros((20_001, 1, 3)), "number of action sequences is 20001"),
+        (np.zeros((2, 0, 3)), "horizon .* is 0"),
+        (np.zeros((1, 10_000, 3)), "horizon .* is 10000"),
+        ([[[0, 0, 0]], [[0, 0, 0], [0, 0, 0]]], "actions"),
+        ([[["a", "b", "c"]]], "actions"),
+        ("north", "actions"),
+        (None, "actions"),
+        ([[[10**400, 0, 0]]], "actions"),
+    ],
+)
+def test_actions_that_cannot_be_rolled_out_are_told_in_one_sentence(model, state, actions, words):
+    with pytest.raises(InvalidInput, match=words) as caught:
+        model.rollout(state, actions)
+    sentence = str(caught.value)
+    assert len(sentence) < 400
+    assert sentence.endswith(".")
+    assert "\n" not in sentence
+
+
+def test_scenes_that_cannot_be_predicted_are_told(model, state, shapes):
+    with pytest.raises(InvalidInput, match="number of objects is 0"):
+        model.rollout(scene(shapes, {}), plans(1))
+    with pytest.raises(InvalidInput, match="pusher of the state is missing"):
+        model.rollout(SceneState(state.names, state.poses, state.light, None), plans(1))
+    with pytest.raises(UnknownName, match="no shape named 'teapot'"):
+        model.rollout(SceneState(("teapot",), state.poses[[0]], state.light, state.pusher), plans(1))
+    with pytest.raises(OsfError, match="unit quaternion"):
+        SceneState(state.names, Pose(state.poses.position, 1.1 * state.poses.quaternion), state.light, state.pusher)
+
+
+def test_a_single_object_and_all_known_ones(model, shapes):
+    assert model.names == tuple(sorted(shapes))
+    alone = model.rollout(scene(shapes, {APPLE: (0.06, 0.0)}), PUSH[None])
+    assert alone.positions[0, -1, 0, 0] > 0.07
+    assert alone.positions.shape == (1, 4, 1, 3)
+
+
+def test_a_pushed_object_moves_with_the_pusher(shapes):
+    """The first guess alone: a box pushed at its middle goes as far as the pusher goes after contact."""
+    model = PushModel(network(silent=True), shapes)
+    begin = scene(shapes, {GELATIN: (0.08, 0.0, (0.0, 0.0, 0.02))})
+    found = model.rollout(begin, np.array([[[0.2, 0.0, 0.0]] * 4]))
+    gap = 0.08 - shapes[GELATIN].half_extents[0] - 0.015
+    assert found.positions[0, -1, 0, 0] - begin.poses.position[0, 0] == pytest.approx(0.16 - gap, abs=1e-2)
+    assert abs(found.positions[0, -1, 0, 1] - begin.poses.position[0, 1]) < 1e-2
+
+
+def test_extreme_places_give_finite_answers(model, shapes):
+    """The pusher inside an object, objects inside each other, far away, upside down."""
+    begin = scene(shapes, {BOX: (0.01, 0.0, (3.0, 0.3, 0)), CAN: (0.02, 0.01), APPLE: (40.0, 0.0)})
+    found = model.rollout(begin, plans(5, 6))
+    assert np.isfinite(found.positions).all()
+    np.testing.assert_allclose(np.linalg.norm(found.quaternions, axis=-1), 1, atol=1e-9)
+
+
+def test_no_gradients_are_kept(model, state):
+    assert all(p.grad is None for p in model._network.parameters())
+    model.rollout(state, plans(1))
+    assert torch.is_grad_enabled()
