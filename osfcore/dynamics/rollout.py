@@ -44,6 +44,9 @@ class PushModel:
         network: predicts the motion of one substep.
         shapes: of all objects that may be asked about, by name.
         device: that computes.
+
+    Raises:
+        InvalidInput: if there are no shapes.
     """
 
     def __init__(
@@ -52,6 +55,8 @@ class PushModel:
         shapes: Mapping[str, ObjectShape],
         device: torch.device | str = "cpu",
     ) -> None:
+        if not shapes:
+            raise InvalidInput("number of objects", 0, "at least 1")
         self.device = torch.device(device)
         self._network = network.to(self.device).eval()
         self._names = tuple(sorted(shapes))

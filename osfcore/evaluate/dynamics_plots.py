@@ -97,7 +97,9 @@ def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectSh
     cell = np.full((_CELL_PX, _CELL_PX, 3), _PAPER, np.uint8)
     windows, end = scored.windows, GALLERY_HORIZON
     pusher = windows.pusher[window, 1 : end + 2, :2]
-    middle = pusher.mean(axis=0)
+    ends = windows.positions[window, [1, end + 1], :, :2]
+    farthest = np.linalg.norm(ends[1] - ends[0], axis=-1).argmax()
+    middle = ends[:, farthest].mean(axis=0)
 
     def pixels(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
         flat = (points - middle) / _SHOWN_M * [1, -1] + 0.5

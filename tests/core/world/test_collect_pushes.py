@@ -37,7 +37,8 @@ def test_episodes_have_the_stated_shapes_and_tell_the_truth(library, tmp_path):
         assert e.positions.shape == (21, 3, 3)
         assert e.quaternions.shape == (21, 3, 4)
         assert e.contact.shape == (20, 3)
-        assert e.sub_positions is not None and e.sub_quaternions is not None
+        assert e.sub_positions is not None
+        assert e.sub_quaternions is not None
         assert e.sub_positions.shape == (20, SUBSTATES, 3, 3)
         np.testing.assert_array_equal(e.sub_positions[:, -1], e.positions[1:])
         np.testing.assert_allclose(e.sub_quaternions[:, -1], e.quaternions[1:], atol=1e-12)
