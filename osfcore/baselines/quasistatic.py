@@ -19,11 +19,12 @@ from torch.nn import functional
 from osfcore.dynamics import turns
 from osfcore.dynamics.graph import OUTLINE
 from osfcore.dynamics.motion import Motion
-from osfcore.dynamics.outline import circle, gap_between, gap_to_point
+from osfcore.dynamics.outline import circle, dot, gap_between, gap_to_point
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.sliding import lever, slide
 from osfcore.scene import PUSHER_RADIUS_M
 
+_FACE_M = 0.001  # corners that are not farther back than this belong to the face of an outline
 _STRETCH_M = 0.0025  # the pusher travels at most this far between two looks at contacts
 
 
@@ -86,11 +87,28 @@ def _shove(
     rows = meets.nonzero()[:, 0]
     if not len(rows):
         return motion, outline
-    gap = gap_between(outline[rows, j], outline[rows, i] + offset[rows, None])
+    other = outline[rows, i] + offset[rows, None]
+    gap = gap_between(outline[rows, j], other)
     depth = (-gap.distance).clamp(min=0)
     pushed[rows, j] |= depth > 0
-    way = slide(gap.point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[rows, j])
+    point = _meeting(outline[rows, j], other, gap.normal)
+    way = slide(point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[rows, j])
     return _moved(motion, outline, (rows, j), way)
+
+
+def _meeting(
+    first: Float[Tensor, "B K 2"], second: Float[Tensor, "B K 2"], normal: Float[Tensor, "B 2"]
+) -> Float[Tensor, "B 2"]:
+    """Middle of where the faces of two outlines meet, the normal pointing out of the first."""
+    tangent = torch.stack([-normal[:, 1], normal[:, 0]], dim=1)
+    ends = []
+    for outline, out in ((first, normal), (second, -normal)):
+        height, along = (dot(outline, direction[:, None]) for direction in (out, tangent))
+        off = torch.where(height > height.amax(dim=1, keepdim=True) - _FACE_M, 0.0, 1.0)
+        ends.append(((along + off).amin(dim=1), (along - off).amax(dim=1)))
+    middle = (torch.maximum(ends[0][0], ends[1][0]) + torch.minimum(ends[0][1], ends[1][1])) / 2
+    reach = dot(first, normal[:, None]).amax(dim=1)
+    return middle[:, None] * tangent + reach[:, None] * normal
 
 
 def _moved(

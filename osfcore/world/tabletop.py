@@ -395,10 +395,13 @@ def _check_request(library: AssetLibrary, request: SceneRequest) -> None:
         return
     if not 1 <= request.count <= MAX_OBJECTS:
         raise InvalidInput("number of objects", request.count, f"between 1 and {MAX_OBJECTS}")
+    choice = library.names() if request.among is None else request.among
     for name in request.among or ():
         _check_object(library, name)
-    available = len(library.names() if request.among is None else request.among)
-    if available == 0:
+    if len(set(choice)) != len(choice):
+        raise InvalidInput("list of objects", ", ".join(choice), "without repetition")
+    available = len(choice)
+    if request.among is None and available == 0:
         raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
     if request.count > available:
         raise InvalidInput(

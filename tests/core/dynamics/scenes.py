@@ -5,8 +5,11 @@ import torch
 
 from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
-from osfcore.dynamics.pusher import SUBSTEPS
+from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.unroll import unroll
 from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate
+from osfcore.pushfile import PushEpisode
 from osfcore.scene import PUSHER_CENTRE_Z_M, STEP_S, Light, SceneState
 
 BOX, CAN, GELATIN, APPLE = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box", "013_apple")
@@ -88,3 +91,29 @@ def sweep_of(motion: Motion, velocity) -> Sweep:
     """One substep of an action (vx, vy) [m/s]."""
     velocity = torch.as_tensor(np.array([velocity]), dtype=torch.float32).expand(len(motion.pusher), 2)
     return Sweep(headings(velocity, motion), velocity * (STEP_S / SUBSTEPS))
+
+
+def episode(shapes, state: SceneState, actions, *, substates: bool = True) -> PushEpisode:
+    """A recording of what the first guess alone would make of a push, with its poses within the actions."""
+    actions = np.asarray(actions, float)
+    table = ShapeTable(tuple(shapes[name] for name in sorted(shapes)))
+    number, motion = start(table, shapes, state)
+    velocity = torch.as_tensor(actions[:, None, :2], dtype=torch.float32)
+    with torch.inference_mode():
+        motions = [motion, *unroll(network(silent=True), table, number, motion, velocity)]
+    turned = np.stack([m.quaternion[0].numpy() for m in motions]).astype(float)
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    offset = np.array([shapes[name].centre for name in state.names])
+    positions = np.stack([m.centre[0].numpy() for m in motions]) - rotate(turned, offset)
+    ends = slice(None, None, SUBSTEPS)
+    pusher = np.concatenate(
+        [pusher_path(state.pusher[:2], actions[:, :2])[ends], np.full((len(actions) + 1, 1), PUSHER_CENTRE_Z_M)], axis=1
+    )
+    within = {
+        "sub_positions": positions[1:].reshape(len(actions), SUBSTEPS, -1, 3),
+        "sub_quaternions": turned[1:].reshape(len(actions), SUBSTEPS, -1, 4),
+    }
+    moved = np.linalg.norm(np.diff(positions[ends], axis=0), axis=-1) > 0
+    return PushEpisode(
+        state.names, 0, positions[ends], turned[ends], pusher, actions, moved, **(within if substates else {})
+    )

@@ -1,3 +1,4 @@
+import json
 import multiprocessing
 import os
 import signal
@@ -6,10 +7,11 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 
+import h5py
 import numpy as np
 import pytest
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.pushfile import PushEpisode, read_pushes
 from osfcore.scene import STEP_S
 from osfcore.world.collect_pushes import SUBSTATES, CollectPushes, collect_pushes
@@ -126,3 +128,42 @@ def test_existing_file_is_never_overwritten(library, tmp_path):
     with pytest.raises(InvalidInput, match="must be new"):
         collect(library, tmp_path / "a.h5")
     assert (tmp_path / "a.h5").read_text() == "precious"
+
+
+def test_only_the_named_objects_are_pushed(library, tmp_path):
+    names = ("005_tomato_soup_can", "009_gelatin_box", "035_power_drill")
+    episodes = collect(library, tmp_path / "a.h5", objects=2, names=names, steps=1)
+    assert {name for e in episodes for name in e.names} == set(names)
+    assert all(len(set(e.names)) == 2 for e in episodes)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert json.loads(str(file.attrs["settings"]))["available"] == list(names)
+
+
+def test_naming_all_objects_is_naming_none(library, tmp_path):
+    whole = collect(library, tmp_path / "a.h5", episodes=2, steps=2)
+    assert_same(collect(library, tmp_path / "b.h5", episodes=2, steps=2, names=library.names()), whole)
+
+
+def test_a_collection_of_other_objects_is_not_gone_on_with(library, tmp_path):
+    config = CollectPushes(tmp_path / "a.h5", episodes=2, steps=2)
+    begun = collect_pushes(config, library)
+    next(begun)
+    begun.close()
+    with pytest.raises(InvalidInput, match="other settings"):
+        collect(library, config.out, episodes=2, steps=2, names=library.names()[:4])
+
+
+@pytest.mark.parametrize(
+    ("names", "error"),
+    [
+        (("teapot",) * 3, UnknownName),
+        (("024_bowl", "005_tomato_soup_can", "009_gelatin_box"), MissingAssets),
+        (("005_tomato_soup_can", "009_gelatin_box"), InvalidInput),  # three are wanted
+        ((), InvalidInput),
+        (("005_tomato_soup_can",) * 3, InvalidInput),
+    ],
+)
+def test_bad_names_are_refused_before_anything_is_written(library, tmp_path, names, error):
+    with pytest.raises(error):
+        collect(library, tmp_path / "a.h5", names=names)
+    assert not list(tmp_path.iterdir())

@@ -218,11 +218,46 @@ def test_sizes_beyond_are_refused(size):
         (SceneRequest(count=0), InvalidInput),
         (SceneRequest(count=9), InvalidInput),
         (SceneRequest(count=6), InvalidInput),  # five were fetched
+        (SceneRequest(count=2, among=("009_gelatin_box",)), InvalidInput),
+        (SceneRequest(count=1, among=()), InvalidInput),
+        (SceneRequest(count=1, among=("teapot",)), UnknownName),
+        (SceneRequest(count=1, among=("024_bowl", "009_gelatin_box")), MissingAssets),
     ],
 )
 def test_bad_requests_are_refused(library, request_, error):
     with pytest.raises(error):
         Tabletop(library, request=request_)
+
+
+def test_random_scenes_choose_among_what_is_named(library):
+    among = ("003_cracker_box", "009_gelatin_box", "035_power_drill")
+    world, seen = Tabletop(library, request=SceneRequest(count=1, among=among)), set()
+    for seed in range(12):
+        world.arrange(seed)
+        seen |= set(world.names)
+    world.close()
+    assert seen == set(among)
+
+
+def test_choosing_among_everything_is_choosing_freely(library, world):
+    same_choice = Tabletop(library, request=SceneRequest(among=library.names()))
+    same_choice.arrange(0)
+    assert same(same_choice.truth(), world.truth())
+    same_choice.close()
+
+
+def test_poses_within_an_action_lead_to_its_end(library, world):
+    twin = Tabletop(library)
+    twin.arrange(0)
+    for action in ACTIONS[:3]:
+        touched, poses = world.act_recorded(action, 4)
+        assert touched == twin.act_contacts(action)
+        assert poses.position.shape == (4, 3, 3)
+        np.testing.assert_array_equal(poses.position[-1], world.truth().poses.position)
+        assert same(world.truth(), twin.truth())
+    with pytest.raises(InvalidInput):
+        world.act_recorded(np.array([0.31, 0, 0]), 4)
+    twin.close()
 
 
 def test_an_empty_table_says_so(library):
