@@ -7,12 +7,15 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from osfcore.dynamics import turns
+from osfcore.dynamics.outline import circle
 from osfcore.dynamics.shapes import ShapeTable
 
 SLEEP_M = 1e-4  # an object that moves less than this in a substep, and turns less than that, rests
 SLEEP_RAD = 2e-3
+_ASIDE = 0.035  # about a cell of the map of directions [rad]
 
 
 class Motion(NamedTuple):
@@ -50,9 +53,14 @@ class Sweep(NamedTuple):
 def lowest_point(
     table: ShapeTable, number: Int[Tensor, "A"], centre: Float[Tensor, "A 3"], quaternion: Float[Tensor, "A 4"]
 ) -> Float[Tensor, "A"]:
-    """Height of the lowest point of each object over the table's top [m]."""
-    down = centre.new_tensor([[0.0, 0.0, -1.0]])
-    return centre[:, 2] + table.farthest(number, turns.matrix(quaternion), down)[:, 0, 2]
+    """Height of the lowest point of each object over the table's top [m].
+
+    The lowest of what is farthest straight down and in directions around it: one alone may find the wrong end of a face
+    that hardly tilts.
+    """
+    around = functional.pad(_ASIDE * circle(8, centre.device), (0, 1), value=-1.0)
+    down = torch.cat([centre.new_tensor([[0.0, 0.0, -1.0]]), around])
+    return centre[:, 2] + table.farthest(number, turns.matrix(quaternion), down)[..., 2].amin(dim=1)
 
 
 def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B 2"]:

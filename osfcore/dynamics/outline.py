@@ -48,10 +48,10 @@ def gap_to_point(outline: Float[Tensor, "A K 2"], point: Float[Tensor, "A 2"]) -
     nearest = dot(rest, rest).argmin(dim=1)
     rest = rest[torch.arange(len(rest), device=rest.device), nearest]
     length = (dot(rest, rest) + 1e-14).sqrt()
-    directions = circle(outline.shape[1], outline.device)
-    beyond = dot(away, directions).amax(dim=1)  # over the support lines: negative only inside
-    sign = torch.where(beyond < 0, -1.0, 1.0)
-    return Gap(sign * length, (sign / length)[:, None] * rest, point - rest)
+    reached = point - rest
+    outward = dot(rest, reached - outline.mean(dim=1))  # a convex outline's nearest point lies away from its middle
+    sign = torch.where(outward < 0, -1.0, 1.0)
+    return Gap(sign * length, (sign / length)[:, None] * rest, reached)
 
 
 def gap_between(first: Float[Tensor, "E K 2"], second: Float[Tensor, "E K 2"]) -> Gap:
@@ -74,7 +74,10 @@ def _separation(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     side = first.roll(-1, dims=1) - first
     length = (dot(side, side) + 1e-16).sqrt()
     normal = torch.stack([side[..., 1], -side[..., 0]], dim=-1) / length[..., None]
-    reach = torch.matmul(normal, second.transpose(1, 2)).amin(dim=2) - dot(normal, first)
+    # Not from the side's own corner: points found with an error may run back a little before they go on.
+    reach = torch.matmul(normal, second.transpose(1, 2)).amin(dim=2) - torch.matmul(normal, first.transpose(1, 2)).amax(
+        dim=2
+    )
     reach = torch.where(length > 1e-4, reach, -1.0)  # repeated points have no side between them
     best = reach.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)

@@ -73,7 +73,6 @@ def test_gap_of_a_disc_to_a_point(radius, x, y):
         assert exact - 1e-6 <= float(gap.distance) <= exact + flat + 1e-6
 
 
-@pytest.mark.xfail(reason="inside is told by support lines, which stand off sides between two directions", strict=True)
 def test_what_is_just_outside_a_long_side_is_outside():
     angle = math.pi / COUNT
     point = torch.tensor([[0.051, 0.0]]) @ turn(angle).T
@@ -137,7 +136,6 @@ def test_between_corners_the_gap_is_never_too_large(angle, shift):
     assert float(found.normal.norm()) == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.xfail(reason="separation is measured from a side's own corner, not from the whole outline", strict=True)
 def test_a_dent_does_not_tear_outlines_apart():
     """Farthest points found with an error may come back a little before they go on."""
     one, other = rectangle(0.05, 0.03), rectangle(0.05, 0.03, 0.0, (0.11, 0.0))

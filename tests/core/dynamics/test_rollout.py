@@ -104,8 +104,7 @@ def test_turning_and_shifting_the_scene_turns_and_shifts_the_rollout(model, stat
 
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_sinks(shapes, state, seed):
-    """Not below the table, nor below where it was estimated to begin with; a cell of the map of directions is why
-    the hull itself may be a little lower than what the model takes for its lowest point."""
+    """Not below the table, nor below where it was estimated to begin with."""
     sunk = SceneState(
         state.names, Pose(state.poses.position - [0, 0, 0.002], state.poses.quaternion), state.light, state.pusher
     )
@@ -115,7 +114,7 @@ def test_nothing_sinks(shapes, state, seed):
             points = hull(shapes[name]) + shapes[name].centre
             q = found.quaternions[:, :, slot].reshape(-1, 4)
             heights = rotate(q[:, None], points[None])[..., 2].min(axis=1) + found.positions[:, :, slot, 2].ravel()
-            assert heights.min() > floor - 0.01
+            assert heights.min() > floor - 1e-3
 
 
 def test_many_sequences_at_once_are_the_same_as_one_by_one(model, state):
