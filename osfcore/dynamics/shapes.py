@@ -124,7 +124,8 @@ class ShapeTable:
     def farthest(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
         """Farthest points of A objects in D directions of the world, relative to their centres of mass (A, D, 3) [m].
 
-        The points are those of the nearest direction on the map; the height over them errs by 0.1 mm at most.
+        The points are those of the nearest direction on the map, 3.6 deg away at most: they reach 0.03 to 0.25 mm less
+        far than the farthest ones (rms over all directions), and some millimetres less beside the normal of a face.
         """
         local = directions @ rotation  # R^T d for every d
         return self._support(number, local) @ rotation.transpose(1, 2)
