@@ -104,20 +104,22 @@ class TrainDynamicsCommand:
     """Push files that 'osf collect pushes' wrote; one in twelve episodes is held out."""
     out: Path
     """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
-    iterations: int = 14_000
-    """Steps of descent, at most."""
+    iterations: int = 16_000
+    """Steps of descent on single substeps, at most."""
+    long_iterations: int = 800
+    """Steps of descent on windows of three actions, after these."""
     patience: int = 6
     """Measurements on held-out episodes without a better one after which training stops."""
     without: tuple[str, ...] = ()
     """Objects whose episodes are left out."""
     hidden: int = 128
     """Width of the network."""
-    batch: int = 192
-    """Windows of a single action in a step of descent; a third as many of three actions."""
+    batch: int = 512
+    """Substeps in each step of descent."""
+    long_batch: int = 96
+    """Windows in each."""
     rate: float = 2e-3
     """Of learning, at its highest."""
-    short_share: float = 0.6
-    """Share of the steps with single actions, before those with three."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     seed: int = 0
@@ -137,8 +139,9 @@ class TrainDynamicsCommand:
             self.data,
             self.out,
             iterations=self.iterations,
-            short_share=self.short_share,
             batch=self.batch,
+            long_iterations=self.long_iterations,
+            long_batch=self.long_batch,
             hidden=self.hidden,
             rate=self.rate,
             patience=self.patience,

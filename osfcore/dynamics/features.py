@@ -62,6 +62,12 @@ def inputs(table: ShapeTable, graph: Graph) -> Inputs:
     return Inputs(nodes, edges, torch.cat([pushed, graph.receiver]), graph.sender, turn @ graph.frame, guess)
 
 
+def corrections(seen: Inputs) -> Float[Tensor, "A 6"]:
+    """What the network's answer is added to: the sliding that is guessed, as displacement and rotation vector."""
+    flat = torch.zeros_like(seen.guess)
+    return torch.cat([seen.guess[:, :2], flat, seen.guess[:, 2:]], dim=1)
+
+
 def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
     """Where each object is being pushed to: by the pusher, else by the closest object, else where it is moving."""
     flat = graph.linear[:, :2]

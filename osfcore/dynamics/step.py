@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from osfcore.dynamics import turns
-from osfcore.dynamics.features import SHIFT_M, TURN_RAD, inputs, mirrored
+from osfcore.dynamics.features import SHIFT_M, TURN_RAD, corrections, inputs, mirrored
 from osfcore.dynamics.graph import build_graph
 from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, Sweep, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
@@ -46,8 +46,7 @@ def advance(
         flags = mirror[graph.scene]
         nodes, edges = mirrored(seen.nodes, flags, "node"), mirrored(seen.edges, flags[seen.receiver], "edge")
         answer = mirrored(network(nodes, edges, seen.receiver, seen.sender), flags, "motion")
-    push = seen.guess
-    answer = answer + torch.cat([push[:, :2], torch.zeros_like(answer[:, :3]), push[:, 2:]], dim=1)
+    answer = answer + corrections(seen)
     scale = answer.new_tensor([SHIFT_M] * 3 + [TURN_RAD] * 3)
     vectors = (answer * scale).view(-1, 2, 3) @ seen.frame
     linear, angular = vectors.unbind(1)

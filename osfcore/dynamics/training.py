@@ -2,8 +2,9 @@
 
 Deviations from the paper (section 4.3), measured in docs/dynamics.md: an action is predicted in four substeps; the loss
 is a distance rather than its square, of the centre of mass and the orientation together, so that a few objects that
-topple do not outweigh all that slide; half of the windows are seen in a mirror. As in the paper, the loss runs over up
-to three actions, with gradients through all of them; training begins with single ones, which is faster.
+topple do not outweigh all that slide; half of all is seen in a mirror. As in the paper, the loss runs over three
+actions, with gradients through all of them, but only at the end: most of the training is on single substeps from true
+states, which cost a fraction.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ import torch
 from torch import Tensor
 
 from osfcore.dynamics import turns
+from osfcore.dynamics.features import SHIFT_M, TURN_RAD
 from osfcore.dynamics.holdout import has_held_out_pair, is_for_validation
 from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.network import PropagationNetwork
+from osfcore.dynamics.samples import Sample, samples
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.unroll import unroll
 from osfcore.dynamics.weights import network_bytes
@@ -46,7 +49,8 @@ _WARM_UP = 100
 _LAST_RATE = 0.01  # of the first one
 _AVERAGING = 0.998  # of the weights that are kept, from iteration to iteration
 _CLIP = 5.0
-_REPORT_EVERY, _MEASURE_EVERY = 20, 500
+_REPORT_EVERY, _MEASURE_EVERY, _MEASURE_LONG_EVERY = 20, 1000, 100
+_LONG_RATE = 0.1
 _MEASURED = 2000  # windows
 _OWN_METRICS = ("validation_mm_4", "validation_windows")
 
@@ -58,11 +62,12 @@ class TrainDynamics:
     Attributes:
         data: push files; one in twelve episodes is held out.
         out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
-        iterations: at most.
-        short_share: share of the iterations with windows of a single action, before those of three.
-        batch: windows of a single action in an iteration; a third as many where there are three.
+        iterations: on single substeps, at most.
+        batch: substeps in each.
+        long_iterations: on windows of three actions, after these.
+        long_batch: windows in each.
         hidden: width of the network.
-        rate: of learning, at its highest.
+        rate: of learning, at its highest; on windows a tenth of it.
         patience: measurements on held-out episodes without a better one after which training stops.
         without: objects whose episodes are left out.
         device: "auto", "cpu" or "cuda".
@@ -71,9 +76,10 @@ class TrainDynamics:
 
     data: tuple[Path, ...]
     out: Path
-    iterations: int = 14_000
-    short_share: float = 0.6
-    batch: int = 192
+    iterations: int = 16_000
+    batch: int = 512
+    long_iterations: int = 800
+    long_batch: int = 96
     hidden: int = 128
     rate: float = 2e-3
     patience: int = 6
@@ -86,7 +92,7 @@ class TrainDynamics:
         """How to do it again."""
         parts = ["osf", "train", "dynamics", "--data", *(path.name for path in self.data), "--out", self.out.name]
         default = TrainDynamics(self.data, self.out)
-        for name in ("iterations", "short_share", "batch", "hidden", "rate", "patience", "seed"):
+        for name in ("iterations", "batch", "long_iterations", "long_batch", "hidden", "rate", "patience", "seed"):
             if getattr(self, name) != getattr(default, name):
                 parts += [f"--{name.replace('_', '-')}", str(getattr(self, name))]
         return shlex.join([*parts, *(["--without", *self.without] if self.without else [])])
@@ -107,29 +113,31 @@ def train_dynamics(config: TrainDynamics, shapes: Mapping[str, ObjectShape]) -> 
     _check(config)
     device = pick_device(config.device)
     check_weights_place(config.out, _OWN_METRICS)
-    yield Progress(0, config.iterations, "Reading the pushes")
+    total = config.iterations + config.long_iterations
+    yield Progress(0, total, "Reading the pushes")
     run = _Run(config, shapes, device)
     run.resume()
-    while run.done < config.iterations and run.fruitless < config.patience:
+    while run.done < total:
         note = run.iterate()
-        if run.done % _MEASURE_EVERY == 0 or run.done == config.iterations:
+        if run.done % run.measure_every == 0 or run.done in (config.iterations, total):
             run.measure()
             run.save()
         if run.done % _REPORT_EVERY == 0:
-            yield Progress(run.done, config.iterations, note)
+            yield Progress(run.done, total, note)
     run.finish()
-    yield Progress(config.iterations, config.iterations, run.note)
+    yield Progress(total, total, run.note)
 
 
 def _check(config: TrainDynamics) -> None:
     check_seed(config.seed)
     for what, value, low, high in (
         ("number of iterations", config.iterations, 1, 10_000_000),
-        ("batch", config.batch, 3, 100_000),
+        ("number of iterations on windows", config.long_iterations, 0, 10_000_000),
+        ("batch", config.batch, 1, 100_000),
+        ("batch of windows", config.long_batch, 1, 100_000),
         ("width of the network", config.hidden, 1, 1024),
         ("patience", config.patience, 1, 1_000_000),
         ("rate of learning", config.rate, 1e-9, 1),
-        ("share of single actions", config.short_share, 0, 1),
     ):
         if not low <= value <= high:
             raise InvalidInput(what, value, f"between {low} and {high}")
@@ -164,7 +172,8 @@ class _Run:
         names = tuple(sorted(shapes))
         self._table = ShapeTable(tuple(shapes[name] for name in names), device)
         learned, kept = _episodes(config, frozenset(names))
-        self._short, self._long = record(learned, shapes, 1), record(learned, shapes, LONG_WINDOW)
+        self._long = record(learned, shapes, LONG_WINDOW)
+        self._samples = samples(record(learned, shapes, 1), self._table, device)
         self._validation = record(kept, shapes, MEASURED_WINDOW)
         self._used = len(learned)
         torch.manual_seed(config.seed)
@@ -174,7 +183,7 @@ class _Run:
         self._optimiser = torch.optim.AdamW(self._network.parameters(), lr=config.rate, weight_decay=1e-4)
         self._best: dict[str, Tensor] = {}
         self.best: Validation | None = None
-        self.done = self.fruitless = 0
+        self.done = self.fruitless = self.steps = 0
 
     @property
     def note(self) -> str:
@@ -183,18 +192,14 @@ class _Run:
             return "not measured yet"
         return f"held out: {self.best.mm_4:.1f} mm, {self.best.deg_4:.1f} deg after 4 steps"
 
+    @property
+    def measure_every(self) -> int:
+        """Iterations between measurements: those on windows take longer."""
+        return _MEASURE_EVERY if self.done < self._config.iterations else _MEASURE_LONG_EVERY
+
     def iterate(self) -> str:
         """One step of descent."""
-        config = self._config
-        is_short = self.done < config.short_share * config.iterations
-        recording = self._short if is_short else self._long
-        windows = _draw(recording, self._rng, config.batch if is_short else config.batch // LONG_WINDOW)
-        pieces = batch(recording, self._table, windows, self._device)
-        mirror = torch.as_tensor(self._rng.random(len(windows)) < 0.5, device=self._device)
-        loss = torch.zeros((), device=self._device)
-        for step, motion in enumerate(self._unroll(pieces, mirror)):
-            loss = loss + distance(motion, pieces, step).sum()
-        loss = loss * (1e3 / len(windows) / len(pieces.targets.centre))
+        loss = self._loss_of_samples() if self.done < self._config.iterations else self._loss_of_windows()
         self._set_rate()
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -205,15 +210,41 @@ class _Run:
             for kept, new in zip(self._average.parameters(), self._network.parameters(), strict=True):
                 kept.lerp_(new, 1 - share)
         self.done += 1
-        return f"loss {float(loss.detach()):.2f} mm a window; {self.note}"
+        self.steps += 1
+        what = "a substep" if self.done <= self._config.iterations else "a window"
+        return f"loss {float(loss.detach()):.2f} mm {what}; {self.note}"
+
+    def _loss_of_samples(self) -> Tensor:
+        """How far single substeps end from the truth [mm]."""
+        graphs = torch.as_tensor(self._rng.integers(len(self._samples), size=self._config.batch))
+        flipped = torch.as_tensor(self._rng.random(len(graphs)) < 0.5)
+        sample = Sample(*(part.to(self._device) for part in self._samples.draw(graphs, flipped)))
+        answer = self._network(sample.nodes, sample.edges, sample.receiver, sample.sender)
+        scale = answer.new_tensor([SHIFT_M] * 3 + [_ARM_M * TURN_RAD] * 3)
+        return 1e3 * (((answer - sample.target) * scale).square().sum(dim=1) + 1e-9).sqrt().mean()
+
+    def _loss_of_windows(self) -> Tensor:
+        """How far windows of three actions are from the truth, on average over their substeps [mm]."""
+        windows = _draw(self._long, self._rng, self._config.long_batch)
+        pieces = batch(self._long, self._table, windows, self._device)
+        mirror = torch.as_tensor(self._rng.random(len(windows)) < 0.5, device=self._device)
+        loss = torch.zeros((), device=self._device)
+        for step, motion in enumerate(self._unroll(pieces, mirror)):
+            loss = loss + distance(motion, pieces, step).sum()
+        return loss * (1e3 / len(windows) / len(pieces.targets.centre))
 
     def _unroll(self, pieces: Batch, mirror: Tensor) -> Iterator[Motion]:
         return unroll(self._network, self._table, pieces.number, pieces.motion, pieces.velocity, mirror)
 
     def _set_rate(self) -> None:
-        share = self.done / self._config.iterations
-        falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * share)) / 2
-        rate = self._config.rate * min(1, (self.done + 1) / _WARM_UP) * falling
+        """A warm-up and a cosine for each of both parts."""
+        config = self._config
+        is_long = self.done >= config.iterations
+        done, total = (
+            (self.done - config.iterations, config.long_iterations) if is_long else (self.done, config.iterations)
+        )
+        falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * done / total)) / 2
+        rate = config.rate * (_LONG_RATE if is_long else 1) * min(1, (done + 1) / _WARM_UP) * falling
         for group in self._optimiser.param_groups:
             group["lr"] = rate
 
@@ -225,6 +256,13 @@ class _Run:
             self._best = {name: value.detach().cpu().clone() for name, value in self._average.state_dict().items()}
         else:
             self.fruitless += 1
+        if self.fruitless >= self._config.patience:  # what is left of this part would be in vain
+            self.done, self.fruitless = self._next_part(), 0
+
+    def _next_part(self) -> int:
+        """Number of the iteration at which the next part begins."""
+        config = self._config
+        return config.iterations if self.done < config.iterations else config.iterations + config.long_iterations
 
     @property
     def _checkpoint(self) -> Path:
@@ -232,7 +270,7 @@ class _Run:
 
     def _fingerprint(self) -> str:
         settings = {**asdict(self._config), "data": [path.name for path in self._config.data], "out": "", "device": ""}
-        return repr((settings, self._used, len(self._short.starts)))
+        return repr((settings, self._used, len(self._samples)))
 
     def save(self) -> None:
         """Everything that is needed to go on."""
@@ -243,7 +281,7 @@ class _Run:
             "optimiser": self._optimiser.state_dict(),
             "best": self._best,
             "validation": asdict(self.best) if self.best else None,
-            "numbers": [self.done, self.fruitless],
+            "numbers": [self.done, self.fruitless, self.steps],
             "rng": self._rng.bit_generator.state,
         }
         buffer = io.BytesIO()
@@ -261,7 +299,7 @@ class _Run:
             self._optimiser.load_state_dict(content["optimiser"])
             self._best = content["best"]
             self.best = Validation(**content["validation"]) if content["validation"] else None
-            self.done, self.fruitless = content["numbers"]
+            self.done, self.fruitless, self.steps = content["numbers"]
             self._rng.bit_generator.state = content["rng"]
         except Exception:  # missing, cut short or of another version: start over
             return
@@ -273,7 +311,7 @@ class _Run:
         data = network_bytes(self._network)
         write_atomically(self._config.out, data)
         metrics = {f"validation_{name}": round(value, 3) for name, value in asdict(self.best).items()}
-        own = {"iterations": self.done, "seed": self._config.seed, "device": str(self._device), "bytes": len(data),
+        own = {"iterations": self.steps, "seed": self._config.seed, "device": str(self._device), "bytes": len(data),
                "episodes": self._used, "without": list(self._config.without), "threads": torch.get_num_threads(),
                "data": [path.name for path in self._config.data], "command": self._config.command}  # fmt: skip
         write_json(self._config.out.with_suffix(".json"), {**metrics, **own})

@@ -137,7 +137,7 @@ def batch(
     centre, quaternion = recording.centre[episode[:, None], steps], recording.quaternion[episode[:, None], steps]
     before = (first - 1).clamp(min=0)
     linear = centre[:, 0] - recording.centre[episode, before]
-    angular = _turn(recording.quaternion[episode, before], quaternion[:, 0])
+    angular = turn_between(recording.quaternion[episode, before], quaternion[:, 0])
     actions = start[:, None] + torch.arange(recording.length)
     number = recording.number[episode].to(device)
 
@@ -153,7 +153,7 @@ def batch(
     return Batch(number, motion, put(recording.velocity[episode[:, None], actions].transpose(0, 1)), targets)
 
 
-def _turn(first: Tensor, second: Tensor) -> Tensor:
+def turn_between(first: Tensor, second: Tensor) -> Tensor:
     """Rotation vectors from one orientation to another [rad]."""
     a, b = first.double().numpy(), second.double().numpy()
     return torch.as_tensor(quaternion_log(quaternion_multiply(b, quaternion_conjugate(a))), dtype=torch.float32)

@@ -42,14 +42,15 @@ def data(shapes, tmp_path_factory):
 
 
 def config(data, folder, **changes) -> TrainDynamics:
-    settings = {"iterations": 6, "batch": 6, "hidden": 8, "patience": 10, "device": "cpu"}
-    return TrainDynamics((data,), folder / "net.safetensors", **{**settings, **changes})
+    settings = {"iterations": 4, "long_iterations": 2, "batch": 6, "long_batch": 2, "hidden": 8, "patience": 10}
+    return TrainDynamics((data,), folder / "net.safetensors", device="cpu", **{**settings, **changes})
 
 
 @pytest.fixture
 def often(monkeypatch):
     """Measure, save and tell so often that short runs have something to tell."""
     monkeypatch.setattr(training, "_MEASURE_EVERY", 2)
+    monkeypatch.setattr(training, "_MEASURE_LONG_EVERY", 1)
     monkeypatch.setattr(training, "_REPORT_EVERY", 1)
 
 
@@ -84,8 +85,8 @@ def test_a_run_writes_a_network_and_what_is_known_of_it(data, tmp_path, shapes):
 def test_the_command_says_how_to_do_it_again(data, tmp_path):
     plain = TrainDynamics((data,), tmp_path / "net.safetensors")
     assert plain.command == "osf train dynamics --data pushes.h5 --out net.safetensors"
-    told = replace(plain, iterations=5, short_share=0.5, without=(CAN, "a b"), seed=3).command
-    assert told.endswith(f"--iterations 5 --short-share 0.5 --seed 3 --without {CAN} 'a b'")
+    told = replace(plain, iterations=5, long_batch=7, without=(CAN, "a b"), seed=3).command
+    assert told.endswith(f"--iterations 5 --long-batch 7 --seed 3 --without {CAN} 'a b'")
 
 
 @pytest.mark.usefixtures("often")
@@ -121,7 +122,7 @@ def test_a_checkpoint_that_does_not_fit_is_not_gone_on_with(data, tmp_path, shap
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(data, tmp_path, shapes):
     for folder, seed in (("a", 0), ("b", 0), ("c", 1)):
-        list(train_dynamics(config(data, tmp_path / folder, iterations=3, seed=seed), shapes))
+        list(train_dynamics(config(data, tmp_path / folder, iterations=2, long_iterations=1, seed=seed), shapes))
     assert_same_weights(tmp_path / "a" / "net.safetensors", tmp_path / "b" / "net.safetensors")
     a, c = weights(tmp_path / "a" / "net.safetensors"), weights(tmp_path / "c" / "net.safetensors")
     assert any(not torch.equal(a[name], c[name]) for name in a)
@@ -129,23 +130,24 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(data, tmp_
 
 @pytest.mark.usefixtures("often")
 def test_training_stops_when_nothing_gets_better(data, tmp_path, shapes):
-    settings = config(data, tmp_path, iterations=100, patience=1, rate=1e-9, short_share=1.0)
+    settings = config(data, tmp_path, iterations=100, long_iterations=100, patience=1, rate=1e-9)
     list(train_dynamics(settings, shapes))
     told = json.loads(settings.out.with_suffix(".json").read_text())
-    assert told["iterations"] < 100
+    assert told["iterations"] < 20
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"iterations": 0}, "number of iterations is 0"),
-        ({"batch": 2}, "batch is 2"),
+        ({"batch": 0}, "batch is 0"),
+        ({"long_batch": 0}, "batch of windows is 0"),
+        ({"long_iterations": -1}, "iterations on windows is -1"),
         ({"hidden": 0}, "width of the network is 0"),
         ({"hidden": 1025}, "width of the network is 1025"),
         ({"patience": 0}, "patience is 0"),
         ({"rate": 0.0}, "rate of learning is 0"),
         ({"rate": float("nan")}, "rate of learning is nan"),
-        ({"short_share": 1.5}, "share of single actions is 1.5"),
         ({"seed": -1}, "seed is -1"),
         ({"device": "tpu"}, "device"),
         ({"without": (CAN, GELATIN, APPLE)}, "episodes to learn from is 0"),
