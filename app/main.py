@@ -103,7 +103,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         predictor = NeuralLink(settings.data_dir, predictor_main, WHO)
         stack.push_async_callback(run_in_threadpool, predictor.stop)
         predicted = Predictions(runner, fields.names, predictor)
-        viewer = Viewer(runner, neural, fields.names, found)
+        viewer = Viewer(runner, neural, fields.names, found, predicted)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
         services = Services(settings, store, runner, viewer, shelf, fields, neural, found, predicted)
