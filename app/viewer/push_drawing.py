@@ -133,7 +133,7 @@ class PushDrawing:
     def _add_object(self, name: str, poses: Pose) -> np.ndarray:
         """Ghost and trail of an object; tells where to draw its way."""
         mesh = self._mesh(name)
-        rows = np.unique(np.round(np.linspace(0, len(poses.position) - 1, TRAIL + 2)).astype(int))[1:-1]
+        rows = _spaced(poses, TRAIL)
         if len(rows):
             self._trails.append(self._copies(f"/push/trail/{name}", mesh, poses[rows], _TRAIL_OPACITY, _TRAIL_SCALE))
         self._ghosts[name] = self._copies(f"/push/ghost/{name}", mesh, poses[-1:], _GHOST_OPACITY, _GHOST_SCALE)
@@ -187,6 +187,13 @@ def _moves(poses: Pose) -> bool:
     shift = np.abs(poses.position - poses.position[0]).max()
     turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
     return bool(shift > _MOVED_M or turn > _TURNED**2)
+
+
+def _spaced(poses: Pose, count: int) -> np.ndarray:
+    """Rows between start and end that lie about evenly along the way, not in time: most pushes begin with a gap."""
+    gone = np.cumsum(np.linalg.norm(np.diff(poses.position, axis=0), axis=1))
+    rows = 1 + np.searchsorted(gone, gone[-1] * np.arange(1, count + 1) / (count + 1))
+    return np.unique(rows[(rows < len(gone)) & (gone[-1] > _MOVED_M)])
 
 
 def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:

@@ -7,10 +7,10 @@ from html import escape
 
 from app.pushes import Outcome
 
-_STYLE = "width:100%;border-collapse:collapse;font-size:0.75em;line-height:1.35"
+_STYLE = "width:100%;border-collapse:collapse;font-size:0.7em;line-height:1.35"
 _STATUS = "margin:0;padding:0.2em 0.75em 0.5em;font-size:0.8em;line-height:1.35"
-_HEAD = "text-align:right;font-weight:600;vertical-align:bottom"
-_CELL = "text-align:right;vertical-align:top;white-space:nowrap"
+_HEAD = "text-align:right;padding-left:0.5em;font-weight:600;vertical-align:bottom"
+_CELL = "text-align:right;padding-left:0.5em;vertical-align:top;white-space:nowrap"
 
 
 def status(text: str) -> str:
@@ -28,7 +28,7 @@ def report(outcomes: Iterable[Outcome], labels: Mapping[str, str]) -> str:
     head = "".join(f'<th style="{_HEAD}">{text}</th>' for text in heads)
     lines = "".join(_line(row, labels.get(row.name, row.name)) for row in rows)
     return (
-        f'<div style="padding:0 0.75em 0.4em"><table class="push-report" style="{_STYLE}">'
+        f'<div style="padding:0 0.7em 0.4em"><table class="push-report" style="{_STYLE}">'
         f'<tr><th style="text-align:left">Object</th>{head}</tr>{lines}</table></div>'
     )
 
@@ -46,4 +46,8 @@ def _line(row: Outcome, label: str) -> str:
 def _told(shift_mm: float, turn_deg: float) -> str:
     if shift_mm < 0.05 and turn_deg < 0.05:
         return "still"
-    return f"{shift_mm:.1f} mm<br>{turn_deg:.1f}°"
+    return f"{_digits(shift_mm)} mm<br>{_digits(turn_deg)}°"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"

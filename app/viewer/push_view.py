@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -26,19 +26,19 @@ from app.pushes import MAX_ACTIONS, along, outcomes, straight, toward_nearest, w
 from app.viewer.drawing import Client
 from app.viewer.push_drawing import PushDrawing
 from app.viewer.push_report import report, status
+from app.viewer.push_trial import Trial
 from app.viewer.waypoints import FEWEST, MOST, Waypoints
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
-from osfcore.rollouts import Rollouts
 from osfcore.scene import MAX_SPEED_M_S, STEP_S, SceneState
 
 STRAIGHT, PATH = "Straight", "Waypoints"
 COMPASS = {"→": 0, "↗": 45, "↑": 90, "↖": 135, "←": 180, "↙": 225, "↓": 270, "↘": 315}
 TICK_S, REST_S = 0.03, 0.02  # between two pictures of a moving ghost, and the least between any two
 _KEY = "viewer"
-_INTRO = "Starts from the **true poses** in the simulator; nothing moves until *Execute*."
+_INTRO = "Starts from the **true poses** in the simulator."
 _IDLE = "Choose a push, then Predict"
-_EXECUTED = "Executed; purple is what was predicted, black lines are the true ways"
+_EXECUTED = "Executed. Purple: predicted; black: the true ways"
 _CHANGED = "The table has changed; predict again"
 _SPEED = (0.05, MAX_SPEED_M_S)
 _DEFAULT_STEPS = 6
@@ -50,32 +50,6 @@ Act = Callable[[str, list[np.ndarray]], SceneRecord]
 
 class CannotExecute(OsfError):
     """Actions that may not be executed now."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Ready:
-    """A prediction on view.
-
-    Attributes:
-        record: the scene from which it starts.
-        actions: that were tried.
-        rollouts: what they would lead to.
-        took_s: time that predicting took [s].
-        truth: what came of it, as far as it has been executed; empty before.
-        is_executed: whether exactly these actions, all of them, were executed.
-    """
-
-    record: SceneRecord
-    actions: Float[np.ndarray, "T 3"]
-    rollouts: Rollouts
-    took_s: float
-    truth: tuple[SceneState, ...] = ()
-    is_executed: bool = False
-
-    @property
-    def last_revision(self) -> int:
-        """Of the scene once it has been executed: the simulation counts actions."""
-        return self.record.revision + len(self.actions)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,11 +84,11 @@ class PushView:
         self._waypoints = Waypoints(server, self._replan)
         self._changed = threading.Condition()  # guards what was noted
         self._record: SceneRecord | None = None
-        self._ready: Ready | None = None
-        self._drawn: Ready | None = None
+        self._ready: Trial | None = None
+        self._drawn: Trial | None = None
         self._come: _Asked | None = None
         self._told = _IDLE
-        self._executing: Ready | None = None
+        self._executing: Trial | None = None
         self._has_plan = False  # whether anybody has begun to choose a push
         self._is_due = False
         self._is_stopped = False
@@ -145,24 +119,12 @@ class PushView:
                     self._record, self._ready, self._told = record, None, _IDLE
                 case SceneChanged(record, states) if self._record is not None and record.id == self._record.id:
                     self._record = record
-                    self._take_change(record, states)
+                    if self._ready is not None:
+                        self._ready = self._ready.after(record, states, self._executing)
+                        self._told = _CHANGED if self._ready is None else self._told
                 case _:
                     return
             self._wake()
-
-    def _take_change(self, record: SceneRecord, states: tuple[SceneState, ...]) -> None:
-        """A prediction outlives the execution of its own actions, and nothing else."""
-        ready = self._ready
-        if ready is None or record.revision <= ready.record.revision:
-            return
-        is_own = self._executing is not None and ready.rollouts is self._executing.rollouts
-        if is_own and record.revision <= ready.last_revision:
-            truth = (*(ready.truth or (ready.record.state,)), *states, record.state)
-            self._ready = replace(ready, truth=truth, is_executed=record.revision == ready.last_revision)
-            return
-        if ready.is_executed and record.revision == ready.last_revision:
-            return
-        self._ready, self._told = None, _CHANGED
 
     # The panel
 
@@ -211,8 +173,11 @@ class PushView:
             self._replan()
 
     def _replan(self) -> None:
+        """Another push is chosen: what was predicted, or executed, is about a former one."""
         with self._changed:
             self._has_plan = True
+            if self._executing is None:
+                self._ready, self._told = None, _IDLE
             self._wake()
 
     def _seek(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
@@ -342,14 +307,14 @@ class PushView:
             if now is None or (now.id, now.revision) != (asked.record.id, asked.record.revision):
                 self._told = _CHANGED
                 return
-            self._ready = Ready(asked.record, asked.actions, answer.rollouts, answer.took_s)
+            self._ready = Trial(asked.record, asked.actions, answer.rollouts, answer.took_s)
 
     def _draw(self) -> None:
         with self._changed:
             record, ready, told = self._record, self._ready, self._told
         self._draw_plan(record)
         if ready is not self._drawn:
-            told = self._draw_ready(ready) or told
+            told = self._draw_ready(ready) if ready else self._draw_none(told)
             self._drawn = ready
         self._draw_time(ready)
         if self._status.content != status(told):
@@ -384,20 +349,21 @@ class PushView:
         heading_rad, far_m = toward_nearest(state)
         self._heading.value = int(5 * round(math.degrees(heading_rad) / 5)) % 360
         step_m = STEP_S * _number(self._speed.value, *_SPEED)
-        self._steps.value = min(max(math.ceil((far_m + _FURTHER_M) / step_m), 1), MAX_ACTIONS)
+        self._steps.value = min(max(math.ceil((far_m + _FURTHER_M) / step_m - 1e-9), 1), MAX_ACTIONS)
 
     def _is_done(self) -> bool:
         """Whether what is on view has been executed: the plan would only lead on from there."""
         ready = self._ready
         return ready is not None and ready.is_executed
 
-    def _draw_ready(self, ready: Ready | None) -> str:
+    def _draw_none(self, told: str) -> str:
+        self._time.visible = self._play.visible = self._report.visible = False
+        self._playing_since = None
+        self._drawing.clear()
+        return told
+
+    def _draw_ready(self, ready: Trial) -> str:
         """Draw a prediction, or what came of it; tells what to say of it."""
-        self._time.visible = self._play.visible = self._report.visible = ready is not None
-        if ready is None:
-            self._playing_since = None
-            self._drawing.clear()
-            return ""
         drawn = self._drawn
         if drawn is None or drawn.rollouts is not ready.rollouts:
             self._drawing.show(ready.rollouts)
@@ -409,14 +375,16 @@ class PushView:
         after = ready.truth[-1] if ready.is_executed else None
         found = outcomes(ready.record.state, ready.rollouts, after, self._library)
         self._report.content = report(found, self._labels(ready.rollouts.names))
+        self._time.visible = self._play.visible = self._report.visible = True
         moving = len(self._drawing.moving)
         said = f"{moving} object{'s' * (moving != 1)} will move" if moving else "Nothing will move"
         told = f"{said}; predicted in {1000 * ready.took_s:.0f} ms"
         if ready.truth:
             told = _EXECUTED if ready.is_executed else "Executing"
         with self._changed:
-            self._told = told
-        return told
+            if self._ready is ready:  # else there is something newer to tell
+                self._told = told
+            return self._told
 
     def _labels(self, names: tuple[str, ...]) -> Mapping[str, str]:
         labels = {}
@@ -427,7 +395,7 @@ class PushView:
                 labels[name] = name
         return labels
 
-    def _draw_time(self, ready: Ready | None) -> None:
+    def _draw_time(self, ready: Trial | None) -> None:
         if ready is None:
             return
         with self._changed:
