@@ -331,9 +331,9 @@ class PushView:
             return
         laid = (record.id, tuple(pusher[:2]))
         if laid != self._laid:
-            if self._laid is None or self._laid[0] != record.id:
+            if self._laid is None or self._laid[0] != record.id or not self._has_plan:
                 self._aim(record.state)
-            self._waypoints.lay(pusher[:2], math.radians(_number(self._heading.value, 0.0, 360.0)))
+            self._waypoints.lay(pusher[:2], toward_nearest(record.state)[0])
             self._laid = laid
         has_plan = self._has_plan
         self._waypoints.show(self._waypoint_count if has_plan and self._is_path else 0)
