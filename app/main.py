@@ -21,7 +21,9 @@ from app import problems, relay
 from app.estimates import Estimates
 from app.field_shelf import FieldShelf
 from app.neural.link import NeuralLink
-from app.routes import estimates, events, fields, health, jobs, neural, objects, scenes
+from app.neural.predictor import WHO, predictor_main
+from app.predictions import Predictions
+from app.routes import estimates, events, fields, health, jobs, neural, objects, predictions, scenes
 from app.runner import Runner
 from app.schemas import FrameEvent, NoticeEvent, Problem
 from app.schemas_estimates import EstimateIn
@@ -34,7 +36,7 @@ from osfcore.objects.library import AssetLibrary
 
 _DESCRIPTION = (
     "Scenes of real objects on a lit table, a pusher to move them, cameras to look at them, estimates of what they "
-    "see, and jobs for long work. "
+    "see, predictions of what pushes do, and jobs for long work. "
     "Metres, seconds, quaternions (w, x, y, z); world z up, table top at z = 0. "
     "Errors are application/problem+json with one sentence in `detail`."
 )
@@ -66,7 +68,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         limit_of=limit_of,
     )
     problems.install(app)
-    for module in (health, objects, fields, scenes, neural, estimates, jobs, events):
+    for module in (health, objects, fields, scenes, neural, estimates, predictions, jobs, events):
         app.include_router(module.router)
     app.include_router(relay.router)
     _add_docs(app)
@@ -98,10 +100,13 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         found = Estimates(runner, fields, settings.data_dir)
         stack.push_async_callback(run_in_threadpool, found.stop)
         await run_in_threadpool(found.start)
-        viewer = Viewer(runner, neural, fields.names, found)
+        predictor = NeuralLink(settings.data_dir, predictor_main, WHO)
+        stack.push_async_callback(run_in_threadpool, predictor.stop)
+        predicted = Predictions(runner, fields.names, predictor)
+        viewer = Viewer(runner, neural, fields.names, found, predicted)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
-        services = Services(settings, store, runner, viewer, shelf, fields, neural, found)
+        services = Services(settings, store, runner, viewer, shelf, fields, neural, found, predicted)
         app.state.services = services
         stack.callback(services.closing.set)
         yield

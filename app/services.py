@@ -14,6 +14,7 @@ from app.estimates import Estimates
 from app.field_shelf import FieldShelf
 from app.messages import SceneRecord
 from app.neural.link import NeuralLink
+from app.predictions import Predictions
 from app.runner import Runner
 from app.schemas import SceneOut
 from app.settings import Settings
@@ -71,6 +72,7 @@ class Services:
     fields: FieldShelf
     neural: NeuralLink
     estimates: Estimates
+    predictions: Predictions
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
     def scene_out(self, record: SceneRecord) -> SceneOut:

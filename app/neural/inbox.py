@@ -1,14 +1,14 @@
-"""Orders that wait to be rendered: of one visitor only the newest, quick ones first."""
+"""Orders that wait to be carried out: of one visitor only the newest, quick ones first."""
 
 from __future__ import annotations
 
 import threading
 
-from app.neural.messages import CompareView, NumberedOrder
+from app.neural.messages import CompareView, DrawView, NumberedOrder
 
 
 class Inbox:
-    """Filled by the thread that listens, emptied by the one that renders."""
+    """Filled by the thread that listens, emptied by the one that carries out."""
 
     def __init__(self) -> None:
         self._waiting: dict[str, NumberedOrder] = {}
@@ -48,4 +48,4 @@ def _patience(order: NumberedOrder) -> int:
     """How long an order can wait: views that move are the least patient, those that rest the most."""
     if isinstance(order.order, CompareView):
         return 1
-    return 2 if order.order.is_sharp else 0
+    return 2 if isinstance(order.order, DrawView) and order.order.is_sharp else 0

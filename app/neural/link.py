@@ -1,4 +1,4 @@
-"""The web process's end of the rendering process: starts it on first use, hands out answers, starts it again."""
+"""The web process's end of a process with neural models: starts it on first use, hands out answers, starts it again."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import itertools
 import logging
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from app.messages import Failure, Reply
-from app.neural.messages import Comparison, DrawnView, NumberedOrder, Order
+from app.neural.messages import Comparison, DrawnView, NumberedOrder, Order, Predicted
 from app.neural.process import renderer_main
 from app.processes import end, launch
 from osfcore.errors import OsfError
@@ -21,40 +22,49 @@ MAX_PENDING = 64
 ANSWER_S = 180.0  # compiling on a busy machine takes longest; after that the process counts as hung
 _PAUSES_S = (0.0, 2.0, 10.0, 60.0)  # longer and longer while it keeps dying without answering anything
 _log = logging.getLogger(__name__)
-Answer = DrawnView | Comparison | None
+Answer = DrawnView | Comparison | Predicted | None
 
 
-class RendererError(OsfError):
-    """What the renderer refused, told in its own words."""
+class NeuralError(OsfError):
+    """What the process refused, told in its own words."""
 
     def __init__(self, kind: str, text: str) -> None:
         super().__init__(text)
         self.kind = kind
 
 
-class RendererUnavailable(OsfError):
-    """The renderer is not there now."""
+class NeuralUnavailable(OsfError):
+    """The process is not there now."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"The neural renderer {what}; try again in a moment.")
+    def __init__(self, who: str, what: str) -> None:
+        super().__init__(f"The {who} {what}; try again in a moment.")
 
 
-class RendererBusy(OsfError):
+class NeuralBusy(OsfError):
     """More orders wait than make sense."""
 
-    def __init__(self) -> None:
-        super().__init__("The neural renderer has too much to do at once; try again in a moment.")
+    def __init__(self, who: str) -> None:
+        super().__init__(f"The {who} has too much to do at once; try again in a moment.")
 
 
 class NeuralLink:
-    """A rendering process and the thread that listens to it; neither is there before the first order.
+    """A process that carries out orders and the thread that listens to it; neither is there before the first order.
 
     Args:
         data_dir: where trained fields are.
+        main: what the process runs: `main(connection, data_dir)`.
+        who: what people call it.
     """
 
-    def __init__(self, data_dir: Path) -> None:
+    def __init__(
+        self,
+        data_dir: Path,
+        main: Callable[[Connection, Path], None] = renderer_main,
+        who: str = "neural renderer",
+    ) -> None:
         self._data_dir = data_dir
+        self._main = main
+        self._who = who
         self._lock = threading.Lock()  # never held while sending: the listener needs it to take answers
         self._send_lock = threading.Lock()
         self._numbers = itertools.count(1)
@@ -87,7 +97,7 @@ class NeuralLink:
         self._fail(lost, "was stopped")
 
     def submit(self, order: Order) -> Future[Answer]:
-        """Send an order; the future raises RendererError, RendererUnavailable or RendererBusy."""
+        """Send an order; the future raises NeuralError, NeuralUnavailable or NeuralBusy."""
         future: Future[Answer] = Future()
         try:
             connection, number = self._note(future)
@@ -98,7 +108,7 @@ class NeuralLink:
             with self._send_lock:
                 connection.send(NumberedOrder(number, order))
         except OSError:  # the listening thread sees the end as well
-            self._settle(number, RendererUnavailable("stopped unexpectedly"))
+            self._settle(number, NeuralUnavailable(self._who, "stopped unexpectedly"))
         return future
 
     def _note(self, future: Future[Answer]) -> tuple[Connection, int]:
@@ -115,19 +125,19 @@ class NeuralLink:
     def _check_ready(self) -> None:
         """Refuse orders that could not be answered soon."""
         if self._is_stopped:
-            raise RendererUnavailable("was stopped")
+            raise NeuralUnavailable(self._who, "was stopped")
         now = time.monotonic()
         if self._pending and now - self._heard_at > ANSWER_S and self._process is not None:
             self._process.kill()  # the listening thread tells all who wait
-            raise RendererUnavailable("hangs and is being restarted")
+            raise NeuralUnavailable(self._who, "hangs and is being restarted")
         if len(self._pending) >= MAX_PENDING:
-            raise RendererBusy
+            raise NeuralBusy(self._who)
         pause_s = _PAUSES_S[min(max(self._deaths - 1, 0), len(_PAUSES_S) - 1)]
         if self._connection is None and now - self._died_at < pause_s:
-            raise RendererUnavailable("keeps stopping")
+            raise NeuralUnavailable(self._who, "keeps stopping")
 
     def _launch(self) -> Connection:
-        process, connection = launch(renderer_main, "osf-neural", self._data_dir)
+        process, connection = launch(self._main, f"osf-{self._who.replace(' ', '-')}", self._data_dir)
         self._process, self._connection, self._is_warm = process, connection, False
         threading.Thread(target=self._listen, args=(process, connection), name="neural-link", daemon=True).start()
         return connection
@@ -147,7 +157,7 @@ class NeuralLink:
         end(process)
         connection.close()
         if not is_expected:
-            _log.error("the rendering process ended unexpectedly (exit code %s)", process.exitcode)
+            _log.error("the %s ended unexpectedly (exit code %s)", self._who, process.exitcode)
         self._fail(lost, "stopped unexpectedly")
 
     def _take(self, message: object) -> None:
@@ -158,7 +168,7 @@ class NeuralLink:
                 self._settle(number, value)
             case Failure(number, kind, text):
                 self._note_life()
-                self._settle(number, RendererError(kind, text))
+                self._settle(number, NeuralError(kind, text))
 
     def _note_life(self) -> None:
         with self._lock:
@@ -176,4 +186,4 @@ class NeuralLink:
 
     def _fail(self, numbers: list[int], what: str) -> None:
         for number in numbers:
-            self._settle(number, RendererUnavailable(what))
+            self._settle(number, NeuralUnavailable(self._who, what))

@@ -1,12 +1,13 @@
-"""What crosses between the web process and the rendering process; answers and errors are those of `app.messages`."""
+"""What crosses between the web process and processes with neural models; answers are those of `app.messages`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
+from osfcore.rollouts import Rollouts
 from osfcore.scene import Camera, SceneState
 
 
@@ -74,7 +75,35 @@ class Comparison:
     psnr_db: float
 
 
-Order = DrawView | CompareView
+@dataclass(frozen=True, eq=False, slots=True)
+class PredictPushes:
+    """Where sequences of actions would lead. Answered by Predicted, or by None if a newer order overtook it.
+
+    Attributes:
+        key: who wants it; a newer order of the same key overtakes.
+        state: objects with fields only, and the pusher.
+        actions: velocities of the pusher [m/s].
+    """
+
+    key: str
+    state: SceneState
+    actions: Float[np.ndarray, "K T 3"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Predicted:
+    """A prediction.
+
+    Attributes:
+        rollouts: the futures.
+        took_s: time that they took, without waiting and without loading [s].
+    """
+
+    rollouts: Rollouts
+    took_s: float
+
+
+Order = DrawView | CompareView | PredictPushes
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -36,19 +36,31 @@ MOST_PSNR_DB = 100.0
 _NICENESS = 5  # the simulation, and what serves the page, come first
 _MOST_RENDERERS = 4
 _log = logging.getLogger(__name__)
+CarryOut = Callable[[Order, Callable[[], bool]], object]  # an order, and what tells whether a newer one overtook it
 
 
 def renderer_main(connection: Connection, data_dir: Path) -> None:
     """Serve orders until the other end is gone."""
+    os.nice(_NICENESS)
+    studio = Studio(FieldLibrary(data_dir))
+    serve(connection, studio.render, "neural renderer")
+
+
+def serve(connection: Connection, carry_out: CarryOut, who: str) -> None:
+    """Carry out orders, one at a time, until the other end is gone.
+
+    Args:
+        connection: where they come from.
+        carry_out: what answers one; raises OsfError where it refuses.
+        who: what people call this process.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
     silence_stdout()
-    os.nice(_NICENESS)
     inbox, replies = Inbox(), Replies(connection)
-    # Orders are read at once, however long rendering takes, so that whoever sends them never waits.
+    # Orders are read at once, however long work takes, so that whoever sends them never waits.
     threading.Thread(target=_listen, args=(connection, inbox, replies), daemon=True).start()
-    studio = Studio(FieldLibrary(data_dir))
     while (order := inbox.take()) is not None:
-        replies.send(_answer(studio, inbox, order))
+        replies.send(_answer(carry_out, who, inbox, order))
 
 
 class Replies:
@@ -74,14 +86,14 @@ def _listen(connection: Connection, inbox: Inbox, replies: Replies) -> None:
         inbox.close()
 
 
-def _answer(studio: Studio, inbox: Inbox, order: NumberedOrder) -> Reply | Failure:
+def _answer(carry_out: CarryOut, who: str, inbox: Inbox, order: NumberedOrder) -> Reply | Failure:
     try:
-        return Reply(order.number, studio.render(order.order, lambda: inbox.is_overtaken(order)))
+        return Reply(order.number, carry_out(order.order, lambda: inbox.is_overtaken(order)))
     except OsfError as error:
         return Failure.of(error, order.number)
-    except Exception as error:  # a defect must not end the pictures of others
-        _log.exception("an order could not be rendered")
-        return Failure(order.number, "Internal", f"The neural renderer failed ({type(error).__name__}).")
+    except Exception as error:  # a defect must not end the orders of others
+        _log.exception("the %s could not carry out an order", who)
+        return Failure(order.number, "Internal", f"The {who} failed ({type(error).__name__}).")
 
 
 class Studio:
@@ -98,9 +110,13 @@ class Studio:
             UnknownName: if an object has no field.
             CorruptFile: if a field, or the table's, is broken.
         """
-        if isinstance(order, CompareView):
-            return self._compare(order)
-        return self._draw(order, is_overtaken)
+        match order:
+            case DrawView():
+                return self._draw(order, is_overtaken)
+            case CompareView():
+                return self._compare(order)
+            case _:
+                raise TypeError(f"{type(order).__name__} is no picture")
 
     def _draw(self, order: DrawView, is_overtaken: Callable[[], bool]) -> DrawnView | None:
         from osfcore.render.scene_renderer import EXACT, PLANNING

@@ -26,6 +26,6 @@ _TEXTS = {
     421: "The service is not known under this host name.",
     422: "The input is not valid; the detail says what is allowed.",
     429: "Too many jobs wait already.",
-    503: "The simulation, or the neural renderer, is being restarted.",
+    503: "The simulation, the neural renderer or the predictor is being restarted.",
     507: "The disk is full.",
 }

@@ -16,14 +16,16 @@ import viser
 
 from app.estimates import Estimates
 from app.job import JobChanged
-from app.messages import CurrentScene
+from app.messages import CurrentScene, SceneRecord
 from app.neural.link import NeuralLink
 from app.playback import Playback
+from app.predictions import Predictions
 from app.runner import Runner
 from app.viewer.drawing import Client, SceneDrawing
 from app.viewer.estimate_drawing import EstimateDrawing
 from app.viewer.estimate_view import EstimateView
 from app.viewer.neural_view import NeuralViews
+from app.viewer.push_view import PushView
 from osfcore.errors import OsfError
 from osfcore.poses import Pose
 from osfcore.scene import Light
@@ -46,7 +48,12 @@ class Viewer:
     """The view of the runner's current scene, the same for any number of browsers."""
 
     def __init__(
-        self, runner: Runner, neural: NeuralLink, fields: Callable[[], Collection[str]], estimates: Estimates
+        self,
+        runner: Runner,
+        neural: NeuralLink,
+        fields: Callable[[], Collection[str]],
+        estimates: Estimates,
+        predictions: Predictions,
     ) -> None:
         """Prepare the view.
 
@@ -55,8 +62,10 @@ class Viewer:
             neural: renders what they see.
             fields: names of the objects that have one.
             estimates: finds poses and light in what the cameras see.
+            predictions: tells what pushes would do.
         """
         self._estimates = estimates
+        self._predictions = predictions
         self._runner = runner
         self._neural = neural
         self._fields = fields
@@ -97,15 +106,18 @@ class Viewer:
             self._obey,
             self._runner.jobs.cancel,
         )
+        self._push_view = PushView(self._server, self._runner.library, self._predictions, self._runner.act, self._obey)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._part)
         self._neural_views.start()
         self._playback.start()
         self._estimate_view.start(self._runner.current)
+        self._push_view.start(self._current_record())
         self._undo = [
             self._runner.hub.subscribe(self._playback.note),
             self._runner.hub.subscribe(self._on_job),
             self._runner.hub.subscribe(self._estimate_view.note),
+            self._runner.hub.subscribe(self._push_view.note),
         ]
         self._show_current()
 
@@ -118,6 +130,7 @@ class Viewer:
         self._playback.stop()
         self._neural_views.stop()
         self._estimate_view.stop()
+        self._push_view.stop()
         self._commands.shutdown(wait=False, cancel_futures=True)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
@@ -133,8 +146,11 @@ class Viewer:
         self._neural_views.remove(client)
 
     def _show_current(self) -> None:
+        self._playback.note(CurrentScene(self._current_record()))
+
+    def _current_record(self) -> SceneRecord | None:
         current = self._runner.current
-        self._playback.note(CurrentScene(None if current is None else self._runner.scene(current)))
+        return None if current is None else self._runner.scene(current)
 
     def _add_panel(self, server: LoopbackViser) -> None:
         gui = server.gui

@@ -2,10 +2,12 @@ import os
 import signal
 from concurrent.futures import Future
 
+import numpy as np
 import pytest
 
-from app.neural.link import MAX_PENDING, NeuralLink, RendererBusy, RendererError, RendererUnavailable
-from app.neural.messages import DrawnView, DrawView
+from app.neural.link import MAX_PENDING, NeuralBusy, NeuralError, NeuralLink, NeuralUnavailable
+from app.neural.messages import DrawnView, DrawView, Predicted, PredictPushes
+from app.neural.predictor import WHO, predictor_main
 from osfcore.scene import SceneState, goal_camera
 from tests.app.conftest import until
 
@@ -34,7 +36,7 @@ def test_it_starts_with_the_first_order(fields_dir, state):
     assert link.is_warm
     link.stop()
     assert not link.process.is_alive()
-    with pytest.raises(RendererUnavailable, match="stopped"):
+    with pytest.raises(NeuralUnavailable, match="stopped"):
         draw(link, state).result(5)
 
 
@@ -48,7 +50,7 @@ def test_of_many_orders_of_one_visitor_the_last_is_drawn(link, state):
 
 def test_refusals_are_told_in_words(link, state):
     other = SceneState(("teapot",), state.poses, state.light, None)
-    with pytest.raises(RendererError, match="teapot") as refused:
+    with pytest.raises(NeuralError, match="teapot") as refused:
         draw(link, other).result(COMPILE_S)
     assert refused.value.kind == "UnknownName"
 
@@ -56,7 +58,7 @@ def test_refusals_are_told_in_words(link, state):
 def test_too_much_at_once_is_refused(link, state):
     futures = [draw(link, state, key=f"k{n}", size=256, is_sharp=True) for n in range(2 * MAX_PENDING)]
     kinds = {type(future.exception(COMPILE_S)) for future in futures}
-    assert kinds == {type(None), RendererBusy}
+    assert kinds == {type(None), NeuralBusy}
 
 
 def test_a_killed_renderer_says_so_and_comes_back(link, state):
@@ -65,7 +67,7 @@ def test_a_killed_renderer_says_so_and_comes_back(link, state):
     os.kill(process.pid, signal.SIGSTOP)
     waiting = draw(link, state)
     os.kill(process.pid, signal.SIGKILL)
-    with pytest.raises(RendererUnavailable, match="stopped unexpectedly"):
+    with pytest.raises(NeuralUnavailable, match="stopped unexpectedly"):
         waiting.result(20)
     until(lambda: not process.is_alive())
     assert isinstance(draw(link, state).result(COMPILE_S), DrawnView)
@@ -77,8 +79,8 @@ def test_one_that_keeps_dying_is_left_alone_for_a_while(fields_dir, state):
     for _ in range(2):
         waiting = draw(link, state)
         link.process.kill()
-        assert isinstance(waiting.exception(20), RendererUnavailable)
-    with pytest.raises(RendererUnavailable, match="keeps stopping"):
+        assert isinstance(waiting.exception(20), NeuralUnavailable)
+    with pytest.raises(NeuralUnavailable, match="keeps stopping"):
         draw(link, state).result(5)
     link.stop()
 
@@ -89,9 +91,20 @@ def test_one_that_hangs_is_replaced(fields_dir, state, monkeypatch):
     monkeypatch.setattr("app.neural.link.ANSWER_S", 0.0)
     os.kill(link.process.pid, signal.SIGSTOP)
     waiting = draw(link, state)
-    with pytest.raises(RendererUnavailable, match="hangs"):
+    with pytest.raises(NeuralUnavailable, match="hangs"):
         draw(link, state).result(5)
-    assert isinstance(waiting.exception(20), RendererUnavailable)
+    assert isinstance(waiting.exception(20), NeuralUnavailable)
     monkeypatch.undo()
     assert isinstance(draw(link, state).result(COMPILE_S), DrawnView)
     link.stop()
+
+
+def test_it_runs_other_processes_under_their_own_name(fields_dir, state):
+    link = NeuralLink(fields_dir, predictor_main, WHO)
+    predicted = link.submit(PredictPushes("a", state, np.zeros((1, 2, 3)))).result(COMPILE_S)
+    assert isinstance(predicted, Predicted)
+    with pytest.raises(NeuralError, match="predictor of pushes failed"):
+        draw(link, state).result(20)
+    link.stop()
+    with pytest.raises(NeuralUnavailable, match="predictor of pushes was stopped"):
+        draw(link, state).result(5)

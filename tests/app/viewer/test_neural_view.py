@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.neural.link import RendererUnavailable
+from app.neural.link import NeuralUnavailable
 from app.neural.messages import DrawnView
 from app.viewer.neural_view import NeuralViews
 from osfcore.poses import Pose
@@ -188,7 +188,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
 
 def test_where_the_renderer_fails_the_switch_goes_back_and_says_why(room, browser):
     browser.turn(True)
-    room.renderer.answer(0, RendererUnavailable("stopped unexpectedly"))
+    room.renderer.answer(0, NeuralUnavailable("neural renderer", "stopped unexpectedly"))
     until(lambda: browser.notifications)
     assert "stopped unexpectedly" in browser.notifications[0].body
     assert browser.switch.value is False
