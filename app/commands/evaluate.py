@@ -184,9 +184,9 @@ def _show_dynamics(folder: Path, result: dict[str, Any]) -> None:
     print(f"Three objects, {result['windows']} that moved within 4 steps of 0.2 s:")
     for horizon in (1, 4, 10, 30):
         mm, deg = result[f"median_mm_{horizon}"], result[f"median_deg_{horizon}"]
-        constant = f" (constant pose {_number(result[f'constant_mm_{horizon}'])}, "
-        others = f"{constant}quasi-static {_number(result[f'analytic_mm_{horizon}'])} mm)" if horizon > 1 else ""
-        print(f"  after {horizon}: median {_number(mm)} mm, {_number(deg)} deg{others}")
+        others = [_number(result[f"{who}_mm_{horizon}"]) for who in ("constant", "analytic")]
+        told = f"constant pose {others[0]}, quasi-static {others[1]} mm"
+        print(f"  after {horizon}: median {_number(mm)} mm, {_number(deg)} deg ({told})")
     print(f"  what does not move drifts by {_number(result['still_drift_mm_30'], 2)} mm in 30 steps")
     for count, row in result["by_objects"].items():
         print(f"{count} objects: {_number(row['median_mm_4'])} mm, {_number(row['median_deg_4'])} deg after 4 steps")

@@ -62,7 +62,7 @@ def report_json(report: DynamicsReport) -> dict[str, Any]:
     result["still_drift_mm_30"] = _rounded(np.mean(still)) if len(still) else None
     result["still_drift_median_mm_30"] = _median([still])
     result["still_windows_30"] = len(still)
-    for horizon in (4, 10, 30):
+    for horizon in _TOLD:
         result[f"constant_mm_{horizon}"] = _median(_moved(main, "constant", horizon))
         result[f"analytic_mm_{horizon}"] = _median(_moved(main, "analytic", horizon))
         result[f"analytic_deg_{horizon}"] = _median(_moved(main, "analytic", horizon, deg=True))

@@ -6,6 +6,7 @@ import pytest
 import osfcore.evaluate.bench_estimate as bench_estimate
 import osfcore.evaluate.bench_render as bench
 from app.cli import main
+from osfcore.evaluate import bench_dynamics
 from osfcore.evaluate.bench_estimate import BenchEstimate
 from osfcore.evaluate.bench_render import BenchRender
 from tests.core.evaluate.oracle import Oracle
@@ -94,3 +95,14 @@ def test_the_command_explains_itself(capsys):
         main(["bench", "--help"])
     assert stop.value.code == 0
     assert "render" in capsys.readouterr().out
+
+
+def test_rollouts_are_timed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bench_dynamics, "SEQUENCES", 20)
+    arguments = ["bench", "dynamics", "--data-dir", str(tmp_path / "empty"), "--out", str(tmp_path)]
+    assert main([*arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["rollout_steps_per_s"] == pytest.approx(200 / result["rollout_s"])
+    assert json.loads((tmp_path / "dynamics.json").read_text()) == result
+    assert main(arguments) == 0
+    assert "steps of scenes a second" in capsys.readouterr().out

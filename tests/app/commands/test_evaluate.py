@@ -8,6 +8,7 @@ import osfcore.evaluate.fields
 from app.cli import main
 from app.commands.evaluate import Evaluate
 from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.evaluate import bench_dynamics, dynamics
 from osfcore.evaluate.estimate_parts import EvaluateEstimate
 from osfcore.evaluate.fields import EvaluateFields
 from osfcore.world.collect_images import CollectObject, collect_object
@@ -129,6 +130,25 @@ def test_a_mistake_is_one_sentence(fields_dir, tmp_path, capsys, arguments, word
     assert line.startswith("osf: ")
     assert words in line
     assert not out.exists()
+
+
+def test_predicted_pushes_are_measured(data_dir, library, monkeypatch, capsys):
+    monkeypatch.setattr(dynamics, "_STEPS", 34)
+    monkeypatch.setattr(dynamics, "COUNTS", (2, 3))
+    monkeypatch.setattr(bench_dynamics, "SEQUENCES", 10)
+    arguments = ["eval", "dynamics", "--data-dir", str(data_dir), "--tasks", "1", "--workers", "1"]
+    assert main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert result["windows"] > 0
+    assert "Predicting directed pushes of 3 objects" in told.err
+    assert json.loads((data_dir / "evaluation" / "dynamics.json").read_text()) == result
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert f"{result['median_mm_4']:.1f} mm" in shown
+    assert "2 objects" in shown
+    assert main([*arguments, "--data", "set"]) == 1
+    assert "osf eval fields" in capsys.readouterr().err
 
 
 def test_the_command_explains_itself(capsys):

@@ -6,9 +6,12 @@ import time
 
 import pytest
 
+from app.cli import main
 from app.commands.train import TrainFieldCommand, TrainTableCommand
+from osfcore.dynamics.weights import read_network
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.weights import read_field
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 from tests.core.fields.sets import write_set
 
 
@@ -70,3 +73,23 @@ def test_mistakes_are_told_before_anything_is_trained(image_set, tmp_path):
     with pytest.raises(CorruptFile, match="anno.json"):
         TrainFieldCommand(tmp_path, tmp_path / "egg.safetensors").run()
     assert not (tmp_path / "egg.safetensors").exists()
+
+
+def test_pushes_are_learned_from_collected_ones(library, tmp_path, capsys):
+    pushes = tmp_path / "pushes.h5"
+    config = CollectPushes(pushes, episodes=14, steps=8, policy="directed", seed=1)
+    assert list(collect_pushes(config, library))[-1].done == 14
+    out = tmp_path / "pushes.safetensors"
+    arguments = ["train", "dynamics", "--data", str(pushes), "--out", str(out), "--data-dir", str(tmp_path)]
+    quick = ["--iterations", "30", "--long-iterations", "2", "--hidden", "8", "--device", "cpu"]
+    assert main([*arguments, *quick, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
+    assert result["iterations"] == 32
+    assert "held out" in told.err
+    assert read_network(out).hidden == 8
+    assert main([*arguments, *quick, "--without", "teapot", "--rate", "0"]) == 1
+    assert "rate of learning" in capsys.readouterr().err
+    assert main([*arguments, *quick]) == 0
+    assert "after 4 steps" in capsys.readouterr().out
