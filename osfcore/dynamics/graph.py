@@ -8,6 +8,7 @@ or that move, or that can be touched by one of these, take part; all others stay
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from osfcore.dynamics import turns
 from osfcore.dynamics.motion import Motion, Sweep
-from osfcore.dynamics.outline import Gap, circle, gap_between, gap_to_point
+from osfcore.dynamics.outline import Gap, circle, dot, gap_between, gap_to_point
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.scene import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 
@@ -25,6 +26,7 @@ OUTLINE = 64  # corners of an outline
 _PAIR_STRIDE = 2  # pairs are compared with every second corner
 TOUCH_M = 0.008  # a substep's sweep is sampled at three points: nothing nearer than this is missed
 _NODE_PARTS = 14  # of a graph: those that belong to objects; the last three belong to pairs
+_LOOKUP_M = 0.005  # by which a look at a single direction may fall short
 PAIR_REACH_M = 0.025  # objects closer than this may touch within a substep
 
 
@@ -78,13 +80,9 @@ def adjacency(
 
 def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Graph:
     """The objects that may move in this substep, and the pairs of them that may touch."""
-    radius = table.radius[number]
     moving = (motion.linear.abs().amax(dim=2) > 0) | (motion.angular.abs().amax(dim=2) > 0)
-    near = _clearance(motion, sweep) < radius + PUSHER_RADIUS_M + TOUCH_M
-    couples = adjacency(motion.centre, table.half_extent[number])
-    reach = radius[:, :, None] + radius[:, None] + PAIR_REACH_M
-    couples &= (motion.centre[:, :, None, :2] - motion.centre[:, None, :, :2]).norm(dim=-1) < reach
-    possible = _spread(near | moving, couples)
+    couples = _couples(table, number, motion)
+    possible = _spread(_near(table, number, motion, sweep) | moving, couples)
     graph = _gather(table, number, motion, sweep, possible)
     index = possible.new_full(possible.shape, 0, dtype=torch.long)
     index[graph.scene, graph.slot] = torch.arange(len(graph.scene), device=index.device)
@@ -102,12 +100,41 @@ def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, s
     return _keep(graph, first, second, gap, awake[graph.scene, graph.slot])
 
 
-def _clearance(motion: Motion, sweep: Sweep) -> Float[Tensor, "B N"]:
-    """Horizontal distance of the centres from the stretch that the pusher's centre travels [m]."""
-    away = motion.centre[..., :2] - motion.pusher[:, None]
+def _near(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Bool[Tensor, "B N"]:
+    """Objects that are not clear of the pusher's way along the line to its nearest point; a quick look."""
+    away = motion.pusher[:, None] - motion.centre[..., :2]
     shift = sweep.shift[:, None]
-    along = (away * shift).sum(dim=-1) / (shift.square().sum(dim=-1) + 1e-12)
-    return (away - along.clamp(0, 1)[..., None] * shift).norm(dim=-1)
+    along = (-dot(away, shift) / (dot(shift, shift) + 1e-12)).clamp(0, 1)
+    away = away + along[..., None] * shift
+    distance = away.norm(dim=-1) - PUSHER_RADIUS_M - TOUCH_M - _LOOKUP_M
+    near = distance < table.radius[number]
+    rows = near.nonzero().unbind(1)
+    reach = _extent(table, number, motion, rows, away[rows])
+    return near.index_put(rows, distance[rows] < reach)
+
+
+def _couples(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion) -> Bool[Tensor, "B N N"]:
+    """Pairs that could collide (eq. 8) and are not clear of each other along the line between their centres."""
+    radius = table.radius[number]
+    couples = adjacency(motion.centre, table.half_extent[number])
+    away = motion.centre[:, None, :, :2] - motion.centre[:, :, None, :2]
+    distance = away.norm(dim=-1) - PAIR_REACH_M - 2 * _LOOKUP_M
+    couples &= distance < radius[:, :, None] + radius[:, None]
+    scene, i, j = couples.triu().nonzero().unbind(1)
+    line = away[scene, i, j]
+    reach = _extent(table, number, motion, (scene, i), line) + _extent(table, number, motion, (scene, j), -line)
+    close = torch.zeros_like(couples).index_put((scene, i, j), distance[scene, i, j] < reach)
+    return close | close.transpose(1, 2)
+
+
+def _extent(
+    table: ShapeTable, number: Tensor, motion: Motion, rows: Sequence[Tensor], direction: Float[Tensor, "R 2"]
+) -> Float[Tensor, "R"]:
+    """How far some objects reach horizontally from their centres of mass in one direction each [m]."""
+    length = direction.norm(dim=1, keepdim=True)
+    unit = torch.where(length > 1e-6, direction / length.clamp(min=1e-6), direction.new_tensor([1.0, 0.0]))
+    directions = torch.nn.functional.pad(unit, (0, 1))[:, None]
+    return table.extents(number[tuple(rows)], turns.matrix(motion.quaternion[tuple(rows)]), directions)[:, 0]
 
 
 def _spread(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N"]:
@@ -141,13 +168,27 @@ def _gather(
     flat = torch.nn.functional.pad(circle(OUTLINE, hx.device), (0, 1))
     outline = table.farthest(which, rotation, flat)[..., :2] + centre[:, None, :2]
     shift = shift[:, :2]
-    gaps = [gap_to_point(outline, share * shift) for share in (0.0, 0.5, 1.0)]
-    before, halfway, after = (gap._replace(distance=gap.distance - PUSHER_RADIUS_M) for gap in gaps)
-    touched = torch.stack([before.distance, halfway.distance, after.distance]).amin(dim=0) < TOUCH_M
+    halfway = _rim_gap(outline, 0.5 * shift)
+    reached = halfway.distance - 0.5 * shift.norm(dim=1) < TOUCH_M  # elsewhere neither end comes near
+    before, after = (_gap_where(reached, outline, share * shift, halfway) for share in (0.0, 1.0))
+    touched = reached & (torch.stack([before.distance, halfway.distance, after.distance]).amin(dim=0) < TOUCH_M)
     none = scene[:0]
     pair = Gap(centre[:0, 0], centre[:0, :2], centre[:0, :2])
     return Graph(scene, slot, which, frame, rotation, centre, linear, angular, outline, shift, touched, before, halfway,
                  after, none, none, pair)  # fmt: skip
+
+
+def _rim_gap(outline: Float[Tensor, "A K 2"], centre: Float[Tensor, "A 2"]) -> Gap:
+    """From outlines to the pusher's rim."""
+    gap = gap_to_point(outline, centre)
+    return gap._replace(distance=gap.distance - PUSHER_RADIUS_M)
+
+
+def _gap_where(chosen: Bool[Tensor, "A"], outline: Tensor, centre: Tensor, other: Gap) -> Gap:
+    """The same for chosen outlines; the others, which are far away, keep another gap."""
+    rows = chosen.nonzero()[:, 0]
+    gap = _rim_gap(outline[rows], centre[rows])
+    return Gap(*(old.index_put((rows,), new) for old, new in zip(other, gap, strict=True)))
 
 
 def _keep(graph: Graph, first: Tensor, second: Tensor, gap: Gap, kept: Bool[Tensor, "A"]) -> Graph:
