@@ -20,10 +20,12 @@ from osfcore.fields.outputs import check_place
 from osfcore.fields.overlay import overlay_sheet
 from osfcore.fields.set_archive import unpack_set
 from osfcore.fields.table import TABLE_FORMAT, read_table
+from osfcore.fields.weights import FORMAT as FIELD_FORMAT
 from osfcore.fields.weights import read_field, tensor_format
 from osfcore.files import read_json, write_atomically
 from osfcore.observation_overlay import observation_sheet
 from osfcore.observationfile import OBSERVATION_FILE, is_observation, read_observation
+from osfcore.rolloutfile import actions_from_json
 from osfcore.scenefile import scene_from_json
 from osfcore.statefile import estimated_from_json, is_estimated
 
@@ -35,7 +37,8 @@ class Report:
     """What a file turned out to be.
 
     Attributes:
-        kind: "scene", "state", "observation", "image set", "push file" or "field".
+        kind: "scene", "state", "observation", "image set", "push file",
+            "actions", "field" or "dynamics".
         summary: its contents in words.
         facts: its contents in numbers.
     """
@@ -59,18 +62,22 @@ def check_path(path: Path) -> Report:
     if path.suffix.lower() == ".json":
         if path.name == OBSERVATION_FILE:
             raise CorruptFile(path, "it is one file of an observation; check the folder that holds it")
-        return read_json(path, _scene_or_state)
+        return read_json(path, _any_json)
     if path.suffix.lower() in (".h5", ".hdf5"):
         return _check_pushes(path)
     if path.suffix.lower() == ".safetensors":
         return _check_field(path)
     kinds = (
-        "a .json scene or state, a .h5 push file, a .safetensors field nor the folder of an observation or image set"
+        "a .json scene, state or actions, a .h5 push file, a .safetensors field or network, "
+        "nor the folder of an observation or image set"
     )
     raise CorruptFile(path, f"it is neither {kinds}")
 
 
-def _scene_or_state(data: object) -> Report:
+def _any_json(data: object) -> Report:
+    if isinstance(data, dict) and "actions" in data and "objects" not in data:
+        count, steps = actions_from_json(data).shape[:2]
+        return Report("actions", f"{count} sequences of {steps} actions", {"sequences": count, "steps": steps})
     if not is_estimated(data):
         scene = scene_from_json(data)
         counts = {"objects": len(scene.state.names), "cameras": len(scene.cameras)}
@@ -92,9 +99,17 @@ def _check_observation(folder: Path) -> Report:
 
 
 def _check_field(path: Path) -> Report:
-    if tensor_format(path) == TABLE_FORMAT:
+    kind = tensor_format(path)
+    if kind == TABLE_FORMAT:
         table = read_table(path)
         return Report("field", "the table", {"half_side": table.half_side})
+    if kind is not None and kind != FIELD_FORMAT:
+        from osfcore.dynamics.weights import FORMAT, read_network
+
+        if kind == FORMAT:
+            network = read_network(path)
+            facts = {"hidden": network.hidden, "steps": network.steps}
+            return Report("dynamics", f"a network of pushes, {network.hidden} wide, {network.steps} rounds", facts)
     field = read_field(path)
     size = " x ".join(f"{side:.3g}" for side in field.extent[1] - field.extent[0])
     facts = {"corners": len(field.rows) - 1, "networks": len(field.networks)}
@@ -104,30 +119,9 @@ def _check_field(path: Path) -> Report:
 
 
 def _check_pushes(path: Path) -> Report:
-    from osfcore.pushfile import read_pushes
+    from osfcore.pushfile import read_sound_pushes
 
-    episodes = read_pushes(path)
-    if not episodes:
-        raise CorruptFile(path, "it holds no episodes")
-    for number, episode in enumerate(episodes):
-        if episode.actions.ndim != 2:
-            raise CorruptFile(path, f"actions of episode {number} have shape {episode.actions.shape}, not (T, 3)")
-        steps, count = len(episode.actions), len(episode.names)
-        shapes = {
-            "positions": (steps + 1, count, 3),
-            "quaternions": (steps + 1, count, 4),
-            "pusher": (steps + 1, 3),
-            "actions": (steps, 3),
-            "contact": (steps, count),
-        }
-        for name, shape in shapes.items():
-            array = getattr(episode, name)
-            if array.dtype.kind not in "bfiu":
-                raise CorruptFile(path, f"{name} of episode {number} are not numbers")
-            if array.shape != shape:
-                raise CorruptFile(path, f"{name} of episode {number} has shape {array.shape}, not {shape}")
-            if not np.all(np.isfinite(array)):
-                raise CorruptFile(path, f"{name} of episode {number} has values that are not finite")
+    episodes = read_sound_pushes(path)
     facts = {"episodes": len(episodes), "steps": sum(len(e.actions) for e in episodes)}
     return Report("push file", f"{facts['episodes']} episodes, {facts['steps']} steps", facts)
 

@@ -168,6 +168,45 @@ def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
         raise CorruptFile(path, f"it is not a push file ({error})") from error
 
 
+def read_sound_pushes(path: Path) -> tuple[PushEpisode, ...]:
+    """The same, with every array looked at.
+
+    Raises:
+        CorruptFile: if there are no episodes, or an array has another shape or holds what is not a finite number.
+    """
+    episodes = read_pushes(path)
+    if not episodes:
+        raise CorruptFile(path, "it holds no episodes")
+    for number, episode in enumerate(episodes):
+        if episode.actions.ndim != 2:
+            raise CorruptFile(path, f"actions of episode {number} have shape {episode.actions.shape}, not (T, 3)")
+        for name, shape in _shapes(episode).items():
+            array = getattr(episode, name)
+            if array.dtype.kind not in "bfiu":
+                raise CorruptFile(path, f"{name} of episode {number} are not numbers")
+            if array.shape != shape:
+                raise CorruptFile(path, f"{name} of episode {number} has shape {array.shape}, not {shape}")
+            if not np.all(np.isfinite(array)):
+                raise CorruptFile(path, f"{name} of episode {number} has values that are not finite")
+    return episodes
+
+
+def _shapes(episode: PushEpisode) -> dict[str, tuple[int, ...]]:
+    """What the shapes of an episode's arrays must be."""
+    steps, count = len(episode.actions), len(episode.names)
+    shapes: dict[str, tuple[int, ...]] = {
+        "positions": (steps + 1, count, 3),
+        "quaternions": (steps + 1, count, 4),
+        "pusher": (steps + 1, 3),
+        "actions": (steps, 3),
+        "contact": (steps, count),
+    }
+    if episode.sub_positions is not None and episode.sub_quaternions is not None:
+        instants = episode.sub_positions.shape[1] if episode.sub_positions.ndim > 1 else 0
+        shapes |= {"sub_positions": (steps, instants, count, 3), "sub_quaternions": (steps, instants, count, 4)}
+    return shapes
+
+
 def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
     group.attrs["seed"] = episode.seed
     group.create_dataset("names", data=list(episode.names), dtype=h5py.string_dtype())

@@ -37,7 +37,7 @@ from osfcore.fields.devices import pick_device
 from osfcore.fields.outputs import check_weights_place
 from osfcore.files import write_atomically, write_json
 from osfcore.progress import Progress
-from osfcore.pushfile import PushEpisode, read_pushes
+from osfcore.pushfile import PushEpisode, read_sound_pushes
 from osfcore.scene import check_seed
 
 LONG_WINDOW = 3  # actions (paper: up to three future steps)
@@ -323,7 +323,7 @@ def _episodes(config: TrainDynamics, known: frozenset[str]) -> tuple[list[PushEp
     parts: tuple[list[PushEpisode], list[PushEpisode]] = [], []
     unknown = set[str]()
     for path in config.data:
-        for number, episode in enumerate(read_pushes(path)):
+        for number, episode in enumerate(read_sound_pushes(path)):
             unknown |= set(episode.names) - known
             left_out = set(episode.names) & set(config.without)
             if set(episode.names) <= known and not left_out and not has_held_out_pair(episode.names):

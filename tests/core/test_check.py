@@ -1,11 +1,15 @@
+import json
 import shutil
 import zipfile
 
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from osfcore.check import check_path, draw_overlay
+from osfcore.dynamics.network import PropagationNetwork
+from osfcore.dynamics.weights import write_network
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.estimated import EstimatedState
 from osfcore.observationfile import write_observation
@@ -190,3 +194,35 @@ def test_states_are_told_from_scenes(tmp_path):
     path.write_text(path.read_text().replace('"doubt": "', '"doubt": 3, "x": "'))
     with pytest.raises(CorruptFile, match="doubt of a is 3"):
         check_path(path)
+
+
+def test_actions_and_networks_are_told(tmp_path):
+    (tmp_path / "actions.json").write_text(json.dumps({"actions": [[[0.1, 0, 0]] * 4] * 2, "step_s": 0.2}))
+    report = check_path(tmp_path / "actions.json")
+    assert (report.kind, dict(report.facts)) == ("actions", {"sequences": 2, "steps": 4})
+    (tmp_path / "actions.json").write_text(json.dumps({"actions": [[[0.4, 0, 0]]]}))
+    with pytest.raises(CorruptFile, match=r"0\.4"):
+        check_path(tmp_path / "actions.json")
+    write_network(tmp_path / "pushes.safetensors", PropagationNetwork(8, 2))
+    report = check_path(tmp_path / "pushes.safetensors")
+    assert (report.kind, dict(report.facts)) == ("dynamics", {"hidden": 8, "steps": 2})
+    save_file({"x": np.zeros(3)}, tmp_path / "other.safetensors", metadata={"format": "other"})
+    with pytest.raises(CorruptFile, match="format"):
+        check_path(tmp_path / "other.safetensors")
+
+
+def test_wrong_substates_of_pushes_are_told(tmp_path):
+    arrays = {"positions": np.zeros((3, 1, 3)), "quaternions": np.zeros((3, 1, 4)), "pusher": np.zeros((3, 3)),
+              "actions": np.zeros((2, 3)), "contact": np.zeros((2, 1), bool)}  # fmt: skip
+    for shape, words in (((2, 4, 1, 3), None), ((2, 4, 2, 3), "sub_positions of episode 0 has shape")):
+        episode = PushEpisode(
+            ("a",), 0, **arrays, sub_positions=np.zeros(shape), sub_quaternions=np.zeros((2, 4, 1, 4))
+        )
+        with EpisodeFolder(tmp_path / f"{words is None}.h5", {}) as folder:
+            save_episode(folder.path(0), episode)
+            folder.combine(1)
+        if words is None:
+            assert check_path(tmp_path / "True.h5").kind == "push file"
+        else:
+            with pytest.raises(CorruptFile, match=words):
+                check_path(tmp_path / "False.h5")
