@@ -11,10 +11,12 @@ from torch.nn import functional
 
 from osfcore.dynamics import turns
 from osfcore.dynamics.outline import circle
+from osfcore.dynamics.pusher import SUBSTEPS
 from osfcore.dynamics.shapes import ShapeTable
 
 SLEEP_M = 1e-4  # an object that moves less than this in a substep, and turns less than that, rests
 SLEEP_RAD = 2e-3
+_MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
 _ASIDE = 0.035  # about a cell of the map of directions [rad]
 
 
@@ -75,6 +77,19 @@ def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B
     other = other / other.norm(dim=1, keepdim=True).clamp(min=1e-9)
     other = torch.where(other.norm(dim=1, keepdim=True) > 0.5, other, other.new_tensor([1.0, 0.0]))
     return torch.where(speed > 1e-6, velocity / speed.clamp(min=1e-6), other)
+
+
+def going_on(former: Motion, motion: Motion) -> Motion:
+    """The scenes with velocities by how things moved since the former ones, one action ago.
+
+    The mean over the action stands for its last substep. (To predict that action again and take its last substep is
+    less exact, see docs/dynamics.md.) What moved by less than an estimate may err is at rest.
+    """
+    opposite = former.quaternion * former.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])
+    turn = turns.logarithm(turns.multiply(motion.quaternion, opposite))
+    shift = motion.centre - former.centre
+    moved = (shift.norm(dim=-1, keepdim=True) > _MOVED_M) | (turn.norm(dim=-1, keepdim=True) > _MOVED_RAD)
+    return motion._replace(linear=shift * moved / SUBSTEPS, angular=turn * moved / SUBSTEPS)
 
 
 def sleeping(motion: Motion) -> Motion:

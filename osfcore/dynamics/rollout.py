@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,30 +11,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from osfcore.dynamics import turns
-from osfcore.dynamics.motion import Motion, lowest_point
+from osfcore.dynamics.motion import Motion, going_on, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
-from osfcore.dynamics.unroll import set_moving, unroll
+from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.poses import rotate
 from osfcore.rollouts import Rollouts, check_actions
-from osfcore.scene import SceneState, check_action
+from osfcore.scene import SceneState
 
 _CHUNK = 4096  # sequences rolled out at once: more would not be faster
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Before:
-    """What was there one action ago: tells how fast things are now.
-
-    Attributes:
-        state: the same objects before that action.
-        action: velocity of the pusher since then [m/s].
-    """
-
-    state: SceneState
-    action: Float[np.ndarray, "3"]
 
 
 class PushModel:
@@ -67,7 +54,9 @@ class PushModel:
         """Objects whose shapes are known."""
         return self._names
 
-    def rollout(self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: Before | None = None) -> Rollouts:
+    def rollout(
+        self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
+    ) -> Rollouts:
         """Where K sequences of T actions would lead.
 
         Objects are put into the order of their names inside, so that the order in which they come never matters. What
@@ -76,7 +65,7 @@ class PushModel:
         Args:
             state: of the scene, with its pusher.
             actions: velocities (vx, vy, 0) of the pusher [m/s], each held for 0.2 s.
-            before: the scene one action ago, if something may still be moving; else everything is at rest.
+            before: the same objects one action ago, if something may still be moving; else everything is at rest.
 
         Raises:
             InvalidInput: if there are no objects or no pusher, or actions have another shape, are too many, not finite
@@ -119,19 +108,17 @@ class PushModel:
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array, float), device=self.device)
 
-    def _start(self, state: SceneState, order: list[int], names: tuple[str, ...], before: Before | None) -> Motion:
-        """The state as it is, moving as it would after the action before, which is predicted as well."""
+    def _start(self, state: SceneState, order: list[int], names: tuple[str, ...], before: SceneState | None) -> Motion:
+        """The state as it is, going on as it moved during the action before."""
         number = self._number(names)
         start = self._at_rest(state, order, number)
         if before is None:
             return start
-        self._check(before.state)
-        if sorted(before.state.names) != list(names):
-            raise InvalidInput("objects one action ago", ", ".join(before.state.names), "those of the state")
-        earlier = sorted(range(len(names)), key=before.state.names.__getitem__)
-        former = self._at_rest(before.state, earlier, number)
-        velocity = torch.as_tensor(check_action(before.action)[None, :2], dtype=torch.float32, device=self.device)
-        return set_moving(self._network, self._table, number, former, velocity, start)
+        if sorted(before.names) != list(names):
+            raise InvalidInput("objects one action ago", ", ".join(before.names), "those of the state")
+        earlier = sorted(range(len(names)), key=before.names.__getitem__)
+        former = self._at_rest(replace(before, pusher=state.pusher), earlier, number)
+        return going_on(former, start)
 
     def _unroll(self, number: Tensor, start: Motion, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres of mass, orientations and whether anything moved since the start, after each action."""

@@ -26,6 +26,14 @@ def exponential(rotation_vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
     return torch.cat([half.cos(), rotation_vector / 2 * (half.sin() / half)], dim=-1)
 
 
+def logarithm(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vectors [rad] of unit quaternions, with an angle of at most pi."""
+    q = torch.where(q[..., :1] < 0, -q, q)
+    sine = q[..., 1:].norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, q[..., :1])
+    return q[..., 1:] * torch.where(sine > 1e-7, angle / sine.clamp(min=1e-7), 2.0)
+
+
 def matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of unit quaternions."""
     w, x, y, z = q.unbind(-1)

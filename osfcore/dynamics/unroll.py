@@ -15,8 +15,6 @@ from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.step import advance
 
-_REALLY_MOVED_M = 1e-3  # during the action before: what moved less is taken to be at rest
-
 
 def unroll(
     network: PropagationNetwork,
@@ -42,20 +40,3 @@ def unroll(
         sweep = Sweep(headings(velocity[step // SUBSTEPS], motion), shifts[:, step])
         motion = advance(network, table, number, motion, sweep, mirror)
         yield motion
-
-
-def set_moving(
-    network: PropagationNetwork,
-    table: ShapeTable,
-    number: Int[Tensor, "B N"],
-    former: Motion,
-    velocity: Float[Tensor, "B 2"],
-    motion: Motion,
-) -> Motion:
-    """The scenes with the velocities that they should have, after one action that began in the former scenes.
-
-    Velocities are predicted from the former scenes; what hardly moved meanwhile rests.
-    """
-    *_, last = unroll(network, table, number, former, velocity[None])
-    moved = (motion.centre - former.centre).norm(dim=-1, keepdim=True) > _REALLY_MOVED_M
-    return motion._replace(linear=last.linear * moved, angular=last.angular * moved)

@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from osfcore.baselines.quasistatic import push
-from osfcore.dynamics.motion import Motion, lowest_point
+from osfcore.dynamics.motion import Motion, going_on, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.pusher import SUBSTEPS
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
-from osfcore.dynamics.unroll import set_moving, unroll
+from osfcore.dynamics.unroll import unroll
 from osfcore.evaluate.pose_errors import rotation_error
 from osfcore.objects.asset import Symmetry
 from osfcore.poses import quaternion_conjugate, quaternion_multiply, rotate
@@ -37,11 +37,11 @@ class Windows:
 
     Attributes:
         names: of the objects of each window.
-        positions: true ones, one action before the start, at the start, and after each action [m].
+        positions: true ones, one action before the start (or at it, where there was none), at the start, and after each
+            action [m].
         quaternions: likewise.
         pusher: likewise [m].
-        actions: velocities, that of the action before the start first [m/s].
-        has_before: whether there was an action before the start.
+        actions: velocities [m/s].
         on_table: how many actions pass before something comes near the table's edge.
     """
 
@@ -49,8 +49,7 @@ class Windows:
     positions: Float[np.ndarray, "W T2 N 3"]
     quaternions: Float[np.ndarray, "W T2 N 4"]
     pusher: Float[np.ndarray, "W T2 3"]
-    actions: Float[np.ndarray, "W T1 3"]
-    has_before: Bool[np.ndarray, "W"]
+    actions: Float[np.ndarray, "W T 3"]
     on_table: Int[np.ndarray, "W"]
 
 
@@ -108,11 +107,10 @@ def windows_of(episodes: Sequence[PushEpisode]) -> Windows:
         inside = (np.abs(e.positions[..., :2]).max(axis=(1, 2)) < _EDGE_M) & (e.positions[..., 2].min(axis=1) > -0.02)
         for start in range(0, len(e.actions) - LONGEST + 1, _START_EVERY):
             steps = np.clip(np.arange(start - 1, start + LONGEST + 1), 0, None)
-            actions = np.arange(start - 1, start + LONGEST)
             leaves = np.flatnonzero(~inside[start : start + LONGEST + 1])
             last = int(leaves[0]) - 1 if len(leaves) else LONGEST
-            taken = np.where((actions >= 0)[:, None], e.actions[actions], 0.0)
-            parts.append((e.names, e.positions[steps], e.quaternions[steps], e.pusher[steps], taken, start > 0, last))
+            taken = e.actions[start : start + LONGEST]
+            parts.append((e.names, e.positions[steps], e.quaternions[steps], e.pusher[steps], taken, last))
     names, *arrays = zip(*parts, strict=True)
     return Windows(names, *(np.array(array) for array in arrays))  # pyright: ignore[reportArgumentType]
 
@@ -127,12 +125,12 @@ def constant(windows: Windows) -> Predicted:
 
 
 def learned(network: PropagationNetwork, shapes: Mapping[str, ObjectShape], windows: Windows) -> Predicted:
-    """The network, told the poses and the action of one step ago."""
+    """The network, told the poses of one step ago."""
 
     def roll(scenes: _Scenes) -> Iterator[Motion]:
         given = (network, scenes.table, scenes.number)
-        start = set_moving(*given, scenes.former, scenes.velocity[0], scenes.start)
-        for step, motion in enumerate(unroll(*given, start, scenes.velocity[1:]), start=1):
+        start = going_on(scenes.former, scenes.start)
+        for step, motion in enumerate(unroll(*given, start, scenes.velocity), start=1):
             if step % SUBSTEPS == 0:
                 yield motion
 
@@ -155,7 +153,7 @@ class _Scenes(NamedTuple):
     number: Tensor
     former: Motion
     start: Motion
-    velocity: Float[Tensor, "T1 B 2"]
+    velocity: Float[Tensor, "T B 2"]
     shifts: Float[Tensor, "T B 2"]
 
 

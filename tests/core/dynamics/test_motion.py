@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, headings, lowest_point, sleeping
+from osfcore.dynamics import turns
+from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, going_on, headings, lowest_point, sleeping
 from osfcore.poses import quaternion_exp, rotate
 from tests.core.dynamics.scenes import NAMES, crowd, hull, start
 
@@ -75,3 +76,19 @@ def test_only_what_hardly_moves_rests(share, axis):
     torch.testing.assert_close(rested.angular[0, 1], kept * angular[0, 1])
     torch.testing.assert_close(rested.linear[0, 2], linear[0, 2])  # who moves keeps his slow turn
     torch.testing.assert_close(rested.angular[0, 2], angular[0, 2])
+
+
+def test_velocities_are_means_over_the_action_before(shapes, table):
+    _, now = start(table, shapes, crowd(shapes))
+    turn = torch.tensor([0.0, 0.0, -0.4])
+    before = now._replace(
+        centre=now.centre - torch.tensor([0.02, 0.0, 0.0]),
+        quaternion=turns.multiply(turns.exponential(turn).expand_as(now.quaternion), now.quaternion),
+    )
+    moving = going_on(before, now)
+    torch.testing.assert_close(moving.linear, torch.tensor([0.005, 0.0, 0.0]).expand_as(now.linear), atol=1e-6, rtol=0)
+    torch.testing.assert_close(moving.angular, -turn.expand_as(now.angular) / 4, atol=1e-6, rtol=0)
+    assert torch.equal(moving.centre, now.centre)
+    still = going_on(now._replace(centre=now.centre + 1e-4), now)
+    assert not still.linear.any()
+    assert not still.angular.any()

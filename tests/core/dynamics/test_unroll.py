@@ -3,8 +3,8 @@ import torch
 
 from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
 from osfcore.dynamics.step import advance
-from osfcore.dynamics.unroll import set_moving, unroll
-from tests.core.dynamics.scenes import BOX, crowd, network, start, sweep_of
+from osfcore.dynamics.unroll import unroll
+from tests.core.dynamics.scenes import crowd, network, start, sweep_of
 
 VELOCITY = torch.tensor([[[0.3, 0.0]], [[0.25, 0.1]], [[-0.1, 0.2]]])
 
@@ -45,25 +45,3 @@ def test_going_on_from_the_middle_is_going_on(shapes, table):
     with torch.inference_mode():
         rest = list(unroll(net, table, number, whole[SUBSTEPS - 1], VELOCITY[1:]))
     torch.testing.assert_close(rest[-1], whole[-1])
-
-
-def test_what_really_moved_gets_the_velocity_that_was_predicted(shapes, table):
-    net, state = network(silent=True), crowd(shapes)
-    number, former = start(table, shapes, state)
-    with torch.inference_mode():
-        last = list(unroll(net, table, number, former, VELOCITY[:1]))[-1]
-        now = former._replace(centre=last.centre, quaternion=last.quaternion, pusher=last.pusher)
-        moving = set_moving(net, table, number, former, VELOCITY[0], now)
-    torch.testing.assert_close(moving.linear, last.linear)
-    assert moving.linear[0, 0].norm() > 1e-3
-    assert not moving.linear[0, state.names.index(BOX)].any()
-    assert torch.equal(moving.centre, now.centre)
-
-
-def test_what_did_not_move_after_all_rests(shapes, table):
-    net, state = network(silent=True), crowd(shapes)
-    number, former = start(table, shapes, state)
-    with torch.inference_mode():
-        moving = set_moving(net, table, number, former, VELOCITY[0], former)
-    assert not moving.linear.any()
-    assert not moving.angular.any()

@@ -23,7 +23,7 @@ def test_windows_hold_the_step_before_their_start_and_all_that_follows():
     windows = windows_of([episode(speed=0.01)])
     assert len(windows.names) == (STEPS - LONGEST) // 4 + 1
     assert windows.positions.shape[1] == LONGEST + 2
-    assert windows.has_before.tolist() == [False, True]
+    assert windows.actions.shape[1] == LONGEST
     np.testing.assert_array_equal(windows.positions[0, 0], windows.positions[0, 1])  # nothing is known before
     np.testing.assert_allclose(np.diff(windows.positions[1, :, 0, 0]), 0.01)
     assert (windows.on_table == LONGEST).all()
