@@ -95,7 +95,8 @@ def test_a_push_is_chosen_predicted_executed_and_compared(page, url):
     expected = [predicted - start, true - start, predicted - true]
     np.testing.assert_allclose(told, 1000 * np.linalg.norm(expected, axis=1), atol=0.6)
     assert len(re.findall(r"[\d.]+°", row.inner_text())) == 3
-    assert purple(page) > plain + 1000  # the ghosts stay, with the objects in them
+    kept = purple(page)
+    assert kept > plain + 300  # the ghosts stay, with the objects in them
     frame.get_by_role("button", name="Play").click()
     frame.get_by_role("button", name="Pause").wait_for()
     frame.get_by_role("button", name="Play").wait_for()
@@ -103,5 +104,5 @@ def test_a_push_is_chosen_predicted_executed_and_compared(page, url):
 
     page.click("#reset")  # the table has changed by other hands
     frame.locator(".push-status:has-text('has changed')").wait_for()
-    wait_until(lambda: purple(page) < plain + 1000)  # only the way of the pusher is left
+    wait_until(lambda: purple(page) < kept)  # only the way of the pusher is left
     assert page.problems == []
