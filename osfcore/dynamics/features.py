@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from osfcore.dynamics import turns
 from osfcore.dynamics.graph import Graph
 from osfcore.dynamics.outline import Gap, direction_index, dot
 from osfcore.dynamics.shapes import ShapeTable
@@ -54,7 +55,7 @@ class Inputs(NamedTuple):
 
 def inputs(table: ShapeTable, graph: Graph) -> Inputs:
     """All that the network needs."""
-    turn = _about_z(_directions(graph))
+    turn = turns.facing(_directions(graph))
     guess = _give_way(graph, graph.after, turn)
     pushed = graph.touched.nonzero()[:, 0]
     edges = torch.cat([_from_pusher(graph, pushed, turn), _between(graph, turn)])
@@ -79,13 +80,6 @@ def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
     by_neighbour = (closest < _CLOSE_M)[:, None] | ((closest < 1.0)[:, None] & (speed <= 1e-6))
     direction = torch.where(by_neighbour, neighbour, moving)
     return torch.where(graph.touched[:, None], -graph.after.normal, direction)
-
-
-def _about_z(forward: Float[Tensor, "A 2"]) -> Float[Tensor, "A 3 3"]:
-    """Rotations that take a horizontal direction to +x."""
-    x, y = forward.unbind(1)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    return torch.stack([x, y, zero, -y, x, zero, zero, zero, one], dim=1).view(-1, 3, 3)
 
 
 def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Tensor, "A 3"]:

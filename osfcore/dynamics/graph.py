@@ -149,9 +149,7 @@ def _gather(
 ) -> Graph:
     """The chosen objects side by side, without pairs yet."""
     scene, slot = chosen.nonzero().unbind(1)
-    hx, hy = sweep.heading[scene].unbind(1)
-    zero, one = torch.zeros_like(hx), torch.ones_like(hx)
-    frame = torch.stack([hx, hy, zero, -hy, hx, zero, zero, zero, one], dim=1).view(-1, 3, 3)
+    frame = turns.facing(sweep.heading[scene])
     rotation = frame @ turns.matrix(motion.quaternion[scene, slot])
     origin = torch.nn.functional.pad(motion.pusher[scene], (0, 1))
     vectors = torch.stack(
@@ -165,7 +163,7 @@ def _gather(
     )
     centre, linear, angular, shift = (frame @ vectors).unbind(2)
     which = number[scene, slot]
-    flat = torch.nn.functional.pad(circle(OUTLINE, hx.device), (0, 1))
+    flat = torch.nn.functional.pad(circle(OUTLINE, scene.device), (0, 1))
     outline = table.farthest(which, rotation, flat)[..., :2] + centre[:, None, :2]
     shift = shift[:, :2]
     halfway = _rim_gap(outline, 0.5 * shift)

@@ -50,3 +50,10 @@ def rotate(q: Float[Tensor, "*batch 4"], v: Float[Tensor, "*batch 3"]) -> Float[
     u = q[..., 1:]
     t = 2 * torch.linalg.cross(u, v)
     return v + q[..., :1] * t + torch.linalg.cross(u, t)
+
+
+def facing(direction: Float[Tensor, "A 2"]) -> Float[Tensor, "A 3 3"]:
+    """Rotation matrices about the vertical that take a horizontal unit vector to +x."""
+    x, y = direction.unbind(1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    return torch.stack([x, y, zero, -y, x, zero, zero, zero, one], dim=1).view(-1, 3, 3)

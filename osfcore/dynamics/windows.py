@@ -20,6 +20,7 @@ from osfcore.pushfile import PushEpisode
 from osfcore.scene import TABLE_SIDE_M
 
 _MOVED_M = 1e-3
+_SUNK_M = 0.02  # below the table's top: what lies there fell off
 _EDGE_M = TABLE_SIDE_M / 2 - 0.05  # what comes nearer to the table's edge may fall: nothing to learn from
 
 
@@ -96,12 +97,18 @@ def _substates(episode: PushEpisode) -> Pose:
     return Pose(positions, np.concatenate([episode.quaternions[:1], turned]))
 
 
+def is_on_table(episode: PushEpisode) -> Bool[np.ndarray, "T1"]:
+    """Whether all objects are on the table, away from its edge, before the first and after each action."""
+    reach = np.abs(episode.positions[..., :2]).max(axis=(1, 2))
+    return (reach < _EDGE_M) & (episode.positions[..., 2].min(axis=1) > -_SUNK_M)
+
+
 def _windows(episodes: Sequence[PushEpisode], length: int) -> tuple[np.ndarray, np.ndarray]:
     """Starts of windows in which nothing falls off the table, and whether anything happens in them."""
     starts, busy = [], []
     for number, e in enumerate(episodes):
         last = len(e.actions) - length
-        safe = (np.abs(e.positions[..., :2]).max(axis=(1, 2)) < _EDGE_M) & (e.positions[..., 2].min(axis=1) > -0.02)
+        safe = is_on_table(e)
         moved = np.linalg.norm(np.diff(e.positions, axis=0), axis=-1).max(axis=1) > _MOVED_M
         happens = moved | e.contact.any(axis=1)
         for start in range(last + 1):

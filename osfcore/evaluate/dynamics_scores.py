@@ -17,17 +17,16 @@ from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.pusher import SUBSTEPS
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.unroll import unroll
+from osfcore.dynamics.windows import is_on_table
 from osfcore.evaluate.pose_errors import rotation_error
 from osfcore.objects.asset import Symmetry
-from osfcore.poses import quaternion_conjugate, quaternion_multiply, rotate
+from osfcore.poses import rotate, rotation_angle
 from osfcore.pushfile import PushEpisode
-from osfcore.scene import TABLE_SIDE_M
 
 HORIZONS = (1, 2, 3, 4, 6, 8, 10, 15, 20, 25, 30)
 LONGEST = HORIZONS[-1]
 MOVED_MM, MOVED_DEG = 10.0, 5.0  # what counts as truly moved within a window
 _START_EVERY = 4  # steps
-_EDGE_M = TABLE_SIDE_M / 2 - 0.05  # what comes nearer to the table's edge may fall off it
 _CHUNK = 512  # windows
 
 
@@ -104,7 +103,7 @@ def windows_of(episodes: Sequence[PushEpisode]) -> Windows:
     """All windows of episodes of one length and number of objects."""
     parts: list[tuple[object, ...]] = []
     for e in episodes:
-        inside = (np.abs(e.positions[..., :2]).max(axis=(1, 2)) < _EDGE_M) & (e.positions[..., 2].min(axis=1) > -0.02)
+        inside = is_on_table(e)
         for start in range(0, len(e.actions) - LONGEST + 1, _START_EVERY):
             steps = np.clip(np.arange(start - 1, start + LONGEST + 1), 0, None)
             leaves = np.flatnonzero(~inside[start : start + LONGEST + 1])
@@ -214,8 +213,7 @@ def _angles(
     windows: Windows, symmetries: Mapping[str, Symmetry], a: Float[np.ndarray, "H W N 4"], b: np.ndarray
 ) -> Float[np.ndarray, "H W N"]:
     """Symmetry-aware angles between orientations [deg]."""
-    between = quaternion_multiply(quaternion_conjugate(a), b)
-    angles = 2 * np.arctan2(np.linalg.norm(between[..., 1:], axis=-1), np.abs(between[..., 0]))
+    angles = rotation_angle(a, b)
     for window, names in enumerate(windows.names):
         for slot, name in enumerate(names):
             if symmetries[name].kind != "none":

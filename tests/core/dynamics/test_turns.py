@@ -57,3 +57,12 @@ def test_exponential_is_smooth_at_zero():
 def test_unit_keeps_the_direction():
     q = tensor(QUATERNIONS)
     torch.testing.assert_close(turns.unit(7.3 * q), q)
+
+
+def test_facing_takes_a_direction_to_x_and_keeps_the_vertical():
+    angles = torch.linspace(-3, 3, 7)
+    direction = torch.stack([angles.cos(), angles.sin(), torch.zeros(7)], dim=1)
+    frame = turns.facing(direction[:, :2])
+    torch.testing.assert_close((frame @ direction[..., None])[..., 0], torch.eye(3)[:1].expand(7, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(frame @ frame.transpose(1, 2), torch.eye(3).expand(7, 3, 3), atol=1e-6, rtol=0)
+    assert torch.equal(frame[:, 2], torch.eye(3)[2].expand(7, 3))
