@@ -8,15 +8,38 @@ import os
 import shutil
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import h5py
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from osfcore.errors import CorruptFile, InvalidInput
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Disturbed:
+    """W substeps from disturbed states of an episode of N objects, for learning from.
+
+    Attributes:
+        step: number of the substep in the episode, M of them to an action.
+        positions: of the objects, before [m].
+        quaternions: likewise, (w, x, y, z).
+        linear: velocity of each object's origin, before [m per substep].
+        angular: likewise [rad per substep].
+        after_positions: a substep later [m].
+        after_quaternions: likewise.
+    """
+
+    step: Int[np.ndarray, "W"]
+    positions: Float32[np.ndarray, "W N 3"]
+    quaternions: Float32[np.ndarray, "W N 4"]
+    linear: Float32[np.ndarray, "W N 3"]
+    angular: Float32[np.ndarray, "W N 3"]
+    after_positions: Float32[np.ndarray, "W N 3"]
+    after_quaternions: Float32[np.ndarray, "W N 4"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,6 +57,7 @@ class PushEpisode:
         sub_positions: of the objects at M equally spaced instants of each action, the last its end [m]; or None.
         sub_quaternions: likewise.
         frames: images of one camera, likewise, or None.
+        disturbed: what single substeps would have done from states near the recorded ones, or None.
     """
 
     names: tuple[str, ...]
@@ -46,10 +70,13 @@ class PushEpisode:
     sub_positions: Float[np.ndarray, "T M N 3"] | None = None
     sub_quaternions: Float[np.ndarray, "T M N 4"] | None = None
     frames: UInt8[np.ndarray, "T1 h w 3"] | None = None
+    disturbed: Disturbed | None = None
 
 
 _ARRAYS = ("positions", "quaternions", "pusher", "actions", "contact")
 _OPTIONAL = ("sub_positions", "sub_quaternions", "frames")
+_DISTURBED = tuple(field.name for field in fields(Disturbed))
+_PREFIX = "disturbed_"  # of their names on disk
 
 
 class EpisodeFolder:
@@ -145,13 +172,14 @@ def save_episode(path: Path, episode: PushEpisode) -> None:
 def load_episode(path: Path) -> PushEpisode:
     """Read what `save_episode` wrote."""
     with path.open("rb") as file, np.load(file) as data:
-        arrays = {name: data[name] for name in _ARRAYS} | {name: data[name] for name in _OPTIONAL if name in data}
-        return PushEpisode(tuple(data["names"].tolist()), int(data["seed"]), **arrays)
+        return _episode(tuple(data["names"].tolist()), int(data["seed"]), data)
 
 
 def _arrays(episode: PushEpisode) -> dict[str, np.ndarray]:
     """All arrays that an episode has, by name."""
     found = {name: getattr(episode, name) for name in (*_ARRAYS, *_OPTIONAL)}
+    if episode.disturbed is not None:
+        found |= {_PREFIX + name: getattr(episode.disturbed, name) for name in _DISTURBED}
     return {name: array for name, array in found.items() if array is not None}
 
 
@@ -180,8 +208,9 @@ def read_sound_pushes(path: Path) -> tuple[PushEpisode, ...]:
     for number, episode in enumerate(episodes):
         if episode.actions.ndim != 2:
             raise CorruptFile(path, f"actions of episode {number} have shape {episode.actions.shape}, not (T, 3)")
+        arrays = _arrays(episode)
         for name, shape in _shapes(episode).items():
-            array = getattr(episode, name)
+            array = arrays[name]
             if array.dtype.kind not in "bfiu":
                 raise CorruptFile(path, f"{name} of episode {number} are not numbers")
             if array.shape != shape:
@@ -204,6 +233,10 @@ def _shapes(episode: PushEpisode) -> dict[str, tuple[int, ...]]:
     if episode.sub_positions is not None and episode.sub_quaternions is not None:
         instants = episode.sub_positions.shape[1] if episode.sub_positions.ndim > 1 else 0
         shapes |= {"sub_positions": (steps, instants, count, 3), "sub_quaternions": (steps, instants, count, 4)}
+    if episode.disturbed is not None:
+        rows = len(np.atleast_1d(episode.disturbed.step))
+        shapes |= {_PREFIX + name: (rows, count, 4 if "quaternions" in name else 3) for name in _DISTURBED}
+        shapes |= {_PREFIX + "step": (rows,)}
     return shapes
 
 
@@ -215,6 +248,14 @@ def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
 
 
 def _from_group(group: h5py.Group) -> PushEpisode:
-    arrays = {name: np.asarray(group[name]) for name in (*_ARRAYS, *(n for n in _OPTIONAL if n in group))}
     names = tuple(name.decode() for name in np.asarray(group["names"]).tolist())
-    return PushEpisode(names, int(np.asarray(group.attrs["seed"])), **arrays)
+    return _episode(names, int(np.asarray(group.attrs["seed"])), group)
+
+
+def _episode(names: tuple[str, ...], seed: int, stored: Mapping[str, Any]) -> PushEpisode:
+    """An episode from arrays by their names on disk."""
+    arrays = {name: np.asarray(stored[name]) for name in (*_ARRAYS, *(n for n in _OPTIONAL if n in stored))}
+    disturbed = None
+    if _PREFIX + _DISTURBED[0] in stored:
+        disturbed = Disturbed(*(np.asarray(stored[_PREFIX + name]) for name in _DISTURBED))
+    return PushEpisode(names, seed, **arrays, disturbed=disturbed)

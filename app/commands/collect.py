@@ -89,6 +89,8 @@ class CollectPushesCommand:
     """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
     names: tuple[str, ...] | None = None
     """Objects to choose from; by default all that were fetched."""
+    disturb: int = 0
+    """From how many slightly disturbed states to simulate each quarter of an action in which something moves."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Where fetched objects are."""
     json: bool = False
@@ -100,7 +102,7 @@ class CollectPushesCommand:
         from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
         config = CollectPushes(self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images,
-                               self.renderer, self.names)  # fmt: skip
+                               self.renderer, self.names, self.disturb)  # fmt: skip
         with worker_pool(self.workers) as executor:
             last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, self.workers + 2))
         result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}

@@ -24,12 +24,15 @@ from osfcore.scene import PUSHER_RADIUS_M
 
 _AROUND = 16  # horizontal directions in which an object's extent is told
 _SLANTED = 8  # directions 45 deg below and above the horizon
+_FOOT = 8  # directions close to straight down, in which lies what an object stands on
+_FOOT_ANGLE = math.radians(12)  # off the vertical
 LENGTH_M = 0.05  # that becomes 1
 SHIFT_M = 0.01  # displacement that becomes 1
 TURN_RAD = 0.1  # rotation that becomes 1
+_MAGNIFIED = 5  # heights over the table: millimetres matter there
 _GAP_M = 0.004  # near contact, gaps count in these
 _CLOSE_M = 0.01  # an object this close gives the direction, rather than the motion
-NODE_FEATURES = _AROUND + 2 * _SLANTED + 2 + 1 + 3 + 3 + 2 + 3
+NODE_FEATURES = _AROUND + 2 * _SLANTED + 2 + 1 + 3 + 3 + 2 + 3 + 3 * _FOOT + 1
 EDGE_FEATURES = 35
 
 
@@ -92,7 +95,7 @@ def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Ten
 
 
 def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, guess: Tensor) -> Float[Tensor, "A F"]:
-    """Extents in 34 directions, height over the table, motion, the pusher's motion, and how it would slide."""
+    """Extents in 34 directions, height over the table, motion, the pusher's motion, how it would slide, its foot."""
     slanted = functional.pad(_fan_of(_SLANTED, turn), (0, 1))
     vertical = slanted.new_tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     half = math.sqrt(0.5)
@@ -102,8 +105,19 @@ def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, guess: Tensor) -> Floa
     height = graph.centre[:, 2:] - extents[:, -2:-1]
     motion = torch.stack([graph.linear, graph.angular, functional.pad(graph.shift, (0, 1))], dim=2)
     linear, angular, shift = (turn @ motion).unbind(2)
-    lengths = torch.cat([extents, 5 * height], dim=1) / LENGTH_M
-    return torch.cat([lengths, linear / SHIFT_M, angular / TURN_RAD, shift[:, :2] / SHIFT_M, guess], dim=1)
+    lengths = torch.cat([extents, _MAGNIFIED * height], dim=1) / LENGTH_M
+    motions = [linear / SHIFT_M, angular / TURN_RAD, shift[:, :2] / SHIFT_M]
+    return torch.cat([lengths, *motions, guess, _foot(table, graph, turn)], dim=1)
+
+
+def _foot(table: ShapeTable, graph: Graph, turn: Tensor) -> Float[Tensor, "A 25"]:
+    """What an object stands on, for friction acts there: its lowest points all around, and their mean distance."""
+    fan = math.sin(_FOOT_ANGLE) * _fan_of(_FOOT, turn)
+    downward = functional.pad(fan, (0, 1), value=-math.cos(_FOOT_ANGLE))
+    points = table.farthest(graph.number, turn @ graph.rotation, downward)
+    height = _MAGNIFIED * (points[..., 2] + graph.centre[:, None, 2])
+    distance = points[..., :2].norm(dim=2).mean(dim=1, keepdim=True)
+    return torch.cat([points[..., 0], points[..., 1], height, distance], dim=1) / LENGTH_M
 
 
 def _fan_of(count: int, like: Tensor) -> Float[Tensor, "D 2"]:
@@ -216,8 +230,13 @@ _SCALAR, _PLANE = ([0], [1.0]), ([0, 1], [1.0, -1])
 _POLAR, _AXIAL = ([0, 1, 2], [1.0, -1, 1]), ([0, 1, 2], [-1.0, 1, -1])
 _SLIDE = ([0, 1, 2], [1.0, -1, -1])
 _ENDS = ([2, 3, 0, 1], [1.0, -1, 1, -1])
+_FEET = _fan(_FOOT)
+_ACROSS = (_FEET[0], [-1.0] * _FOOT)
 _MIRRORS = {
-    "node": _mirror(_fan(_AROUND), _fan(_SLANTED), _fan(_SLANTED), *[_SCALAR] * 3, _POLAR, _AXIAL, _PLANE, _SLIDE),
+    "node": _mirror(
+        *(_fan(_AROUND), _fan(_SLANTED), _fan(_SLANTED), *[_SCALAR] * 3, _POLAR, _AXIAL, _PLANE, _SLIDE),
+        *(_FEET, _ACROSS, _FEET, _SCALAR),
+    ),
     "edge": _mirror(*[_SCALAR] * 5, _SLIDE, _POLAR, _POLAR, _AXIAL, _PLANE, _PLANE, _ENDS, _ENDS, *[_PLANE] * 3),
     "motion": _mirror(_POLAR, _AXIAL),
 }

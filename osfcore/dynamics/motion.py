@@ -10,12 +10,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from osfcore.dynamics import turns
+from osfcore.dynamics.episodes import SLEEP_M, SLEEP_RAD
 from osfcore.dynamics.outline import circle
 from osfcore.dynamics.pusher import SUBSTEPS
 from osfcore.dynamics.shapes import ShapeTable
 
-SLEEP_M = 1e-4  # an object that moves less than this in a substep, and turns less than that, rests
-SLEEP_RAD = 2e-3
 _MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
 _ASIDE = 0.035  # about a cell of the map of directions [rad]
 

@@ -6,10 +6,12 @@ over whole windows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -17,11 +19,14 @@ from torch import Tensor
 from osfcore.dynamics.features import SHIFT_M, TURN_RAD, Inputs, corrections, inputs, mirrored
 from osfcore.dynamics.graph import Graph, build_graph
 from osfcore.dynamics.motion import Motion, Sweep, headings, sleeping
-from osfcore.dynamics.pusher import SUBSTEPS
-from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.windows import Recording, turn_between
+from osfcore.poses import rotate
+from osfcore.pushfile import Disturbed, PushEpisode
 
 _CHUNK = 4096  # scenes looked at together
+_TOGETHER = 24  # episodes of disturbed states looked at together
 
 
 class Sample(NamedTuple):
@@ -40,6 +45,26 @@ class Sample(NamedTuple):
     receiver: Int[Tensor, "E"]
     sender: Int[Tensor, "S"]
     target: Float[Tensor, "A 6"]
+
+
+class Substeps(NamedTuple):
+    """Single substeps of B scenes.
+
+    Attributes:
+        number: shape of each object.
+        motion: before.
+        velocity: commanded [m/s].
+        shift: of the pusher [m].
+        centre: centres of mass, after [m].
+        quaternion: orientations, after.
+    """
+
+    number: Int[Tensor, "B N"]
+    motion: Motion
+    velocity: Float[Tensor, "B 2"]
+    shift: Float[Tensor, "B 2"]
+    centre: Float[Tensor, "B N 3"]
+    quaternion: Float[Tensor, "B N 4"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,46 +133,84 @@ def _ranges(first: Int[Tensor, "B"], count: Int[Tensor, "B"]) -> Int[Tensor, "R"
     return (first - before).repeat_interleave(count) + torch.arange(int(count.sum()), device=count.device)
 
 
-def samples(recording: Recording, table: ShapeTable, device: torch.device | str = "cpu") -> Samples:
-    """Every substep of a recording of windows of one action."""
-    parts = [_sample(graph, seen, target) for graph, seen, target in _looked_at(recording, table, device)]
+def samples(
+    recording: Recording,
+    table: ShapeTable,
+    device: torch.device | str = "cpu",
+    others: Iterable[Substeps] = (),
+) -> Samples:
+    """Every substep of a recording of windows of one action, and others."""
+    pieces = itertools.chain(_recorded(recording), others)
+    parts = [_sample(*found) for piece in pieces if (found := _looked_at(piece, table, device)) is not None]
     columns = list(zip(*parts, strict=True))
     return Samples(*(_Rows.of(torch.cat(columns[k]), torch.cat(columns[k + 1])) for k in (0, 2, 4)))
 
 
 def _looked_at(
-    recording: Recording, table: ShapeTable, device: torch.device | str
-) -> Iterator[tuple[Graph, Inputs, Float[Tensor, "A 6"]]]:
-    """Graphs of many scenes together, what the network sees of them, and what it should answer."""
+    piece: Substeps, table: ShapeTable, device: torch.device | str
+) -> tuple[Graph, Inputs, Float[Tensor, "A 6"]] | None:
+    """Graphs of many scenes together, what the network sees of them, and what it should answer; None if all rests."""
+    sweep = Sweep(headings(piece.velocity, piece.motion), piece.shift)
+    motion, sweep = Motion(*(p.to(device) for p in piece.motion)), Sweep(*(p.to(device) for p in sweep))
+    graph = build_graph(table, piece.number.to(device), motion, sweep)
+    if not len(graph.scene):
+        return None
+    seen = inputs(table, graph)
+    place = (graph.scene.cpu(), graph.slot.cpu())
+    shift = piece.centre[place] - piece.motion.centre[place]
+    turn = turn_between(piece.motion.quaternion[place], piece.quaternion[place])
+    truth = torch.stack([shift / SHIFT_M, turn / TURN_RAD], dim=1).to(device)
+    return graph, seen, (truth @ seen.frame.transpose(1, 2)).flatten(1) - corrections(seen)
+
+
+def _recorded(recording: Recording) -> Iterator[Substeps]:
+    """The substeps of a recording as they truly are and move."""
     starts = torch.as_tensor(recording.starts).repeat_interleave(SUBSTEPS, dim=0)
-    step = starts[:, 1] * SUBSTEPS + torch.arange(SUBSTEPS).repeat(len(recording.starts))
-    for episode, time in zip(starts[:, 0].split(_CHUNK), step.split(_CHUNK), strict=True):
-        motion, number = _motion(recording, episode, time)
-        heading = headings(recording.velocity[episode, time // SUBSTEPS], motion)
-        sweep = Sweep(heading, recording.pusher[episode, time + 1] - motion.pusher)
-        motion, sweep = Motion(*(p.to(device) for p in motion)), Sweep(*(p.to(device) for p in sweep))
-        graph = build_graph(table, number.to(device), motion, sweep)
-        if not len(graph.scene):
-            continue
-        seen = inputs(table, graph)
-        scene, slot = graph.scene.cpu(), graph.slot.cpu()
-        e, s = episode[scene], time[scene]
-        shift = recording.centre[e, s + 1, slot] - recording.centre[e, s, slot]
-        turn = turn_between(recording.quaternion[e, s, slot], recording.quaternion[e, s + 1, slot])
-        truth = torch.stack([shift / SHIFT_M, turn / TURN_RAD], dim=1).to(device)
-        target = (truth @ seen.frame.transpose(1, 2)).flatten(1) - corrections(seen)
-        yield graph, seen, target
+    steps = starts[:, 1] * SUBSTEPS + torch.arange(SUBSTEPS).repeat(len(recording.starts))
+    for e, s in zip(starts[:, 0].split(_CHUNK), steps.split(_CHUNK), strict=True):
+        before = (s - 1).clamp(min=0)
+        centre, quaternion = recording.centre[e, s], recording.quaternion[e, s]
+        linear = centre - recording.centre[e, before]
+        angular = turn_between(recording.quaternion[e, before], quaternion)
+        pusher, velocity = recording.pusher[e, s], recording.velocity[e, s // SUBSTEPS]
+        yield _substeps(recording.number[e], (centre, quaternion, linear, angular, pusher), velocity,
+                        recording.pusher[e, s + 1] - pusher,
+                        recording.centre[e, s + 1], recording.quaternion[e, s + 1])  # fmt: skip
 
 
-def _motion(recording: Recording, e: Int[Tensor, "B"], s: Int[Tensor, "B"]) -> tuple[Motion, Int[Tensor, "B N"]]:
-    """The scenes before some substeps, as they truly are and move."""
-    before = (s - 1).clamp(min=0)
-    centre, quaternion = recording.centre[e, s], recording.quaternion[e, s]
-    linear = centre - recording.centre[e, before]
-    angular = turn_between(recording.quaternion[e, before], quaternion)
-    number = recording.number[e]
-    floor = torch.zeros(number.shape)  # plays no part: nothing is moved here
-    return sleeping(Motion(centre, quaternion, linear, angular, recording.pusher[e, s], floor)), number
+def off_track(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape]) -> Iterator[Substeps]:
+    """What is recorded of disturbed states of episodes with the same number of objects."""
+    order = {name: number for number, name in enumerate(sorted(shapes))}
+    found = [(e, e.disturbed) for e in episodes if e.disturbed is not None and len(e.disturbed.step)]
+    for first in range(0, len(found), _TOGETHER):
+        columns = zip(
+            *(_disturbed(e, rows, shapes, order) for e, rows in found[first : first + _TOGETHER]), strict=True
+        )
+        number, *start, velocity, shift, centre, quaternion = (torch.cat(column) for column in columns)
+        yield _substeps(number, tuple(start), velocity, shift, centre, quaternion)
+
+
+def _disturbed(
+    episode: PushEpisode, rows: Disturbed, shapes: Mapping[str, ObjectShape], order: Mapping[str, int]
+) -> list[Tensor]:
+    """What `_substeps` needs, of one episode."""
+    to_centre = np.broadcast_to([shapes[name].centre for name in episode.names], rows.positions.shape)
+    before, after = (rotate(q.astype(float), to_centre) for q in (rows.quaternions, rows.after_quaternions))
+    path = pusher_path(episode.pusher[0, :2], episode.actions[:, :2])
+    arrays = (
+        *(rows.positions + before, rows.quaternions, rows.linear + np.cross(rows.angular, before), rows.angular),
+        *(path[rows.step], episode.actions[rows.step // SUBSTEPS, :2], path[rows.step + 1] - path[rows.step]),
+        *(rows.after_positions + after, rows.after_quaternions),
+    )
+    number = torch.tensor([order[name] for name in episode.names]).expand(len(rows.step), -1)
+    return [number, *(torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32) for array in arrays)]
+
+
+def _substeps(
+    number: Tensor, start: tuple[Tensor, ...], velocity: Tensor, shift: Tensor, centre: Tensor, quaternion: Tensor
+) -> Substeps:
+    motion = Motion(*start, floor=torch.zeros(number.shape))  # the floor plays no part: nothing is moved here
+    return Substeps(number, sleeping(motion), velocity, shift, centre, quaternion)
 
 
 def _sample(graph: Graph, seen: Inputs, target: Float[Tensor, "A 6"]) -> tuple[Tensor, ...]:

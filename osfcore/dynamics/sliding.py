@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 FRICTION = 0.25  # between pusher and object, as in the simulator
-_LEVER_SHARE = 0.6  # moment that friction can hold over force that it can hold, in mean radii of the outline
+_LEVER_SHARE = 1.2  # moment that friction can hold over force, in mean radii of the outline: things stand on corners
 
 
 def lever(outline: Float[Tensor, "*batch K 2"]) -> Float[Tensor, "*batch"]:

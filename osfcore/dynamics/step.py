@@ -7,9 +7,10 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from osfcore.dynamics import turns
+from osfcore.dynamics.episodes import SLEEP_M, SLEEP_RAD
 from osfcore.dynamics.features import SHIFT_M, TURN_RAD, corrections, inputs, mirrored
 from osfcore.dynamics.graph import build_graph
-from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, Sweep, lowest_point
+from osfcore.dynamics.motion import Motion, Sweep, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.shapes import ShapeTable
 

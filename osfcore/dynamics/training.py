@@ -27,7 +27,7 @@ from osfcore.dynamics.features import SHIFT_M, TURN_RAD
 from osfcore.dynamics.holdout import has_held_out_pair, is_for_validation
 from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.network import PropagationNetwork
-from osfcore.dynamics.samples import Sample, samples
+from osfcore.dynamics.samples import Sample, off_track, samples
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.unroll import unroll
 from osfcore.dynamics.weights import network_bytes
@@ -45,6 +45,7 @@ MEASURED_WINDOW = 4
 MOVED_M, MOVED_RAD = 0.01, math.radians(5)  # what counts as truly moved within a window
 _ARM_M = 0.05  # a rotation by an angle counts as the angle times this
 _BUSY_SHARE = 0.85  # of the windows of a batch: in the others nothing happens
+_COARSE_SHARE = 0.5  # of the windows, which start with velocities as little known as in use
 _WARM_UP = 100
 _LAST_RATE = 0.01  # of the first one
 _AVERAGING = 0.998  # of the weights that are kept, from iteration to iteration
@@ -76,9 +77,9 @@ class TrainDynamics:
 
     data: tuple[Path, ...]
     out: Path
-    iterations: int = 16_000
+    iterations: int = 30_000
     batch: int = 512
-    long_iterations: int = 800
+    long_iterations: int = 1_500
     long_batch: int = 96
     hidden: int = 128
     rate: float = 2e-3
@@ -173,7 +174,7 @@ class _Run:
         self._table = ShapeTable(tuple(shapes[name] for name in names), device)
         learned, kept = _episodes(config, frozenset(names))
         self._long = record(learned, shapes, LONG_WINDOW)
-        self._samples = samples(record(learned, shapes, 1), self._table, device)
+        self._samples = samples(record(learned, shapes, 1), self._table, device, off_track(learned, shapes))
         self._validation = record(kept, shapes, MEASURED_WINDOW)
         self._used = len(learned)
         torch.manual_seed(config.seed)
@@ -226,7 +227,7 @@ class _Run:
     def _loss_of_windows(self) -> Tensor:
         """How far windows of three actions are from the truth, on average over their substeps [mm]."""
         windows = _draw(self._long, self._rng, self._config.long_batch)
-        pieces = batch(self._long, self._table, windows, self._device)
+        pieces = batch(self._long, self._table, windows, self._device, self._rng.random(len(windows)) < _COARSE_SHARE)
         mirror = torch.as_tensor(self._rng.random(len(windows)) < 0.5, device=self._device)
         loss = torch.zeros((), device=self._device)
         for step, motion in enumerate(self._unroll(pieces, mirror)):
@@ -312,7 +313,8 @@ class _Run:
         write_atomically(self._config.out, data)
         metrics = {f"validation_{name}": round(value, 3) for name, value in asdict(self.best).items()}
         own = {"iterations": self.steps, "seed": self._config.seed, "device": str(self._device), "bytes": len(data),
-               "episodes": self._used, "without": list(self._config.without), "threads": torch.get_num_threads(),
+               "episodes": self._used, "substeps": len(self._samples), "without": list(self._config.without),
+               "threads": torch.get_num_threads(),
                "data": [path.name for path in self._config.data], "command": self._config.command}  # fmt: skip
         write_json(self._config.out.with_suffix(".json"), {**metrics, **own})
         self._checkpoint.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ from osfcore.dynamics.network import PropagationNetwork
 from osfcore.errors import CorruptFile
 from osfcore.files import write_atomically
 
-FORMAT = "pushes-1"
+FORMAT = "pushes-2"
 _MOST_HIDDEN, _MOST_STEPS = 1024, 16
 
 

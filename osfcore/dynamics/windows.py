@@ -11,17 +11,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from osfcore.dynamics.episodes import is_on_table, substates
 from osfcore.dynamics.motion import Motion, lowest_point, sleeping
 from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.errors import InvalidInput
-from osfcore.poses import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply, rotate
+from osfcore.poses import quaternion_conjugate, quaternion_log, quaternion_multiply, rotate
 from osfcore.pushfile import PushEpisode
-from osfcore.scene import TABLE_SIDE_M
 
 _MOVED_M = 1e-3
-_SUNK_M = 0.02  # below the table's top: what lies there fell off
-_EDGE_M = TABLE_SIDE_M / 2 - 0.05  # what comes nearer to the table's edge may fall: nothing to learn from
 
 
 class Targets(NamedTuple):
@@ -73,7 +71,7 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
     if len(sizes) != 1 or min(sizes)[0] < length:
         raise InvalidInput("steps and objects of the episodes", sorted(sizes), f"equal, with at least {length} steps")
     number = np.array([[order[name] for name in e.names] for e in episodes])
-    poses = [_substates(e) for e in episodes]
+    poses = [substates(e) for e in episodes]
     position, quaternion = np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses])
     centres = np.array([shapes[name].centre for name in sorted(shapes)])
     centre = position + rotate(quaternion, centres[number][:, None])
@@ -86,21 +84,6 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
 
     return Recording(torch.as_tensor(number), tensor(centre), tensor(quaternion), tensor(pusher), tensor(velocity),
                      starts, is_busy, length)  # fmt: skip
-
-
-def _substates(episode: PushEpisode) -> Pose:
-    """All poses of an episode, substep by substep."""
-    if episode.sub_positions is None or episode.sub_quaternions is None or episode.sub_positions.shape[1] != SUBSTEPS:
-        raise InvalidInput("push file", "without poses within its actions", "one that 'osf collect pushes' wrote")
-    positions = np.concatenate([episode.positions[:1], episode.sub_positions.reshape(-1, *episode.positions.shape[1:])])
-    turned = episode.sub_quaternions.reshape(-1, *episode.quaternions.shape[1:])
-    return Pose(positions, np.concatenate([episode.quaternions[:1], turned]))
-
-
-def is_on_table(episode: PushEpisode) -> Bool[np.ndarray, "T1"]:
-    """Whether all objects are on the table, away from its edge, before the first and after each action."""
-    reach = np.abs(episode.positions[..., :2]).max(axis=(1, 2))
-    return (reach < _EDGE_M) & (episode.positions[..., 2].min(axis=1) > -_SUNK_M)
 
 
 def _windows(episodes: Sequence[PushEpisode], length: int) -> tuple[np.ndarray, np.ndarray]:
@@ -135,16 +118,26 @@ class Batch(NamedTuple):
 
 
 def batch(
-    recording: Recording, table: ShapeTable, windows: Int[np.ndarray, "B"], device: torch.device | str = "cpu"
+    recording: Recording,
+    table: ShapeTable,
+    windows: Int[np.ndarray, "B"],
+    device: torch.device | str = "cpu",
+    coarse: Bool[np.ndarray, "B"] | None = None,
 ) -> Batch:
-    """Windows by their numbers in `recording.starts`, with true velocities at their starts."""
+    """Windows by their numbers in `recording.starts`.
+
+    Velocities at their starts are those of the substep before; in `coarse` ones, means over the action before, which is
+    all that a rollout from observed states knows.
+    """
     episode, start = (torch.as_tensor(column) for column in recording.starts[windows].T)
     first = start * SUBSTEPS
     steps = first[:, None] + torch.arange(recording.length * SUBSTEPS + 1)
     centre, quaternion = recording.centre[episode[:, None], steps], recording.quaternion[episode[:, None], steps]
-    before = (first - 1).clamp(min=0)
-    linear = centre[:, 0] - recording.centre[episode, before]
-    angular = turn_between(recording.quaternion[episode, before], quaternion[:, 0])
+    back = torch.ones_like(first) if coarse is None else torch.where(torch.as_tensor(coarse), SUBSTEPS, 1)
+    back = torch.minimum(back, first)
+    share = 1 / back.clamp(min=1)[:, None, None]
+    linear = share * (centre[:, 0] - recording.centre[episode, first - back])
+    angular = share * turn_between(recording.quaternion[episode, first - back], quaternion[:, 0])
     actions = start[:, None] + torch.arange(recording.length)
     number = recording.number[episode].to(device)
 

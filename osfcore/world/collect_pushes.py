@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,14 @@ from osfcore.objects.library import AssetLibrary
 from osfcore.poses import rotation_angle
 from osfcore.pushfile import EpisodeFolder, PushEpisode, load_episode, save_episode
 from osfcore.scene import DEFAULT_IMAGE_SIDE, MAX_OBJECTS, SceneState, default_cameras
+from osfcore.world.disturb import disturbed
 from osfcore.world.policies import DirectedPolicy, PaperPolicy, PolicyName
 from osfcore.world.tabletop import Renderer, SceneRequest, Tabletop
 
 MOVED_M = 1e-3
 MOVED_RAD = np.deg2rad(0.5)
 SUBSTATES = 4  # poses recorded within an action: dynamics learns from them what contact does in between
-_MAX_EPISODES, _MAX_STEPS = 1_000_000, 1000
+_MAX_EPISODES, _MAX_STEPS, _MAX_DISTURB = 1_000_000, 1000, 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,8 @@ class CollectPushes:
         images: whether to keep frames of camera "0" as well.
         renderer: what takes the frames.
         names: objects to choose from; all of the library if None.
+        disturb: from how many disturbed states to simulate each substep in which something moves (see
+            `osfcore.world.disturb`).
     """
 
     out: Path
@@ -51,6 +54,7 @@ class CollectPushes:
     images: bool = False
     renderer: Renderer = "embree"
     names: tuple[str, ...] | None = None
+    disturb: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +109,7 @@ def collect_pushes(
         "images": config.images,
         "renderer": config.renderer,
         "available": list(library.names() if config.names is None else config.names),
+        "disturb": config.disturb,
     }
     try:
         config.out.parent.mkdir(parents=True, exist_ok=True)
@@ -141,6 +146,8 @@ def _check(config: CollectPushes) -> None:
         raise InvalidInput("number of objects", config.objects, f"between 1 and {MAX_OBJECTS}")
     if config.policy not in ("paper", "directed"):
         raise InvalidInput("policy", repr(config.policy), '"paper" or "directed"')
+    if not 0 <= config.disturb <= _MAX_DISTURB:
+        raise InvalidInput("disturbed states of each substep", config.disturb, f"between 0 and {_MAX_DISTURB}")
     if config.seed < 0:
         raise InvalidInput("seed", config.seed, "0 or more")
     if config.out.exists():
@@ -236,6 +243,9 @@ def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> P
         sub_quaternions=np.array([poses.quaternion for poses in within]),
         frames=np.concatenate(frames) if config.images else None,
     )
+    if config.disturb:
+        found = disturbed(episode, world.models, np.random.default_rng((config.seed, index, 2)), config.disturb)
+        episode = replace(episode, disturbed=found)
     save_episode(path, episode)
     return path
 

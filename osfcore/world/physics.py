@@ -210,9 +210,12 @@ class Physics:
         linear, angular = pybullet.getBaseVelocity(self._bodies[name].uid, physicsClientId=self._client)
         return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
 
-    def set_velocity(self, name: str, velocity: Float[np.ndarray, "3"]) -> None:
-        """Give an object a linear velocity [m/s] without turning."""
-        pybullet.resetBaseVelocity(self._bodies[name].uid, velocity.tolist(), [0, 0, 0], physicsClientId=self._client)
+    def set_velocity(
+        self, name: str, linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"] | None = None
+    ) -> None:
+        """Give an object's centre of mass a velocity [m/s], and the object an angular velocity [rad/s], 0 if None."""
+        turning = [0.0, 0.0, 0.0] if angular is None else angular.tolist()
+        pybullet.resetBaseVelocity(self._bodies[name].uid, linear.tolist(), turning, physicsClientId=self._client)
 
     def distance(self, first: str, second: str | None, reach_m: float = 0.05) -> float:
         """Gap between two objects, or an object and the pusher (None) [m]; negative if they penetrate.

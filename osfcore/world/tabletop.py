@@ -145,6 +145,11 @@ class Tabletop:
         return {name: self._asset(name) for name in self._names}
 
     @property
+    def models(self) -> Mapping[str, BodyModel]:
+        """What physics knows of the objects on the table."""
+        return {name: self._models[name] for name in self._names}
+
+    @property
     def time_s(self) -> float:
         """Simulated time since the last reset or load [s]."""
         return self._steps * TIME_STEP_S

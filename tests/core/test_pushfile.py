@@ -1,9 +1,19 @@
+from dataclasses import fields, replace
+
 import h5py
 import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.pushfile import EpisodeFolder, PushEpisode, load_episode, read_pushes, save_episode
+from osfcore.pushfile import (
+    Disturbed,
+    EpisodeFolder,
+    PushEpisode,
+    load_episode,
+    read_pushes,
+    read_sound_pushes,
+    save_episode,
+)
 
 
 def episode(seed: int, *, frames: bool = False) -> PushEpisode:
@@ -22,6 +32,12 @@ def episode(seed: int, *, frames: bool = False) -> PushEpisode:
     )
 
 
+def disturbed(rows: int = 5) -> Disturbed:
+    rng = np.random.default_rng(rows)
+    shapes = ((3,), (4,), (3,), (3,), (3,), (4,))
+    return Disturbed(np.arange(rows), *(rng.normal(size=(rows, 2, *s)).astype(np.float32) for s in shapes))
+
+
 def assert_same(a: PushEpisode, b: PushEpisode) -> None:
     assert (a.names, a.seed) == (b.names, b.seed)
     for name in ("positions", "quaternions", "pusher", "actions", "contact", "sub_positions", "frames"):
@@ -34,6 +50,31 @@ def test_episode_survives_its_file(tmp_path, frames):
     save_episode(path, episode(1, frames=frames))
     assert_same(load_episode(path), episode(1, frames=frames))
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("rows", [0, 5])
+def test_disturbed_states_survive_both_files(tmp_path, rows):
+    original = replace(episode(1), disturbed=disturbed(rows))
+    with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
+        save_episode(folder.path(0), original)
+        kept = load_episode(folder.path(0))
+        folder.combine(1)
+    for found in (kept, *read_pushes(tmp_path / "pushes.h5")):
+        assert_same(found, original)
+        for field in fields(Disturbed):
+            np.testing.assert_array_equal(getattr(found.disturbed, field.name), getattr(original.disturbed, field.name))
+    assert read_sound_pushes(tmp_path / "pushes.h5")[0].disturbed is not None
+
+
+@pytest.mark.parametrize("change", ["nan", "short"])
+def test_unsound_disturbed_states_are_told(tmp_path, change):
+    rows = disturbed()
+    wrong = np.full_like(rows.linear, np.nan) if change == "nan" else rows.linear[:3]
+    with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
+        save_episode(folder.path(0), replace(episode(1), disturbed=replace(rows, linear=wrong)))
+        folder.combine(1)
+    with pytest.raises(CorruptFile, match="disturbed_linear of episode 0"):
+        read_sound_pushes(tmp_path / "pushes.h5")
 
 
 def test_combined_file_holds_all_episodes_in_order_and_the_folder_goes(tmp_path):

@@ -1,23 +1,33 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from osfcore.dynamics.episodes import substates
 from osfcore.dynamics.graph import build_graph
-from osfcore.dynamics.motion import Sweep, headings
+from osfcore.dynamics.motion import Sweep, headings, sleeping
 from osfcore.dynamics.network import MOTION
 from osfcore.dynamics.pusher import SUBSTEPS
-from osfcore.dynamics.samples import _motion, samples
+from osfcore.dynamics.samples import off_track, samples
 from osfcore.dynamics.step import advance
-from osfcore.dynamics.windows import batch, record
+from osfcore.dynamics.windows import batch, record, turn_between
+from osfcore.poses import quaternion_conjugate, quaternion_log, quaternion_multiply
+from osfcore.pushfile import Disturbed
 from tests.core.dynamics.scenes import CAN, GELATIN, episode, network, scene
 
 
 @pytest.fixture(scope="module")
-def recording(shapes):
+def begun(shapes):
     """A can pushed into a box, twice."""
     begins = [scene(shapes, {CAN: (0.06, y, (0, 0, 0.3)), GELATIN: (0.15, 0.0, (0, 0, 1.0))}) for y in (0.0, 0.01)]
     actions = np.tile([0.3, 0.05, 0.0], (5, 1))
-    return record([episode(shapes, begin, actions) for begin in begins], shapes, 1)
+    return [episode(shapes, begin, actions) for begin in begins]
+
+
+@pytest.fixture(scope="module")
+def recording(begun, shapes):
+    return record(begun, shapes, 1)
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +70,53 @@ def test_what_answers_the_targets_makes_what_was_recorded(recording, drawn, tabl
 
 def _has_graph(recording, table, number: int, substep: int) -> bool:
     e, first = recording.starts[number]
-    at = torch.tensor([first * SUBSTEPS + substep])
-    motion, shape = _motion(recording, torch.tensor([e]), at)
+    at = first * SUBSTEPS + substep
+    pieces = batch(replace(recording, starts=np.array([[e, first]]), is_busy=np.array([True])), table, np.array([0]))
+    centre, quaternion = recording.centre[[e], at], recording.quaternion[[e], at]
+    before = max(at - 1, 0)
+    angular = turn_between(recording.quaternion[[e], before], quaternion)
+    motion = sleeping(pieces.motion._replace(
+        centre=centre, quaternion=quaternion, linear=centre - recording.centre[[e], before], angular=angular,
+        pusher=recording.pusher[[e], at]))  # fmt: skip
     shift = recording.pusher[[e], at + 1] - motion.pusher
-    return (
-        len(build_graph(table, shape, motion, Sweep(headings(recording.velocity[[e], first], motion), shift)).scene) > 0
-    )
+    heading = headings(recording.velocity[[e], first], motion)
+    return len(build_graph(table, pieces.number, motion, Sweep(heading, shift)).scene) > 0
+
+
+def beside(recorded) -> Disturbed:
+    """Rows that repeat what was recorded itself."""
+    poses = substates(recorded)
+    step = np.arange(1, len(poses.position) - 1)
+    turned = quaternion_multiply(poses.quaternion[step], quaternion_conjugate(poses.quaternion[step - 1]))
+    angular = quaternion_log(turned)
+    linear = np.diff(poses.position, axis=0)[step - 1]
+    parts = (poses.position[step], poses.quaternion[step], linear, angular,
+             poses.position[step + 1], poses.quaternion[step + 1])  # fmt: skip
+    return Disturbed(step, *(part.astype(np.float32) for part in parts))
+
+
+def test_disturbed_states_become_graphs_like_recorded_ones(begun, shapes, table):
+    """Rows that repeat the recording teach what it teaches."""
+    recorded = begun[0]
+    plain = samples(record([recorded], shapes, 1), table)
+    rows = list(off_track([replace(recorded, disturbed=beside(recorded)), recorded], shapes))
+    both = samples(record([recorded], shapes, 1), table, others=rows)
+    assert len(rows) == 1
+    assert len(plain) < len(both) <= 2 * len(plain)
+    old = plain.draw(torch.arange(len(plain)), torch.zeros(len(plain), dtype=torch.bool))
+    kept = both.draw(torch.arange(len(plain)), torch.zeros(len(plain), dtype=torch.bool))
+    assert torch.equal(old.nodes, kept.nodes)
+    extra = len(both) - len(plain)
+    new = both.draw(torch.arange(len(plain), len(both)), torch.zeros(extra, dtype=torch.bool))
+    last = plain.draw(torch.arange(len(plain) - extra, len(plain)), torch.zeros(extra, dtype=torch.bool))
+    assert new.nodes.shape == last.nodes.shape
+    off = (new.target - last.target).abs()
+    assert off.median() < 0.01
+    assert off.mean() < 0.05
+
+
+def test_episodes_without_disturbed_states_add_nothing(begun, shapes):
+    assert list(off_track(begun, shapes)) == []
 
 
 def test_graphs_drawn_together_answer_as_they_do_alone(drawn):

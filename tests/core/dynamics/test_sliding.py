@@ -100,5 +100,5 @@ def test_a_push_beside_the_centre_turns_away_from_it():
 @given(radius=st.floats(0.01, 0.1), scale=st.floats(0.1, 10))
 def test_the_lever_grows_with_the_outline(radius, scale):
     disc = radius * circle(64)[None]
-    assert float(lever(disc)) == pytest.approx(0.6 * radius, rel=1e-5)
+    assert float(lever(disc)) == pytest.approx(1.2 * radius, rel=1e-5)
     torch.testing.assert_close(lever(scale * disc), scale * lever(disc))

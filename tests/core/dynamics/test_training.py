@@ -73,7 +73,7 @@ def test_a_run_writes_a_network_and_what_is_known_of_it(data, tmp_path, shapes):
     assert read_network(settings.out).hidden == 8
     told = json.loads(settings.out.with_suffix(".json").read_text(), parse_constant=pytest.fail)
     measured = {f"validation_{n}" for n in ("windows", "mm_4", "deg_4", "mean_mm_4", "loss", "constant_mm_4")}
-    own = {"iterations", "seed", "device", "bytes", "episodes", "without", "threads", "data", "command"}
+    own = {"iterations", "seed", "device", "bytes", "episodes", "substeps", "without", "threads", "data", "command"}
     assert set(told) == measured | own
     assert (told["iterations"], told["episodes"], told["device"], told["data"]) == (6, 12, "cpu", ["pushes.h5"])
     assert told["bytes"] == settings.out.stat().st_size

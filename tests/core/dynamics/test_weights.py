@@ -39,7 +39,7 @@ def test_what_was_read_is_written_without_further_loss(tmp_path):
     assert all(torch.equal(again[name], first[name]) for name in first)
 
 
-BIAS = "decoder.2.bias"
+BIAS = "decoder.4.bias"
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,21 @@ def test_velocities_are_those_of_the_last_substep(shapes, table, pushed):
     np.testing.assert_allclose(pieces.velocity[0], np.array(PUSH)[:, :2], atol=1e-6)
 
 
+def test_coarse_velocities_are_means_over_the_action_before(shapes, table, pushed):
+    found = record([pushed], shapes, 1)
+    windows = np.arange(len(found.starts))
+    coarse = batch(found, table, windows, coarse=np.ones(len(windows), bool)).motion
+    fine = batch(found, table, windows).motion
+    for number, (_, start) in enumerate(found.starts):
+        first = start * SUBSTEPS
+        mean = (found.centre[0, first] - found.centre[0, max(first - SUBSTEPS, 0)]) / SUBSTEPS
+        moves = coarse.linear[number].norm(dim=1) > 0
+        torch.testing.assert_close(coarse.linear[number][moves], mean[moves], atol=1e-7, rtol=1e-5)
+    assert torch.equal(coarse.linear[0], torch.zeros_like(coarse.linear[0]))
+    assert not torch.equal(coarse.linear, fine.linear)
+    assert torch.equal(coarse.centre, fine.centre)
+
+
 def test_episodes_with_other_objects_go_together(shapes, table):
     one = episode(shapes, scene(shapes, {CAN: (0.06, 0.0), BOX: (-0.2, 0.0)}), PUSH)
     other = episode(shapes, scene(shapes, {GELATIN: (0.07, 0.0), CAN: (0.2, 0.1)}), PUSH)

@@ -54,6 +54,16 @@ def test_episodes_have_the_stated_shapes_and_tell_the_truth(library, tmp_path):
     assert any(e.contact.any() for e in episodes)
 
 
+def test_disturbed_states_are_kept_where_they_are_asked_for(library, tmp_path):
+    """They change nothing else."""
+    plain = collect(library, tmp_path / "plain.h5", policy="directed", episodes=2)
+    both = collect(library, tmp_path / "both.h5", policy="directed", episodes=2, disturb=2)
+    assert_same(plain, both)
+    assert all(e.disturbed is None for e in plain)
+    assert all(e.disturbed is not None for e in both)
+    assert sum(len(e.disturbed.step) for e in both) > 0
+
+
 def test_content_does_not_depend_on_the_number_of_workers(library, tmp_path):
     alone = collect(library, tmp_path / "alone.h5")
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
