@@ -28,7 +28,7 @@ class Settings(BaseSettings):
         default=(), description="Origins, such as https://lab.example, that may use the service besides its own."
     )
     demo_scene: bool = Field(default=True, description="Whether a scene is made when there is none.")
-    max_body_bytes: int = Field(default=1 << 20, ge=1024)
+    max_body_bytes: int = Field(default=4 << 20, ge=1024)  # a thousand sequences of thirty actions in full precision
     max_upload_bytes: int = Field(default=1 << 30, ge=1024, description="Of a zipped image set or observation.")
     max_image_sets: int = Field(default=20, ge=1, description="Uploaded image sets kept at once.")
     max_scenes: int = Field(default=32, ge=1, description="Scenes kept at once.")

@@ -70,6 +70,17 @@ def test_sliding_box_stops_by_coulomb_friction(physics):
     assert physics.pose("box").position[0] - released == pytest.approx(0.3**2 / (2 * 0.5 * 9.81), abs=0.002)
 
 
+def test_a_box_in_the_air_goes_on_as_it_was_thrown(physics):
+    physics.place("box", Pose(np.array([0.0, 0, 0.5]), LEVEL))
+    physics.place_pusher(np.array([0.3, 0.3, PUSHER_CENTRE_Z_M]))
+    physics.set_velocity("box", np.array([0.2, -0.1, 0]), np.array([0, 0, 2.0]))
+    for _ in range(24):
+        physics.step(np.zeros(3))
+    pose = physics.pose("box")
+    np.testing.assert_allclose(pose.position[:2], [0.02, -0.01], atol=1e-5)
+    np.testing.assert_allclose(pose.quaternion, quaternion_exp(np.array([0, 0, 0.2])), atol=1e-4)
+
+
 def test_pusher_follows_its_velocity_exactly_and_pushes_what_it_meets(physics):
     physics.place("box", Pose(np.array([0.0, 0, 0.02]), LEVEL))
     start = np.array([-0.1, 0.0, PUSHER_CENTRE_Z_M])
