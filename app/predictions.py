@@ -56,16 +56,23 @@ class Predictions:
             raise NothingToPush
         return self._runner.scene(current)
 
-    def submit(self, state: SceneState, actions: Float[np.ndarray, "K T 3"], key: str | None = None) -> Future[Answer]:
+    def submit(
+        self,
+        state: SceneState,
+        actions: Float[np.ndarray, "K T 3"],
+        key: str | None = None,
+        before: SceneState | None = None,
+    ) -> Future[Answer]:
         """Ask where actions would lead; the future tells a Predicted, or None where a newer order of the key overtook.
 
         Args:
             state: of the scene, with its pusher.
             actions: velocities of the pusher [m/s].
             key: of who asks, if only the latest question of theirs counts.
+            before: the same objects one action ago, if something may still be moving.
 
         Raises:
-            InvalidInput: if there are no objects or no pusher, or actions are out of range.
+            InvalidInput: if there are no objects or no pusher, other objects before, or actions are out of range.
             MissingFields: if objects have no field.
         """
         actions = check_actions(actions)
@@ -73,8 +80,10 @@ class Predictions:
             raise InvalidInput("number of objects", 0, "at least 1")
         if state.pusher is None:
             raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
+        if before is not None and set(before.names) != set(state.names):
+            raise InvalidInput("objects one action ago", ", ".join(before.names), "those of the state")
         known = self._fields()
         missing = [name for name in state.names if name not in known]
         if missing:
             raise MissingFields(missing)
-        return self._link.submit(PredictPushes(key or uuid.uuid4().hex, state, actions))
+        return self._link.submit(PredictPushes(key or uuid.uuid4().hex, state, actions, before))

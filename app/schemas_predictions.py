@@ -72,6 +72,9 @@ class PredictionIn(Input):
     state: StateIn | None = Field(
         None, description="Null for the scene that is shown, with its true poses.", examples=[_STATE_EXAMPLE]
     )
+    before: StateIn | None = Field(
+        None, description="The same objects 0.2 s ago, with a state in which something may still be moving."
+    )
 
 
 class PredictionOut(BaseModel):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Predict:
-    """Predict where objects will be after each push of each sequence, from their poses now; they are taken to rest."""
+    """Predict where objects will be after each push of each sequence, from their poses now."""
 
     state: Path
     """state.json or scene.json, with the pusher."""
@@ -28,6 +28,8 @@ class Predict:
     """actions.json: sequences of pusher velocities [m/s], each held for 0.2 s."""
     out: Path
     """rollouts.json to write."""
+    before: Path | None = None
+    """state.json of 0.2 s ago; without it, everything is taken to rest."""
     images: Path | None = None
     """Folder for pictures of one sequence: predicted through the fields, beside the simulator's where meshes are."""
     camera: str = "0"
@@ -54,12 +56,13 @@ class Predict:
             raise InvalidInput("output file", self.out, "a path that ends in .json")
         check_place(self.out)
         state, actions = read_estimated(self.state).state, read_actions(self.actions)
+        before = None if self.before is None else read_estimated(self.before).state
         if self.images is not None and not 0 <= self.sequence < len(actions):
             raise InvalidInput("sequence", self.sequence, f"between 0 and {len(actions) - 1}")
         camera = self._camera() if self.images is not None else None
         model = load_push_model(self.data_dir, FieldLibrary(self.data_dir), state.names, pick_device(self.device))
         start = time.perf_counter()
-        rollouts = model.rollout(state, actions)
+        rollouts = model.rollout(state, actions, before)
         seconds = time.perf_counter() - start
         write_rollouts(self.out, rollouts)
         result = self._result(rollouts, seconds)

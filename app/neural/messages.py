@@ -83,11 +83,13 @@ class PredictPushes:
         key: who wants it; a newer order of the same key overtakes.
         state: objects with fields only, and the pusher.
         actions: velocities of the pusher [m/s].
+        before: the same objects one action ago, if something may still be moving.
     """
 
     key: str
     state: SceneState
     actions: Float[np.ndarray, "K T 3"]
+    before: SceneState | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -58,7 +58,7 @@ class Oracle:
             return None
         model = self._model(order.state.names)
         start = time.perf_counter()
-        rollouts = model.rollout(order.state, order.actions)
+        rollouts = model.rollout(order.state, order.actions, order.before)
         took_s = time.perf_counter() - start
         if not all(np.isfinite(part).all() for part in (rollouts.positions, rollouts.quaternions, rollouts.pusher)):
             raise OsfError("The prediction runs out of all bounds, so there is none; begin with objects on the table.")

@@ -1,6 +1,7 @@
 """What would a push do? Answered at once, for many pushes at a time."""
 
 import asyncio
+import functools
 import json
 from typing import Any
 
@@ -29,6 +30,9 @@ async def predict(services: ServicesDep, body: PredictionIn) -> Response:
     Open loop, from a network that has learned from pushes; nothing moves in the simulation. The first time, this waits
     for the network to load.
     """
+    before = None if body.before is None else body.before.state()
+    if before is not None and body.state is None:
+        raise InvalidInput("state", "missing", "given together with what was before")
     record, state = (services.predictions.current(), None) if body.state is None else (None, body.state.state())
     if state is None:
         assert record is not None
@@ -36,7 +40,8 @@ async def predict(services: ServicesDep, body: PredictionIn) -> Response:
     else:
         _check_known(state, services.fields.names())
     actions = await asyncio.to_thread(_actions, body, len(state.names))
-    answer = await asyncio.wrap_future(await asyncio.to_thread(services.predictions.submit, state, actions))
+    order = functools.partial(services.predictions.submit, state, actions, before=before)
+    answer = await asyncio.wrap_future(await asyncio.to_thread(order))
     assert isinstance(answer, Predicted)  # nothing overtakes an order with a key of its own
     content = await asyncio.to_thread(_json, answer, record)
     return Response(content, media_type="application/json")

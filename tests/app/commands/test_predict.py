@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from app.cli import main
 from osfcore.fields.library import FieldLibrary
 from osfcore.files import write_json
+from osfcore.poses import Pose
 from osfcore.scene import Light, SceneState, default_cameras
 from osfcore.scenefile import Scene, scene_to_json
 from osfcore.world.tabletop import SceneRequest, Tabletop
@@ -60,6 +62,19 @@ def test_rollouts_are_written_and_told(files, state, data_dir, capsys):
     shown = capsys.readouterr().out
     assert f"2 x {count} actions" in shown
     assert NAMES[0] in shown
+
+
+def test_what_was_moving_goes_on(files, state, data_dir, capsys):
+    folder, _ = files
+    (folder / "actions.json").write_text(json.dumps({"actions": [[[0, 0, 0]]], "step_s": 0.2}))
+    earlier = replace(state, poses=Pose(state.poses.position - [[0.03, 0, 0], [0, 0, 0]], state.poses.quaternion))
+    write_json(folder / "before.json", scene_to_json(Scene(earlier, ())))
+    assert call(folder, data_dir, "--before", str(folder / "before.json"), "--json") == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["farthest_mm"][NAMES[0]] > 0
+    only = SceneState(state.names[:1], state.poses[:1], state.light, state.pusher)
+    write_json(folder / "before.json", scene_to_json(Scene(only, ())))
+    assert call(folder, data_dir, "--before", str(folder / "before.json")) == 1
+    assert "objects one action ago" in capsys.readouterr().err
 
 
 def test_pictures_lie_beside_the_simulators(files, data_dir, capsys):

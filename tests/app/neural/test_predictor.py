@@ -48,7 +48,7 @@ def test_refusals(oracle, state):
 
 def test_what_is_not_finite_is_not_told(oracle, state, monkeypatch):
     class Wild:
-        def rollout(self, state, actions):
+        def rollout(self, state, actions, before):
             from osfcore.rollouts import Rollouts
 
             nowhere = np.full((1, 7, 1, 3), np.nan)

@@ -45,6 +45,14 @@ def test_many_pushes_of_a_state_are_predicted_in_order(service):
     assert told["scene"] is None
 
 
+def test_what_was_moving_goes_on(service):
+    stays = {"state": STATE, "actions": [[[0, 0, 0]]]}
+    earlier = {**STATE, "objects": [STATE["objects"][0] | {"position": [-0.03, 0.0, 0.095]}]}
+    assert ask(service, **stays).json()["positions"][0][1] == ask(service, **stays).json()["positions"][0][0]
+    told = ask(service, **stays, before=earlier).json()["positions"][0]
+    assert told[1][0][0] > told[0][0][0]
+
+
 def test_the_scene_on_the_table_is_what_is_predicted_by_default(service, scene):
     told = ask(service, actions=PUSH).json()
     assert told["scene"] == scene["id"]
@@ -81,6 +89,8 @@ def test_the_scene_on_the_table_is_what_is_predicted_by_default(service, scene):
         ({"actions": PUSH, "state": state(position=[0, 0, 1000])}, "/position/2"),
         ({"actions": PUSH, "state": {**STATE, "light": {"position": [1, 0, -1]}}}, "light elevation"),
         ({"actions": PUSH, "colour": "red"}, "/colour"),
+        ({"actions": PUSH, "before": state(name="teapot")}, "objects one action ago is teapot"),
+        ({"actions": PUSH, "before": STATE, "state": None}, "state is missing"),
     ],
 )
 def test_mistakes_are_told_in_one_sentence(service, body, words):
