@@ -106,9 +106,9 @@ class TrainDynamicsCommand:
     """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
     iterations: int = 16_000
     """Steps of descent on single substeps, at most."""
-    long_iterations: int = 800
+    long_iterations: int = 4_000
     """Steps of descent on windows of three actions, after these."""
-    patience: int = 6
+    patience: int = 20
     """Measurements on held-out episodes without a better one after which training stops."""
     without: tuple[str, ...] = ()
     """Objects whose episodes are left out."""

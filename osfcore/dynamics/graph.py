@@ -81,8 +81,12 @@ def adjacency(
 def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Graph:
     """The objects that may move in this substep, and the pairs of them that may touch."""
     moving = (motion.linear.abs().amax(dim=2) > 0) | (motion.angular.abs().amax(dim=2) > 0)
+    seeds = _near(table, number, motion, sweep) | moving
+    busy = seeds.any(dim=1).nonzero()[:, 0]  # in all other scenes nothing happens
+    number, seeds, moving = number[busy], seeds[busy], moving[busy]
+    motion, sweep = Motion(*(part[busy] for part in motion)), Sweep(*(part[busy] for part in sweep))
     couples = _couples(table, number, motion)
-    possible = _spread(_near(table, number, motion, sweep) | moving, couples)
+    possible = _spread(seeds, couples)
     graph = _gather(table, number, motion, sweep, possible)
     index = possible.new_full(possible.shape, 0, dtype=torch.long)
     index[graph.scene, graph.slot] = torch.arange(len(graph.scene), device=index.device)
@@ -97,7 +101,8 @@ def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, s
     awake = torch.zeros_like(possible)
     awake[graph.scene, graph.slot] = graph.touched | moving[graph.scene, graph.slot]
     awake = _spread(awake, touching | touching.transpose(1, 2))
-    return _keep(graph, first, second, gap, awake[graph.scene, graph.slot])
+    kept = _keep(graph, first, second, gap, awake[graph.scene, graph.slot])
+    return kept._replace(scene=busy[kept.scene])
 
 
 def _near(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Bool[Tensor, "B N"]:

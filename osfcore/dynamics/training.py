@@ -77,13 +77,13 @@ class TrainDynamics:
 
     data: tuple[Path, ...]
     out: Path
-    iterations: int = 30_000
+    iterations: int = 16_000
     batch: int = 512
-    long_iterations: int = 1_500
+    long_iterations: int = 4_000
     long_batch: int = 96
     hidden: int = 128
     rate: float = 2e-3
-    patience: int = 6
+    patience: int = 20
     without: tuple[str, ...] = ()
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0

@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.dynamics.graph import PAIR_REACH_M, TOUCH_M, TRAVEL_M, adjacency, build_graph
+from osfcore.dynamics.motion import Motion, Sweep
 from osfcore.scene import PUSHER_RADIUS_M
 from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, crowd, moved_state, scene, start, sweep_of
 
@@ -139,3 +140,20 @@ def test_the_order_of_the_objects_does_not_matter(shapes, table):
     assert {tuple(sorted((rows[i], rows[j]))) for i, j in zip(b.receiver.tolist(), b.sender.tolist(), strict=True)} == {
         tuple(sorted(pair)) for pair in zip(a.receiver.tolist(), a.sender.tolist(), strict=True)
     }
+
+
+def test_scenes_in_which_nothing_happens_change_nothing_for_others(shapes, table):
+    """Left, right, left: the middle scene has no objects in the graph, the others have the same."""
+    state = scene(shapes, {CAN: (0.06, 0.0), GELATIN: (0.13, -0.02)})
+    number, motion = start(table, shapes, state)
+    three = Motion(*(part.expand(3, *part.shape[1:]) for part in motion))
+    shift = torch.tensor([[0.015, 0.0], [-0.015, 0.0], [0.015, 0.0]])
+    heading = shift / shift.norm(dim=1, keepdim=True)
+    together = build_graph(table, number.expand(3, -1), three, Sweep(heading, shift))
+    alone = build_graph(table, number, motion, Sweep(heading[:1], shift[:1]))
+    count = len(alone.scene)
+    assert count == 2
+    assert together.scene.tolist() == [0] * count + [2] * count
+    for half in (slice(0, count), slice(count, None)):
+        torch.testing.assert_close(together.centre[half], alone.centre)
+        assert torch.equal(together.slot[half], alone.slot)
