@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from osfcore.dynamics.episodes import SLEEP_M, SLEEP_RAD, is_on_table, substates
 from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
@@ -75,7 +75,7 @@ class _Track:
         self._path = pusher_path(episode.pusher[0, :2], episode.actions[:, :2])
         safe = is_on_table(episode)
         is_safe = np.repeat(safe[:-1] & safe[1:], SUBSTEPS)
-        moves = self._awake(self._linear, self._angular).any(axis=1)
+        moves: Bool[np.ndarray, "S"] = np.any(self._awake(self._linear, self._angular), axis=1)
         self.busy = 1 + np.flatnonzero(moves[1:] & moves[:-1] & is_safe[1:])
 
     @staticmethod
