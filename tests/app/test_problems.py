@@ -43,7 +43,7 @@ def test_nothing_there_and_wrong_methods_are_problems(service):
 
 
 def test_large_bodies_are_problems(service):
-    is_problem(service.post("/api/scenes", content=b" " * (1 << 21), headers={"content-type": "application/json"}), 413)
+    is_problem(service.post("/api/scenes", content=b" " * (8 << 20), headers={"content-type": "application/json"}), 413)
 
 
 @pytest.mark.parametrize(
