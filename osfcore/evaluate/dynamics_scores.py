@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from osfcore.baselines.quasistatic import push
+from osfcore.dynamics.episodes import is_on_table
 from osfcore.dynamics.motion import Motion, going_on, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.pusher import SUBSTEPS
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.unroll import unroll
-from osfcore.dynamics.windows import is_on_table
 from osfcore.evaluate.pose_errors import rotation_error
 from osfcore.objects.asset import Symmetry
 from osfcore.poses import rotate, rotation_angle
