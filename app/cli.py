@@ -52,10 +52,10 @@ Commands = Annotated[
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; 0 on success, 1 if it could not be done, 2 for a wrong call, 130 when interrupted."""
-    command: Command = tyro.cli(
-        Commands, prog="osf", args=arguments, description="Rearrange real objects from a photo."
-    )
     try:
+        command: Command = tyro.cli(
+            Commands, prog="osf", args=arguments, description="Rearrange real objects from a photo."
+        )
         result = command.run()
     except OsfError as error:
         print(f"osf: {error}", file=sys.stderr)

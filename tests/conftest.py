@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import osfcore.convex
 import osfcore.objects
 from osfcore.objects.fetch import fetch
 from osfcore.objects.library import AssetLibrary
@@ -29,7 +30,7 @@ TEST_OBJECTS = (
 
 def _objects_key() -> str:
     """Changes when the conversion changes, so that stale objects are not used."""
-    sources = sorted(Path(osfcore.objects.__path__[0]).glob("*.py"))
+    sources = [Path(osfcore.convex.__file__), *sorted(Path(osfcore.objects.__path__[0]).glob("*.py"))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
 
 

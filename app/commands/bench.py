@@ -94,8 +94,7 @@ class Bench:
     def _dynamics(self) -> dict[str, Any]:
         from dataclasses import asdict
 
-        from osfcore.dynamics.library import network_path
-        from osfcore.dynamics.shapes import object_shape
+        from osfcore.dynamics.library import load_shapes, network_path
         from osfcore.dynamics.weights import read_network
         from osfcore.evaluate.bench_dynamics import BENCH_NAMES, HORIZON, SEQUENCES, bench_rollouts
         from osfcore.fields.devices import pick_device
@@ -103,8 +102,7 @@ class Bench:
         from osfcore.files import write_json
 
         self._check_places(_DYNAMICS_FIGURES)
-        library = FieldLibrary(self.data_dir)
-        shapes = {name: object_shape(library.load(name)) for name in BENCH_NAMES}
+        shapes = load_shapes(self.data_dir, FieldLibrary(self.data_dir), BENCH_NAMES)
         result = asdict(bench_rollouts(read_network(network_path(self.data_dir)), shapes, pick_device(self.device)))
         if self.out is not None:
             write_json(self.out / _DYNAMICS_FIGURES, result)

@@ -104,21 +104,21 @@ class TrainDynamicsCommand:
     """Push files that 'osf collect pushes' wrote; one in twelve episodes is held out."""
     out: Path
     """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
-    iterations: int = 16_000
+    iterations: int = 26_000
     """Steps of descent on single substeps, at most."""
-    long_iterations: int = 4_000
+    long_iterations: int = 1_500
     """Steps of descent on windows of three actions, after these."""
     patience: int = 20
     """Measurements on held-out episodes without a better one after which training stops."""
     without: tuple[str, ...] = ()
     """Objects whose episodes are left out."""
-    hidden: int = 128
+    hidden: int = 192
     """Width of the network."""
     batch: int = 512
     """Substeps in each step of descent."""
     long_batch: int = 96
     """Windows in each."""
-    rate: float = 2e-3
+    rate: float = 4e-3
     """Of learning, at its highest."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
@@ -131,7 +131,7 @@ class TrainDynamicsCommand:
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
-        from osfcore.dynamics.shapes import object_shape
+        from osfcore.dynamics.library import load_shapes
         from osfcore.dynamics.training import TrainDynamics, train_dynamics
         from osfcore.fields.library import FieldLibrary
 
@@ -150,7 +150,7 @@ class TrainDynamicsCommand:
             seed=self.seed,
         )
         library = FieldLibrary(self.data_dir)
-        follow(train_dynamics(config, {name: object_shape(library.load(name)) for name in library.names()}))
+        follow(train_dynamics(config, load_shapes(self.data_dir, library, library.names())))
         metrics = _metrics(self.out)
         if not self.json:
             mm, deg = metrics["validation_mm_4"], metrics["validation_deg_4"]

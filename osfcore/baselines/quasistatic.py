@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from osfcore.dynamics import turns
-from osfcore.dynamics.graph import OUTLINE
+from osfcore.dynamics.contact import outlines
 from osfcore.dynamics.motion import Motion
-from osfcore.dynamics.outline import circle, dot, gap_between, gap_to_point
+from osfcore.dynamics.outline import dot, gap_between, gap_to_point
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.sliding import lever, slide
 from osfcore.scene import PUSHER_RADIUS_M
@@ -44,8 +44,7 @@ def push(
 def _outlines(table: ShapeTable, number: Tensor, motion: Motion) -> Float[Tensor, "B N K 2"]:
     """Outlines around the centres of mass."""
     rotation = turns.matrix(motion.quaternion.flatten(0, 1))
-    flat = functional.pad(circle(OUTLINE, rotation.device), (0, 1))
-    return table.farthest(number.flatten(), rotation, flat)[..., :2].unflatten(0, number.shape)
+    return outlines(table, number.flatten(), rotation, torch.zeros_like(rotation[:, 0])).unflatten(0, number.shape)
 
 
 def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tuple[Motion, Tensor]:

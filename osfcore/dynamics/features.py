@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from osfcore.dynamics import turns
 from osfcore.dynamics.graph import Graph
-from osfcore.dynamics.outline import Gap, direction_index, dot
+from osfcore.dynamics.outline import Gap, dot
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.sliding import lever, slide
 from osfcore.scene import PUSHER_RADIUS_M
@@ -59,7 +59,7 @@ class Inputs(NamedTuple):
 def inputs(table: ShapeTable, graph: Graph) -> Inputs:
     """All that the network needs."""
     turn = turns.facing(_directions(graph))
-    guess = _give_way(graph, graph.after, turn)
+    guess = _give_way(graph, graph.pusher.after, turn)
     pushed = graph.touched.nonzero()[:, 0]
     edges = torch.cat([_from_pusher(graph, pushed, turn), _between(graph, turn)])
     nodes = _nodes(table, graph, turn, guess)
@@ -77,18 +77,18 @@ def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
     flat = graph.linear[:, :2]
     speed = flat.norm(dim=1, keepdim=True)
     moving = torch.where(speed > 1e-6, flat / speed.clamp(min=1e-6), flat.new_tensor([1.0, 0.0]))
-    closest = speed.new_full((len(speed),), 1.0).scatter_reduce(0, graph.receiver, graph.pair.distance, "amin")
-    is_closest = graph.pair.distance <= closest[graph.receiver]
-    neighbour = moving.index_put((graph.receiver[is_closest],), -graph.pair.normal[is_closest])
+    closest = speed.new_full((len(speed),), 1.0).scatter_reduce(0, graph.receiver, graph.pair.gap.distance, "amin")
+    is_closest = graph.pair.gap.distance <= closest[graph.receiver]
+    neighbour = moving.index_put((graph.receiver[is_closest],), -graph.pair.gap.normal[is_closest])
     by_neighbour = (closest < _CLOSE_M)[:, None] | ((closest < 1.0)[:, None] & (speed <= 1e-6))
     direction = torch.where(by_neighbour, neighbour, moving)
-    return torch.where(graph.touched[:, None], -graph.after.normal, direction)
+    return torch.where(graph.touched[:, None], -graph.pusher.after.normal, direction)
 
 
 def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Tensor, "A 3"]:
     """Sliding at a contact, so far that the pusher's last position is free."""
     centre = graph.centre[:, :2]
-    depth = (-graph.after.distance).clamp(min=0)
+    depth = (-graph.pusher.after.distance).clamp(min=0)
     way = slide(gap.point - centre, -gap.normal, depth, graph.shift, lever(graph.outline - centre[:, None]))
     along = (turn[:, :2, :2] @ way[:, :2, None])[..., 0]
     return torch.cat([along / SHIFT_M, way[:, 2:] / TURN_RAD], dim=1)
@@ -127,21 +127,19 @@ def _fan_of(count: int, like: Tensor) -> Float[Tensor, "D 2"]:
 
 def _from_pusher(graph: Graph, pushed: Tensor, turn: Tensor) -> Tensor:
     centre = graph.centre[pushed]
-    before, halfway, after = (
-        Gap(*(part[pushed] for part in gap)) for gap in (graph.before, graph.halfway, graph.after)
-    )
+    before, halfway, after = (Gap(*(part[pushed] for part in gap)) for gap in graph.pusher[:3])
     shift = functional.pad(graph.shift[pushed], (0, 1))
     rim = -PUSHER_RADIUS_M * before.normal - centre[:, :2]
     return _edge(
         turn[pushed],
         is_pusher=1.0,
-        slide=_give_way(graph, graph.before, turn)[pushed],
+        slide=_give_way(graph, graph.pusher.before, turn)[pushed],
         away=-centre,
         motion=(shift, torch.zeros_like(shift)),
         gaps=(before.distance, halfway.distance, after.distance),
         points=[
             *(before.point - centre[:, :2], after.point - centre[:, :2]),
-            *_face(graph.outline[pushed], before.normal, centre),
+            *(graph.pusher.face[pushed] - centre[:, None, :2]).unbind(1),
             *(rim, rim),
         ],
         directions=[before.normal, after.normal, shift[:, :2] / SHIFT_M],
@@ -150,10 +148,10 @@ def _from_pusher(graph: Graph, pushed: Tensor, turn: Tensor) -> Tensor:
 
 def _between(graph: Graph, turn: Tensor) -> Tensor:
     i, j = graph.receiver, graph.sender
-    centre, normal, distance = graph.centre[i], graph.pair.normal, graph.pair.distance
+    centre, normal, distance = graph.centre[i], graph.pair.gap.normal, graph.pair.gap.distance
     motion = graph.linear[j] - graph.linear[i]
     later = distance + dot(motion[:, :2], normal)
-    point = graph.pair.point - centre[:, :2]
+    point = graph.pair.gap.point - centre[:, :2]
     return _edge(
         turn[i],
         is_pusher=0.0,
@@ -163,8 +161,8 @@ def _between(graph: Graph, turn: Tensor) -> Tensor:
         gaps=(distance, (distance + later) / 2, later),
         points=[
             *(point, point + motion[:, :2]),
-            *_face(graph.outline[i], normal, centre),
-            *_face(graph.outline[j], -normal, centre),
+            *(graph.pair.first_face - centre[:, None, :2]).unbind(1),
+            *(graph.pair.second_face - centre[:, None, :2]).unbind(1),
         ],
         directions=[normal, normal, turn[j, 0, :2]],
     )
@@ -195,14 +193,6 @@ def _edge(
         flat.transpose(1, 2).flatten(1),
     ]
     return torch.cat(parts, dim=1)
-
-
-def _face(outline: Tensor, normal: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends of the side of an outline that faces a direction; a corner gives about the same point twice."""
-    count = outline.shape[1]
-    middle = direction_index(normal, count)
-    rows = torch.arange(len(outline), device=outline.device)
-    return tuple(outline[rows, (middle + step) % count] - centre[:, :2] for step in (-1, 1))  # pyright: ignore[reportReturnType]
 
 
 def mirrored(values: Tensor, flags: Tensor, kind: Literal["node", "edge", "motion"]) -> Tensor:

@@ -2,32 +2,39 @@
 
 Deviation: eq. 8 compares a squared distance with a length; we compare the distance of two objects with
 kappa = the longest half-extents of both + one step of pusher travel. Among the pairs that pass, and between pusher and
-objects, outlines seen from above then tell which can touch within one substep. Only objects that the pusher can touch,
-or that move, or that can be touched by one of these, take part; all others stay exactly where they are.
+objects, outlines seen from above (`contact.py`) then tell which can touch within one substep. Only objects that the
+pusher can touch, or that move, or that can be touched by one of these, take part; all others stay exactly where they
+are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from osfcore.dynamics import turns
+from osfcore.dynamics.contact import (
+    PAIR_REACH_M,
+    TOUCH_M,
+    PairContact,
+    PusherContact,
+    Solids,
+    outlines,
+    pair_contact,
+    pusher_contact,
+    solids,
+)
 from osfcore.dynamics.motion import Motion, Sweep
-from osfcore.dynamics.outline import Gap, circle, dot, gap_between, gap_to_point
+from osfcore.dynamics.outline import Gap, dot
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.scene import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 
 TRAVEL_M = MAX_SPEED_M_S * STEP_S  # of the pusher in one step, per axis
-OUTLINE = 64  # corners of an outline
-_PAIR_STRIDE = 2  # pairs are compared with every second corner
-TOUCH_M = 0.008  # a substep's sweep is sampled at three points: nothing nearer than this is missed
-_NODE_PARTS = 14  # of a graph: those that belong to objects; the last three belong to pairs
 _LOOKUP_M = 0.005  # by which a look at a single direction may fall short
-PAIR_REACH_M = 0.025  # objects closer than this may touch within a substep
 
 
 class Graph(NamedTuple):
@@ -45,9 +52,9 @@ class Graph(NamedTuple):
         outline: seen from above [m].
         shift: of the pusher in this substep [m].
         touched: which objects the pusher can touch.
-        before, halfway, after: gaps to the pusher's rim at its start, halfway and at its end, if nothing moved.
+        pusher: where, if so.
         receiver, sender: numbers among the A objects, for each of the E ordered pairs that can touch.
-        pair: gap of each such pair.
+        pair: where each such pair can touch, out of the receiver.
     """
 
     scene: Int[Tensor, "A"]
@@ -61,12 +68,10 @@ class Graph(NamedTuple):
     outline: Float[Tensor, "A K 2"]
     shift: Float[Tensor, "A 2"]
     touched: Bool[Tensor, "A"]
-    before: Gap
-    halfway: Gap
-    after: Gap
+    pusher: PusherContact
     receiver: Int[Tensor, "E"]
     sender: Int[Tensor, "E"]
-    pair: Gap
+    pair: PairContact
 
 
 def adjacency(
@@ -87,21 +92,20 @@ def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, s
     motion, sweep = Motion(*(part[busy] for part in motion)), Sweep(*(part[busy] for part in sweep))
     couples = _couples(table, number, motion)
     possible = _spread(seeds, couples)
-    graph = _gather(table, number, motion, sweep, possible)
+    graph, parts = _gather(table, number, motion, sweep, possible)
     index = possible.new_full(possible.shape, 0, dtype=torch.long)
     index[graph.scene, graph.slot] = torch.arange(len(graph.scene), device=index.device)
     scene, i, j = (couples & possible[:, :, None] & possible[:, None]).triu().nonzero().unbind(1)
     first, second = index[scene, i], index[scene, j]
-    thin = graph.outline[:, ::_PAIR_STRIDE]
-    gap = gap_between(thin[first], thin[second])
-    close = gap.distance < PAIR_REACH_M
-    first, second, gap = first[close], second[close], Gap(*(part[close] for part in gap))
+    contact = pair_contact(parts, graph.outline, first, second)
+    close = contact.gap.distance < PAIR_REACH_M
+    first, second, contact = first[close], second[close], _picked(contact, close)
     touching = torch.zeros_like(couples)
     touching[graph.scene[first], graph.slot[first], graph.slot[second]] = True
     awake = torch.zeros_like(possible)
     awake[graph.scene, graph.slot] = graph.touched | moving[graph.scene, graph.slot]
     awake = _spread(awake, touching | touching.transpose(1, 2))
-    kept = _keep(graph, first, second, gap, awake[graph.scene, graph.slot])
+    kept = _keep(graph, first, second, contact, awake[graph.scene, graph.slot])
     return kept._replace(scene=busy[kept.scene])
 
 
@@ -151,8 +155,8 @@ def _spread(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Ten
 
 def _gather(
     table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep, chosen: Bool[Tensor, "B N"]
-) -> Graph:
-    """The chosen objects side by side, without pairs yet."""
+) -> tuple[Graph, Solids]:
+    """The chosen objects side by side, without pairs yet, and their convex parts."""
     scene, slot = chosen.nonzero().unbind(1)
     frame = turns.facing(sweep.heading[scene])
     rotation = frame @ turns.matrix(motion.quaternion[scene, slot])
@@ -168,43 +172,44 @@ def _gather(
     )
     centre, linear, angular, shift = (frame @ vectors).unbind(2)
     which = number[scene, slot]
-    flat = torch.nn.functional.pad(circle(OUTLINE, scene.device), (0, 1))
-    outline = table.farthest(which, rotation, flat)[..., :2] + centre[:, None, :2]
+    outline = outlines(table, which, rotation, centre)
+    parts = solids(table, which, rotation, centre, outline)
     shift = shift[:, :2]
-    halfway = _rim_gap(outline, 0.5 * shift)
-    reached = halfway.distance - 0.5 * shift.norm(dim=1) < TOUCH_M  # elsewhere neither end comes near
-    before, after = (_gap_where(reached, outline, share * shift, halfway) for share in (0.0, 1.0))
-    touched = reached & (torch.stack([before.distance, halfway.distance, after.distance]).amin(dim=0) < TOUCH_M)
+    pusher = pusher_contact(parts, shift)
+    touched = torch.stack([gap.distance for gap in pusher[:3]]).amin(dim=0) < TOUCH_M
     none = scene[:0]
-    pair = Gap(centre[:0, 0], centre[:0, :2], centre[:0, :2])
-    return Graph(scene, slot, which, frame, rotation, centre, linear, angular, outline, shift, touched, before, halfway,
-                 after, none, none, pair)  # fmt: skip
+    pair = pair_contact(parts, outline, none, none)
+    graph = Graph(scene, slot, which, frame, rotation, centre, linear, angular, outline, shift, touched, pusher,
+                  none, none, pair)  # fmt: skip
+    return graph, parts
 
 
-def _rim_gap(outline: Float[Tensor, "A K 2"], centre: Float[Tensor, "A 2"]) -> Gap:
-    """From outlines to the pusher's rim."""
-    gap = gap_to_point(outline, centre)
-    return gap._replace(distance=gap.distance - PUSHER_RADIUS_M)
+_Tensors = TypeVar("_Tensors")
 
 
-def _gap_where(chosen: Bool[Tensor, "A"], outline: Tensor, centre: Tensor, other: Gap) -> Gap:
-    """The same for chosen outlines; the others, which are far away, keep another gap."""
-    rows = chosen.nonzero()[:, 0]
-    gap = _rim_gap(outline[rows], centre[rows])
-    return Gap(*(old.index_put((rows,), new) for old, new in zip(other, gap, strict=True)))
+def _picked(values: _Tensors, rows: Tensor) -> _Tensors:
+    """Some rows of a tensor, or of every tensor in a named tuple."""
+    if isinstance(values, Tensor):
+        return values[rows]  # pyright: ignore[reportReturnType]
+    assert isinstance(values, tuple)
+    return type(values)(*(_picked(part, rows) for part in values))
 
 
-def _keep(graph: Graph, first: Tensor, second: Tensor, gap: Gap, kept: Bool[Tensor, "A"]) -> Graph:
+def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kept: Bool[Tensor, "A"]) -> Graph:
     """The objects kept, and the pairs among them in both orders."""
     renumbered = kept.long().cumsum(0) - 1
     both = kept[first] & kept[second]
-    first, second, gap = first[both], second[both], Gap(*(part[both] for part in gap))
+    first, second = renumbered[first[both]], renumbered[second[both]]
+    gap, first_face, second_face = _picked(contact, both)
     opposite = gap.point + gap.distance[:, None] * gap.normal
-    pair = Gap(
-        torch.cat([gap.distance, gap.distance]),
-        torch.cat([gap.normal, -gap.normal]),
-        torch.cat([gap.point, opposite]),
+    pair = PairContact(
+        Gap(
+            torch.cat([gap.distance, gap.distance]),
+            torch.cat([gap.normal, -gap.normal]),
+            torch.cat([gap.point, opposite]),
+        ),
+        torch.cat([first_face, second_face]),
+        torch.cat([second_face, first_face]),
     )
-    nodes = [Gap(*(p[kept] for p in part)) if isinstance(part, Gap) else part[kept] for part in graph[:_NODE_PARTS]]
-    first, second = renumbered[first], renumbered[second]
-    return Graph._make([*nodes, torch.cat([first, second]), torch.cat([second, first]), pair])
+    objects = [_picked(part, kept) for part in graph[:-3]]
+    return Graph._make([*objects, torch.cat([first, second]), torch.cat([second, first]), pair])

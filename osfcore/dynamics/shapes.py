@@ -2,12 +2,13 @@
 
 The paper thresholds the KiloOSF's density on a grid of points (section 4.3). We take the points where the density
 crosses the threshold along the grid's edges, which places the surface within about a millimetre instead of a voxel, and
-keep the support function of their convex hull: the farthest point in every direction. Contact, footprint, height and
-size all follow from it, for any orientation.
+keep the support function of their convex hull: the farthest point in every direction. Footprint, height and size all
+follow from it, for any orientation; contact too, but that hollow objects are touched at one of several convex parts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,16 +35,22 @@ class ObjectShape:
         centre: centre of mass of the solid, of uniform density, in the object's frame [m].
         radius: of the sphere around the centre that holds the object [m].
         support: farthest point from the centre in each direction of the octahedral map, relative to the centre [m].
+        parts: the same of each convex part; none if the hull is good enough.
     """
 
     half_extents: Float[np.ndarray, "3"]
     centre: Float[np.ndarray, "3"]
     radius: float
     support: Float32[np.ndarray, "D 3"]
+    parts: tuple[Float32[np.ndarray, "D 3"], ...] = ()
 
 
-def object_shape(field: KiloOSF) -> ObjectShape:
+def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "M 3"]] = ()) -> ObjectShape:
     """The shape that a field describes.
+
+    Args:
+        field: of the object.
+        parts: corners of convex parts that together fill it; none if its hull is good enough.
 
     Raises:
         OsfError: if nothing in the field is solid.
@@ -55,14 +62,20 @@ def object_shape(field: KiloOSF) -> ObjectShape:
     corners = surface[ConvexHull(surface).vertices]
     solid = np.asarray(ndimage.binary_fill_holes(field.density > SURFACE_G))
     centre = field.origin + field.voxel * np.argwhere(solid).mean(axis=0)
-    around = (corners - centre).astype(np.float32)
-    directions = octahedral_directions(MAP_SIDE).astype(np.float32)
     return ObjectShape(
         half_extents=np.ptp(corners, axis=0) / 2,
         centre=centre,
-        radius=float(np.linalg.norm(around, axis=1).max()),
-        support=around[np.argmax(directions @ around.T, axis=1)],
+        radius=float(np.linalg.norm(corners - centre, axis=1).max()),
+        support=_support_map(corners - centre),
+        parts=tuple(_support_map(part - centre) for part in parts),
     )
+
+
+def _support_map(corners: Float[np.ndarray, "M 3"]) -> Float32[np.ndarray, "D 3"]:
+    """The farthest corner in each direction of the octahedral map."""
+    around = corners.astype(np.float32)
+    directions = octahedral_directions(MAP_SIDE).astype(np.float32)
+    return around[np.argmax(directions @ around.T, axis=1)]
 
 
 def _surface(density: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
@@ -109,20 +122,27 @@ def octahedral_index(directions: Float[Tensor, "*batch 3"], side: int) -> Tensor
 class ShapeTable:
     """The shapes of some objects side by side, for lookups by number.
 
+    Convex parts are bodies as well, numbered after all objects; an object without any is its own only part.
+
     Args:
         shapes: of the objects, in the order of their numbers.
         device: that looks them up.
     """
 
     def __init__(self, shapes: tuple[ObjectShape, ...], device: torch.device | str = "cpu") -> None:
-        self.support = torch.as_tensor(np.concatenate([s.support for s in shapes]), device=device)
+        bodies = [s.support for s in shapes] + [part for s in shapes for part in s.parts]
+        counts = np.array([len(s.parts) for s in shapes])
+        first = np.where(counts > 0, len(shapes) + counts.cumsum() - counts, np.arange(len(shapes)))
+        self.support = torch.as_tensor(np.concatenate(bodies), device=device)
+        self.first_part = torch.as_tensor(first, device=device)
+        self.part_count = torch.as_tensor(counts.clip(1), device=device)
         self.centre = torch.as_tensor(np.array([s.centre for s in shapes]), device=device)
         self.radius = torch.as_tensor(np.array([s.radius for s in shapes]), dtype=torch.float32, device=device)
         extents = np.array([s.half_extents.max() for s in shapes])
         self.half_extent = torch.as_tensor(extents, dtype=torch.float32, device=device)
 
     def farthest(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
-        """Farthest points of A objects in D directions of the world, relative to their centres of mass (A, D, 3) [m].
+        """Farthest points of A bodies in D directions of the world, relative to their centres of mass (A, D, 3) [m].
 
         The points are those of the nearest direction on the map, 3.6 deg away at most: they reach 0.03 to 0.25 mm less
         far than the farthest ones (rms over all directions), and some millimetres less beside the normal of a face.
@@ -131,7 +151,7 @@ class ShapeTable:
         return self._support(number, local) @ rotation.transpose(1, 2)
 
     def extents(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
-        """How far A objects reach in D directions of the world from their centres of mass (A, D) [m]."""
+        """How far A bodies reach in D directions of the world from their centres of mass (A, D) [m]."""
         local = directions @ rotation
         reach = self._support(number, local) * local
         return reach[..., 0] + reach[..., 1] + reach[..., 2]

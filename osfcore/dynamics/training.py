@@ -9,7 +9,6 @@ states, which cost a fraction.
 
 from __future__ import annotations
 
-import copy
 import io
 import math
 import shlex
@@ -23,6 +22,7 @@ import torch
 from torch import Tensor
 
 from osfcore.dynamics import turns
+from osfcore.dynamics.descent import Descent
 from osfcore.dynamics.features import SHIFT_M, TURN_RAD
 from osfcore.dynamics.holdout import has_held_out_pair, is_for_validation
 from osfcore.dynamics.motion import Motion
@@ -48,8 +48,6 @@ _BUSY_SHARE = 0.85  # of the windows of a batch: in the others nothing happens
 _COARSE_SHARE = 0.5  # of the windows, which start with velocities as little known as in use
 _WARM_UP = 100
 _LAST_RATE = 0.01  # of the first one
-_AVERAGING = 0.998  # of the weights that are kept, from iteration to iteration
-_CLIP = 5.0
 _REPORT_EVERY, _MEASURE_EVERY, _MEASURE_LONG_EVERY = 20, 1000, 100
 _LONG_RATE = 0.1
 _MEASURED = 2000  # windows
@@ -68,7 +66,7 @@ class TrainDynamics:
         long_iterations: on windows of three actions, after these.
         long_batch: windows in each.
         hidden: width of the network.
-        rate: of learning, at its highest; on windows a tenth of it.
+        rate: of learning, at its highest; on windows a tenth of it; of what is no matrix half of it.
         patience: measurements on held-out episodes without a better one after which training stops.
         without: objects whose episodes are left out.
         device: "auto", "cpu" or "cuda".
@@ -77,12 +75,12 @@ class TrainDynamics:
 
     data: tuple[Path, ...]
     out: Path
-    iterations: int = 16_000
+    iterations: int = 26_000
     batch: int = 512
-    long_iterations: int = 4_000
+    long_iterations: int = 1_500
     long_batch: int = 96
-    hidden: int = 128
-    rate: float = 2e-3
+    hidden: int = 192
+    rate: float = 4e-3
     patience: int = 20
     without: tuple[str, ...] = ()
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -179,9 +177,7 @@ class _Run:
         self._used = len(learned)
         torch.manual_seed(config.seed)
         self._rng = np.random.default_rng(config.seed)
-        self._network = PropagationNetwork(config.hidden).to(device)
-        self._average = copy.deepcopy(self._network)
-        self._optimiser = torch.optim.AdamW(self._network.parameters(), lr=config.rate, weight_decay=1e-4)
+        self._descent = Descent(PropagationNetwork(config.hidden).to(device), config.rate)
         self._best: dict[str, Tensor] = {}
         self.best: Validation | None = None
         self.done = self.fruitless = self.steps = 0
@@ -201,15 +197,7 @@ class _Run:
     def iterate(self) -> str:
         """One step of descent."""
         loss = self._loss_of_samples() if self.done < self._config.iterations else self._loss_of_windows()
-        self._set_rate()
-        self._optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self._network.parameters(), _CLIP)
-        self._optimiser.step()
-        share = min(_AVERAGING, self.done / (self.done + 10))
-        with torch.no_grad():
-            for kept, new in zip(self._average.parameters(), self._network.parameters(), strict=True):
-                kept.lerp_(new, 1 - share)
+        self._descent.step(loss, self._share_of_rate(), self.done)
         self.done += 1
         self.steps += 1
         what = "a substep" if self.done <= self._config.iterations else "a window"
@@ -220,7 +208,7 @@ class _Run:
         graphs = torch.as_tensor(self._rng.integers(len(self._samples), size=self._config.batch))
         flipped = torch.as_tensor(self._rng.random(len(graphs)) < 0.5)
         sample = Sample(*(part.to(self._device) for part in self._samples.draw(graphs, flipped)))
-        answer = self._network(sample.nodes, sample.edges, sample.receiver, sample.sender)
+        answer = self._descent.network(sample.nodes, sample.edges, sample.receiver, sample.sender)
         scale = answer.new_tensor([SHIFT_M] * 3 + [_ARM_M * TURN_RAD] * 3)
         return 1e3 * (((answer - sample.target) * scale).square().sum(dim=1) + 1e-9).sqrt().mean()
 
@@ -235,9 +223,9 @@ class _Run:
         return loss * (1e3 / len(windows) / len(pieces.targets.centre))
 
     def _unroll(self, pieces: Batch, mirror: Tensor) -> Iterator[Motion]:
-        return unroll(self._network, self._table, pieces.number, pieces.motion, pieces.velocity, mirror)
+        return unroll(self._descent.network, self._table, pieces.number, pieces.motion, pieces.velocity, mirror)
 
-    def _set_rate(self) -> None:
+    def _share_of_rate(self) -> float:
         """A warm-up and a cosine for each of both parts."""
         config = self._config
         is_long = self.done >= config.iterations
@@ -245,16 +233,15 @@ class _Run:
             (self.done - config.iterations, config.long_iterations) if is_long else (self.done, config.iterations)
         )
         falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * done / total)) / 2
-        rate = config.rate * (_LONG_RATE if is_long else 1) * min(1, (done + 1) / _WARM_UP) * falling
-        for group in self._optimiser.param_groups:
-            group["lr"] = rate
+        return (_LONG_RATE if is_long else 1) * min(1, (done + 1) / _WARM_UP) * falling
 
     def measure(self) -> None:
         """Keep the averaged weights if they are the best so far."""
-        found = validate(self._average, self._table, self._validation, self._device)
+        found = validate(self._descent.average, self._table, self._validation, self._device)
         if self.best is None or found.loss < self.best.loss:
             self.best, self.fruitless = found, 0
-            self._best = {name: value.detach().cpu().clone() for name, value in self._average.state_dict().items()}
+            kept = self._descent.average.state_dict()
+            self._best = {name: value.detach().cpu().clone() for name, value in kept.items()}
         else:
             self.fruitless += 1
         if self.fruitless >= self._config.patience:  # what is left of this part would be in vain
@@ -277,9 +264,7 @@ class _Run:
         """Everything that is needed to go on."""
         content: dict[str, Any] = {
             "fingerprint": self._fingerprint(),
-            "network": self._network.state_dict(),
-            "average": self._average.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
+            "descent": self._descent.state(),
             "best": self._best,
             "validation": asdict(self.best) if self.best else None,
             "numbers": [self.done, self.fruitless, self.steps],
@@ -295,9 +280,7 @@ class _Run:
             content = torch.load(self._checkpoint, weights_only=True, map_location=self._device)
             if content["fingerprint"] != self._fingerprint():
                 return
-            self._network.load_state_dict(content["network"])
-            self._average.load_state_dict(content["average"])
-            self._optimiser.load_state_dict(content["optimiser"])
+            self._descent.restore(content["descent"])
             self._best = content["best"]
             self.best = Validation(**content["validation"]) if content["validation"] else None
             self.done, self.fruitless, self.steps = content["numbers"]
@@ -308,8 +291,9 @@ class _Run:
     def finish(self) -> None:
         """Write the best weights and what is known of them."""
         assert self.best is not None
-        self._network.load_state_dict(self._best)
-        data = network_bytes(self._network)
+        network = self._descent.network
+        network.load_state_dict(self._best)
+        data = network_bytes(network)
         write_atomically(self._config.out, data)
         metrics = {f"validation_{name}": round(value, 3) for name, value in asdict(self.best).items()}
         own = {"iterations": self.steps, "seed": self._config.seed, "device": str(self._device), "bytes": len(data),

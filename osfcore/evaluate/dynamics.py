@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from osfcore.dynamics.library import network_path
-from osfcore.dynamics.shapes import ObjectShape, object_shape
+from osfcore.dynamics.library import load_shapes, network_path
+from osfcore.dynamics.shapes import ObjectShape
 from osfcore.dynamics.weights import read_metrics, read_network, shipped
 from osfcore.errors import InvalidInput, MissingAssets
 from osfcore.evaluate.bench_dynamics import BENCH_NAMES, rollout_rate
@@ -111,7 +111,7 @@ def evaluate_dynamics(
         for step in _collect(config, entry, assets, executor):
             yield DynamicsEvaluationStep(done, total, f"Pushes, {entry.objects} objects: {step}")
         done += 1
-    shapes = {name: object_shape(fields.load(name)) for name in names}
+    shapes = load_shapes(config.data_dir, fields, names)
     scored: dict[str, Scored] = {}
     for entry in sets:
         yield DynamicsEvaluationStep(done, total, f"Predicting {entry.policy} pushes of {entry.objects} objects")
@@ -123,7 +123,7 @@ def evaluate_dynamics(
         by_set={key: value for key, value in scored.items() if key != _UNSEEN},
         unseen=scored.get(_UNSEEN),
         unseen_names=unseen,
-        rollout_steps_per_s=rollout_rate(network, {name: object_shape(fields.load(name)) for name in BENCH_NAMES}),
+        rollout_steps_per_s=rollout_rate(network, load_shapes(config.data_dir, fields, BENCH_NAMES)),
     )
     write_plots(config.folder, report)
     write_gallery(config.folder, report, shapes)

@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch.nn import functional
 
-from osfcore.dynamics.graph import OUTLINE
-from osfcore.dynamics.outline import circle
+from osfcore.dynamics.contact import outlines
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.evaluate.charts import Axis, Curve, chart, round_limit, side_by_side
 from osfcore.evaluate.dynamics_report import DynamicsReport, Scored
@@ -132,6 +130,5 @@ def _outline(
 ) -> Float[np.ndarray, "K 2"]:
     """An object from above [m]."""
     rotation = torch.as_tensor(quaternion_to_matrix(quaternion), dtype=torch.float32)[None]
-    flat = functional.pad(circle(OUTLINE), (0, 1))
-    around = ShapeTable((shape,)).farthest(torch.zeros(1, dtype=torch.long), rotation, flat)
-    return around[0, :, :2].numpy() + (position + rotate(quaternion, shape.centre))[:2]
+    centre = torch.as_tensor(position + rotate(quaternion, shape.centre), dtype=torch.float32)[None]
+    return outlines(ShapeTable((shape,)), torch.zeros(1, dtype=torch.long), rotation, centre)[0].numpy()

@@ -126,10 +126,10 @@ def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
     Raises:
         InvalidInput: if the mesh encloses no volume.
     """
-    from osfcore.objects.collision import convex_parts
+    from osfcore.convex import convex_parts
     from osfcore.objects.resting import resting_poses
 
-    parts = convex_parts(mesh)
+    parts = convex_parts(mesh.vertices, mesh.faces)
     return ObjectAsset(info, mesh, parts, resting_poses(parts))
 
 

@@ -1,6 +1,7 @@
 import pytest
 
-from osfcore.dynamics.shapes import ShapeTable, object_shape
+from osfcore.dynamics.library import load_shapes
+from osfcore.dynamics.shapes import ShapeTable
 from osfcore.fields.library import FieldLibrary
 from tests.core.dynamics.scenes import NAMES
 
@@ -8,8 +9,7 @@ from tests.core.dynamics.scenes import NAMES
 @pytest.fixture(scope="session")
 def shapes():
     """Four real objects."""
-    library = FieldLibrary(None)
-    return {name: object_shape(library.load(name)) for name in NAMES}
+    return load_shapes(None, FieldLibrary(None), NAMES)
 
 
 @pytest.fixture(scope="session")

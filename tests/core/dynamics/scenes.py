@@ -1,12 +1,14 @@
 """Scenes to push things around in: real shapes on the table, and networks that have learned nothing."""
 
+import itertools
+
 import numpy as np
 import torch
 
 from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
 from osfcore.dynamics.network import PropagationNetwork
 from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
-from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
 from osfcore.dynamics.unroll import unroll
 from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate
 from osfcore.pushfile import PushEpisode
@@ -18,6 +20,27 @@ BOX, CAN, GELATIN, APPLE = NAMES = ("003_cracker_box", "005_tomato_soup_can", "0
 def hull(shape) -> np.ndarray:
     """Points whose convex hull is the shape's, around its centre of mass (P, 3) [m]."""
     return np.unique(shape.support, axis=0).astype(float)
+
+
+def boxes(*parts) -> ObjectShape:
+    """Boxes, each given as centre and half its sides, as the convex parts of one object; a single box is convex."""
+    corners = [np.array(list(itertools.product(*zip(np.subtract(c, h), np.add(c, h), strict=True)))) for c, h in parts]
+    points = np.concatenate(corners)
+    maps = [support_map(part) for part in corners]
+    radius = float(np.linalg.norm(points, axis=1).max())
+    return ObjectShape(
+        np.ptp(points, axis=0) / 2, np.zeros(3), radius, support_map(points), tuple(maps if len(maps) > 1 else ())
+    )
+
+
+def support_map(corners) -> np.ndarray:
+    """The farthest corner in each direction."""
+    return corners[np.argmax(octahedral_directions(MAP_SIDE) @ corners.T, axis=1)].astype(np.float32)
+
+
+def angle_bracket() -> ObjectShape:
+    """Two arms along +x and +y that share an end, 12 cm long, 4 cm wide and high: the corner between them is free."""
+    return boxes(((0.04, 0.0, 0.0), (0.06, 0.02, 0.02)), ((0.0, 0.04, 0.0), (0.02, 0.06, 0.02)))
 
 
 def on_table(shape, x: float, y: float, turn=(0.0, 0.0, 0.0)) -> Pose:

@@ -4,7 +4,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.graph import PAIR_REACH_M, TOUCH_M, TRAVEL_M, adjacency, build_graph
+from osfcore.dynamics.contact import PAIR_REACH_M, TOUCH_M
+from osfcore.dynamics.graph import TRAVEL_M, adjacency, build_graph
 from osfcore.dynamics.motion import Motion, Sweep
 from osfcore.scene import PUSHER_RADIUS_M
 from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, crowd, moved_state, scene, start, sweep_of
@@ -55,7 +56,7 @@ def test_what_the_push_can_reach_is_in_the_graph_and_nothing_else(shapes, table)
 def test_pushing_the_other_way_leaves_nothing_in_the_graph(shapes, table):
     state = scene(shapes, {CAN: (0.08, 0.0), GELATIN: (0.16, -0.02)})
     graph = graph_of(table, shapes, state, velocity=(-0.3, 0.0))
-    assert len(graph.scene) == len(graph.receiver) == len(graph.pair.distance) == 0
+    assert len(graph.scene) == len(graph.receiver) == len(graph.pair.gap.distance) == 0
 
 
 def test_neighbours_that_rest_are_in_no_graph_although_they_touch_each_other(shapes, table):
@@ -80,11 +81,12 @@ def test_pairs_come_in_both_orders_and_mirror_each_other(shapes, table):
     assert torch.equal(graph.receiver[:half], graph.sender[half:])
     assert torch.equal(graph.sender[:half], graph.receiver[half:])
     assert (graph.receiver != graph.sender).all()
-    torch.testing.assert_close(graph.pair.distance[:half], graph.pair.distance[half:])
-    torch.testing.assert_close(graph.pair.normal[:half], -graph.pair.normal[half:])
-    assert (graph.pair.distance < PAIR_REACH_M).all()
-    between = graph.pair.point[half:] - graph.pair.point[:half]
-    torch.testing.assert_close(between, graph.pair.distance[:half, None] * graph.pair.normal[:half])
+    torch.testing.assert_close(graph.pair.gap.distance[:half], graph.pair.gap.distance[half:])
+    torch.testing.assert_close(graph.pair.gap.normal[:half], -graph.pair.gap.normal[half:])
+    torch.testing.assert_close(graph.pair.first_face[:half], graph.pair.second_face[half:])
+    assert (graph.pair.gap.distance < PAIR_REACH_M).all()
+    between = graph.pair.gap.point[half:] - graph.pair.gap.point[:half]
+    torch.testing.assert_close(between, graph.pair.gap.distance[:half, None] * graph.pair.gap.normal[:half])
 
 
 @pytest.mark.parametrize("away", [0.002, 0.006, 0.011, 0.02])
@@ -95,8 +97,8 @@ def test_a_can_is_touched_where_the_sweep_comes_close(shapes, table, away):
     graph = graph_of(table, shapes, state)
     assert (len(graph.scene) == 1) == (away < TOUCH_M)
     if len(graph.scene):
-        assert float(graph.halfway.distance) == pytest.approx(away, abs=1e-3)
-        torch.testing.assert_close(graph.halfway.normal, torch.tensor([[0.0, -1.0]]), atol=0.05, rtol=0)
+        assert float(graph.pusher.halfway.distance) == pytest.approx(away, abs=1e-3)
+        torch.testing.assert_close(graph.pusher.halfway.normal, torch.tensor([[0.0, -1.0]]), atol=0.05, rtol=0)
 
 
 @given(angle=st.floats(-3.1, 3.1), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
@@ -109,8 +111,8 @@ def test_in_the_headings_frame_a_scene_looks_the_same_wherever_it_is(shapes, tab
         assert torch.equal(getattr(here, part), getattr(there, part))
     for part in ("rotation", "centre", "outline", "shift"):
         torch.testing.assert_close(getattr(here, part), getattr(there, part), atol=1e-5, rtol=0)
-    for part in ("before", "halfway", "after", "pair"):
-        torch.testing.assert_close(getattr(here, part).distance, getattr(there, part).distance, atol=1e-5, rtol=0)
+    for gap, same in zip((*here.pusher[:3], here.pair.gap), (*there.pusher[:3], there.pair.gap), strict=True):
+        torch.testing.assert_close(gap.distance, same.distance, atol=1e-5, rtol=0)
 
 
 def test_scenes_side_by_side_do_not_meet(shapes, table):

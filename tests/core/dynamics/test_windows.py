@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from osfcore.dynamics.library import load_shapes
 from osfcore.dynamics.pusher import SUBSTEPS
-from osfcore.dynamics.shapes import ShapeTable, object_shape
+from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.unroll import unroll
 from osfcore.dynamics.windows import batch, record
 from osfcore.errors import InvalidInput
@@ -135,8 +136,7 @@ def test_real_collections_can_be_learned_from(library, tmp_path):
     config = CollectPushes(tmp_path / "a.h5", episodes=2, steps=8, policy="directed")
     list(collect_pushes(config, library))
     episodes = read_pushes(config.out)
-    fields = FieldLibrary(None)
-    shapes = {name: object_shape(fields.load(name)) for e in episodes for name in e.names}
+    shapes = load_shapes(None, FieldLibrary(None), {name for e in episodes for name in e.names})
     recording = record(episodes, shapes, 3)
     assert len(recording.starts) == 12
     assert recording.is_busy.any()

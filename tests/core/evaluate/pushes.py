@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from osfcore.dynamics.shapes import object_shape
+from osfcore.dynamics.library import load_shapes
 from osfcore.fields.library import FieldLibrary
 from osfcore.poses import quaternion_exp
 from osfcore.pushfile import PushEpisode
@@ -13,7 +13,7 @@ STEPS = 34
 
 def shapes():
     library = FieldLibrary(None)
-    return {name: object_shape(library.load(name)) for name in NAMES}
+    return load_shapes(None, library, NAMES)
 
 
 def episode(*, speed: float = 0.0, turn: float = 0.0, names: tuple[str, ...] = NAMES) -> PushEpisode:

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from osfcore.dynamics.rollout import PushModel
-from osfcore.dynamics.shapes import object_shape
-from osfcore.dynamics.weights import read_network, shipped
+from osfcore.dynamics.library import load_push_model
 from osfcore.evaluate.images import psnr
 from osfcore.evaluate.visual_prediction import VisualPrediction, predicted_states, show_prediction
 from osfcore.fields.library import FieldLibrary
@@ -24,8 +22,7 @@ def prediction(library):
     world.arrange(3)
     state = world.truth()
     world.close()
-    fields = FieldLibrary(None)
-    model = PushModel(read_network(shipped()), {name: object_shape(fields.load(name)) for name in NAMES})
+    model = load_push_model(None, FieldLibrary(None), NAMES)
     away = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
     actions = np.zeros((1, 2, 3))
     actions[..., :2] = 0.1 * away / np.linalg.norm(away)

@@ -1,11 +1,10 @@
-"""Convex parts that together fill an object: what the physics touches."""
+"""Convex parts that together fill an object: what the physics, and the prediction of pushes, touches."""
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from osfcore.errors import InvalidInput
-from osfcore.objects.asset import TexturedMesh
 
 MAX_PARTS = 16
 MAX_VERTICES = 64
@@ -15,21 +14,24 @@ _SHALLOW = 0.07  # dents of this share of the longest side: the rims of cans, th
 _SAMPLES = 20_000
 
 
-def convex_parts(mesh: TexturedMesh, concavity: float = CONCAVITY) -> tuple[Float[np.ndarray, "M 3"], ...]:
+def convex_parts(
+    vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], concavity: float = CONCAVITY
+) -> tuple[Float[np.ndarray, "M 3"], ...]:
     """Vertices of convex parts, at most 16 of at most 64 vertices; the same for the same mesh.
 
     Bodies with shallow dents only, such as cans, are one part: coacd would spend many on the rim of a lid.
 
     Args:
-        mesh: in the object frame; holes in it are closed first.
+        vertices: of a mesh in the object frame [m].
+        faces: its triangles; holes are closed first.
         concavity: how far a part may bulge over the true surface, relative to the object's size.
 
     Raises:
         InvalidInput: if no part with a volume comes out.
     """
-    vertices, faces = np.asarray(mesh.vertices, float), mesh.faces
+    vertices = np.asarray(vertices, float)
     longest = float(np.ptp(vertices, axis=0).max())
-    is_shallow = dent_depth_m(mesh) <= _SHALLOW * longest
+    is_shallow = dent_depth_m(vertices, faces) <= _SHALLOW * longest
     clouds = [vertices] if is_shallow else _decomposed(vertices, faces, concavity)
     hulls = [reduced_hull(cloud) for cloud in clouds]
     solid = tuple(hull.astype(np.float32) for hull in hulls if hull is not None)
@@ -38,19 +40,19 @@ def convex_parts(mesh: TexturedMesh, concavity: float = CONCAVITY) -> tuple[Floa
     return solid
 
 
-def dent_depth_m(mesh: TexturedMesh) -> float:
+def dent_depth_m(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"]) -> float:
     """How far the convex hull's surface lies from the mesh [m], for all but the deepest hundredth of it."""
     import trimesh
     from scipy.spatial import KDTree
 
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    body = trimesh.Trimesh(vertices, faces, process=False)
     try:
-        hull = trimesh.Trimesh(mesh.vertices, ConvexHull(mesh.vertices).simplices, process=False)
+        hull = trimesh.Trimesh(vertices, ConvexHull(vertices).simplices, process=False)
     except QhullError as error:
         raise InvalidInput("mesh", "without volume", "a solid body") from error
     surface = trimesh.sample.sample_surface(body, _SAMPLES, seed=0)[0]
     around = trimesh.sample.sample_surface(hull, _SAMPLES // 4, seed=0)[0]
-    return float(np.percentile(KDTree(np.concatenate([surface, mesh.vertices])).query(around)[0], 99))
+    return float(np.percentile(KDTree(np.concatenate([surface, vertices])).query(around)[0], 99))
 
 
 def _decomposed(
