@@ -111,7 +111,11 @@ def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectSh
             (true_p[end], true_q[end], _TRUE),
             (ours_p[end - 1], ours_q[end - 1], _PREDICTED),
         ):
-            cv2.polylines(cell, [pixels(_outline(shapes[name], p, q))], True, colour, 1, cv2.LINE_AA)
+            mask = np.zeros(cell.shape[:2], np.uint8)
+            for part in _outlines(shapes[name], p, q):
+                cv2.fillConvexPoly(mask, pixels(part), 1)
+            edges = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+            cv2.polylines(cell, edges, True, colour, 1, cv2.LINE_AA)
         cv2.polylines(cell, [pixels(true_p[: end + 1, :2])], False, _TRUE, 1, cv2.LINE_AA)
         path = np.concatenate([true_p[:1, :2], ours_p[:end, :2]])
         cv2.polylines(cell, [pixels(path)], False, _PREDICTED, 1, cv2.LINE_AA)
@@ -125,10 +129,12 @@ def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectSh
     return cell
 
 
-def _outline(
+def _outlines(
     shape: ObjectShape, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "K 2"]:
-    """An object from above [m]."""
-    rotation = torch.as_tensor(quaternion_to_matrix(quaternion), dtype=torch.float32)[None]
-    centre = torch.as_tensor(position + rotate(quaternion, shape.centre), dtype=torch.float32)[None]
-    return outlines(ShapeTable((shape,)), torch.zeros(1, dtype=torch.long), rotation, centre)[0].numpy()
+) -> Float[np.ndarray, "R K 2"]:
+    """An object's convex parts from above [m]."""
+    table = ShapeTable((shape,))
+    body = table.first_part[0] + torch.arange(int(table.part_count[0]))
+    rotation = torch.as_tensor(quaternion_to_matrix(quaternion), dtype=torch.float32)
+    centre = torch.as_tensor(position + rotate(quaternion, shape.centre), dtype=torch.float32)
+    return outlines(table, body, rotation.expand(len(body), 3, 3), centre.expand(len(body), 3)).numpy()
