@@ -33,6 +33,7 @@ ROOMS = (
     "render",
     "estimate",
     "dynamics",
+    "plan",
     "baselines",
     "objects",
     "world",
