@@ -106,7 +106,7 @@ class TrainDynamicsCommand:
     """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
     iterations: int = 26_000
     """Steps of descent on single substeps, at most."""
-    long_iterations: int = 1_500
+    long_iterations: int = 500
     """Steps of descent on windows of three actions, after these."""
     patience: int = 20
     """Measurements on held-out episodes without a better one after which training stops."""

@@ -77,7 +77,7 @@ class TrainDynamics:
     out: Path
     iterations: int = 26_000
     batch: int = 512
-    long_iterations: int = 1_500
+    long_iterations: int = 500
     long_batch: int = 96
     hidden: int = 192
     rate: float = 4e-3
