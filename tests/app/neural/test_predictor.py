@@ -71,7 +71,7 @@ def test_models_are_kept_until_a_field_changes_and_order_does_not_matter(fields_
     assert oracle.answer(PredictPushes("a", both, TOWARD)).rollouts.names == (BOX, other)
     write_box(tmp_path / "own", BOX, 2 * SIZE_M, (0.1, 0.1, 0.1))
     assert oracle._model((BOX, other)) is not first
-    (tmp_path / "own" / "dynamics").mkdir()
+    (tmp_path / "own" / "dynamics").mkdir(exist_ok=True)
     (tmp_path / "own" / "dynamics" / "pushes.safetensors").write_bytes(b"broken")
     with pytest.raises(CorruptFile):
         oracle._model((BOX, other))

@@ -85,6 +85,6 @@ def test_places_that_cannot_be_read_or_written_are_told(tmp_path):
 
 
 def test_the_shipped_network_is_small_and_whole():
-    assert shipped().stat().st_size < 2_000_000
+    assert shipped().stat().st_size < 2_500_000
     assert read_network(shipped()).hidden >= 16
     assert shipped("else").name == "else.safetensors"
