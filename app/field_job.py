@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.field_files import clear_workshop, install, open_workshop
-from osfcore.errors import CannotWrite, OsfError
+from osfcore.errors import CannotWrite
 from osfcore.fields.library import FIELD_FILE, METRICS_FILE
 
 if TYPE_CHECKING:
@@ -71,8 +70,6 @@ def train_field_job(params: dict[str, Any], place: Place) -> Iterator[TrainingSt
             yield step
     install(shop, place.data_dir / "fields" / name)
     _offer(shop, place.folder, name)
-    yield replace(step, note="Finding its convex parts")
-    _prepare_shape(place.data_dir, name)
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
     clear_workshop(place.data_dir, name)
     yield replace(
@@ -129,15 +126,6 @@ def _offer(shop: Path, folder: Path, name: str) -> None:
             shutil.copyfile(shop / file, folder / f"{name}{Path(file).suffix}")
     except OSError as error:
         raise CannotWrite(folder, error.strerror or str(error)) from error
-
-
-def _prepare_shape(data_dir: Path, name: str) -> None:
-    """Keep what the first prediction would otherwise wait for."""
-    from osfcore.dynamics.library import load_shapes
-    from osfcore.fields.library import FieldLibrary
-
-    with contextlib.suppress(OsfError):  # a prediction will say what is wrong with it
-        load_shapes(data_dir, FieldLibrary(data_dir), [name])
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

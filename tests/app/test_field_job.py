@@ -11,12 +11,8 @@ import osfcore.fields.training as training
 from app.field_files import workshop
 from app.field_job import PREVIEW, train_field_job
 from app.job_process import Place
-from osfcore.dynamics.library import load_shapes
 from osfcore.errors import MissingAssets
-from osfcore.fields.library import FieldLibrary
-from osfcore.fields.weights import field_bytes
 from osfcore.progress import Progress
-from tests.core.dynamics.solids import bracket
 
 GELATIN = "009_gelatin_box"
 ORDER = {
@@ -27,9 +23,6 @@ ORDER = {
     "images": 60,
     "hollow": False,
 }
-
-
-WEIGHTS = field_bytes(bracket())
 
 
 @pytest.fixture
@@ -50,7 +43,7 @@ def trained(monkeypatch):
         preview = np.full((4, 12, 3), 200, np.uint8)
         yield training.FieldStep(Progress(15, 30, "20.0 dB held out, 15 s left"), 20.0, 15.0, preview)
         config.out.with_suffix(".partial").write_bytes(b"checkpoint")
-        config.out.write_bytes(WEIGHTS)
+        config.out.write_bytes(b"weights")
         config.out.with_suffix(".json").write_text(json.dumps({"psnr_full": 30.5, "psnr_mask": 25.5}))
         yield training.FieldStep(Progress(30, 30, "Done"), 30.5, 25.5, preview)
 
@@ -68,28 +61,13 @@ def test_from_a_mesh_images_are_taken_first_and_the_field_is_put_in_place(place,
     assert (halfway.previews, halfway.note[-4:]) == (1, "left")
     assert (steps[-1].psnr_full, steps[-1].psnr_mask, steps[-1].previews) == (30.5, 25.5, 2)
     installed = place.data_dir / "fields" / GELATIN
-    assert (installed / "field.safetensors").read_bytes() == WEIGHTS
+    assert (installed / "field.safetensors").read_bytes() == b"weights"
     assert {path.name for path in installed.iterdir()} == {"field.safetensors", "field.json"}
     with Image.open(place.folder / PREVIEW) as preview:
         assert preview.size == (12, 4)
     assert not workshop(place.data_dir, GELATIN).exists()
     assert (trained[0].minutes, trained[0].seed) == (0.5, 3)
     json.dumps(dataclasses.asdict(steps[-1]))
-
-
-@pytest.mark.usefixtures("trained")
-def test_the_first_prediction_need_not_cut_the_field_into_parts(place, monkeypatch):
-    list(train_field_job(ORDER, place))
-    monkeypatch.setattr("osfcore.dynamics.library.field_parts", lambda _: pytest.fail("made again"))
-    shape = load_shapes(place.data_dir, FieldLibrary(place.data_dir), [GELATIN])[GELATIN]
-    assert len(shape.parts) >= 2
-
-
-@pytest.mark.usefixtures("trained")
-def test_a_field_that_cannot_be_cut_is_put_in_place_all_the_same(place, monkeypatch):
-    monkeypatch.setattr("tests.app.test_field_job.WEIGHTS", b"weights")
-    assert list(train_field_job(ORDER, place))[-1].note == "Done"
-    assert (place.data_dir / "fields" / GELATIN / "field.safetensors").is_file()
 
 
 def test_after_a_kill_the_same_order_uses_the_images_that_are_there(place, trained):
