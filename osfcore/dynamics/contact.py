@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from osfcore.dynamics.outline import Gap, circle, direction_index, gap_between, gap_to_point
 from osfcore.dynamics.shapes import ShapeTable
+from osfcore.poses import Pose, quaternion_to_matrix
 from osfcore.scene import PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 
 OUTLINE = 64  # corners of an outline
@@ -77,6 +79,14 @@ def outlines(
     """Outlines of bodies seen from above [m]."""
     flat = torch.nn.functional.pad(circle(OUTLINE, centre.device), (0, 1))
     return table.farthest(body, rotation, flat)[..., :2] + centre[:, None, :2]
+
+
+def part_outlines(table: ShapeTable, number: int, pose: Pose) -> Float[np.ndarray, "R K 2"]:
+    """Outlines of one object's convex parts, seen from above [m]."""
+    body = table.first_part[number] + torch.arange(int(table.part_count[number]))
+    rotation = torch.as_tensor(quaternion_to_matrix(pose.quaternion), dtype=torch.float32)
+    centre = torch.as_tensor(pose.apply(table.centre[number].numpy()), dtype=torch.float32)
+    return outlines(table, body, rotation.expand(len(body), 3, 3), centre.expand(len(body), 3)).numpy()
 
 
 def solids(

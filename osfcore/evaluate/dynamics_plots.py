@@ -7,16 +7,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
-from osfcore.dynamics.contact import outlines
+from osfcore.dynamics.contact import part_outlines
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.evaluate.charts import Axis, Curve, chart, round_limit, side_by_side
 from osfcore.evaluate.dynamics_report import DynamicsReport, Scored
 from osfcore.evaluate.dynamics_scores import HORIZONS
 from osfcore.evaluate.images import put_text, write_png
-from osfcore.poses import quaternion_to_matrix, rotate
+from osfcore.poses import Pose
 from osfcore.scene import PUSHER_RADIUS_M
 
 GALLERY_HORIZON = 10  # actions
@@ -112,7 +111,7 @@ def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectSh
             (ours_p[end - 1], ours_q[end - 1], _PREDICTED),
         ):
             mask = np.zeros(cell.shape[:2], np.uint8)
-            for part in _outlines(shapes[name], p, q):
+            for part in part_outlines(ShapeTable((shapes[name],)), 0, Pose(p, q)):
                 cv2.fillConvexPoly(mask, pixels(part), 1)
             edges = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
             cv2.polylines(cell, edges, True, colour, 1, cv2.LINE_AA)
@@ -127,14 +126,3 @@ def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectSh
     put_text(cell, title, (6, 16), _CELL_PX - 12)
     cv2.rectangle(cell, (0, 0), (_CELL_PX - 1, _CELL_PX - 1), _START, 1)
     return cell
-
-
-def _outlines(
-    shape: ObjectShape, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "R K 2"]:
-    """An object's convex parts from above [m]."""
-    table = ShapeTable((shape,))
-    body = table.first_part[0] + torch.arange(int(table.part_count[0]))
-    rotation = torch.as_tensor(quaternion_to_matrix(quaternion), dtype=torch.float32)
-    centre = torch.as_tensor(position + rotate(quaternion, shape.centre), dtype=torch.float32)
-    return outlines(table, body, rotation.expand(len(body), 3, 3), centre.expand(len(body), 3)).numpy()

@@ -11,14 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
-from osfcore.dynamics.contact import outlines
+from osfcore.dynamics.contact import part_outlines
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.plan.goals import PoseGoal
 from osfcore.plan.travel import CLEARANCE_M, FreeSpace, actions_along
-from osfcore.poses import quaternion_to_matrix, rotate
 from osfcore.scene import PUSHER_RADIUS_M, PUSHER_REACH_M, SceneState
 
 _DONE_M = 0.004  # an object this close to its goal is not pushed on purpose
@@ -38,7 +36,6 @@ class Proposals:
 
     def __init__(self, shapes: Mapping[str, ObjectShape]) -> None:
         self._tables = {name: ShapeTable((shape,)) for name, shape in shapes.items()}
-        self._centres = {name: shape.centre for name, shape in shapes.items()}
 
     def draw(
         self, state: SceneState, goal: PoseGoal, each: int, horizon: int, rng: np.random.Generator
@@ -53,7 +50,7 @@ class Proposals:
             rng: draws angles, offsets, lengths and speeds.
         """
         assert state.pusher is not None
-        parts = [self._outlines(state, name) for name in state.names]
+        parts = [part_outlines(self._tables[name], 0, state.pose(name)).astype(float) for name in state.names]
         space = FreeSpace([outline for outlines_of in parts for outline in outlines_of])
         starts, ends = [], []
         for offset, outlines_of in zip(goal.offsets_m(state), parts, strict=True):
@@ -71,15 +68,6 @@ class Proposals:
             speeds = np.append(np.ones(len(way) - 1), rng.uniform(*_SPEEDS))
             sequences.append(actions_along(np.vstack([way, end]), horizon, speeds))
         return np.array(sequences)
-
-    def _outlines(self, state: SceneState, name: str) -> Float[np.ndarray, "R K 2"]:
-        """An object's convex parts seen from above [m]."""
-        table, pose = self._tables[name], state.pose(name)
-        body = table.first_part[0] + torch.arange(int(table.part_count[0]))
-        rotation = torch.as_tensor(quaternion_to_matrix(pose.quaternion), dtype=torch.float32)
-        centre = pose.position + rotate(pose.quaternion, self._centres[name])
-        placed = torch.as_tensor(centre, dtype=torch.float32).expand(len(body), 3)
-        return outlines(table, body, rotation.expand(len(body), 3, 3), placed).numpy().astype(float)
 
 
 def _pushes(
