@@ -30,6 +30,11 @@ class Rollouts:
     quaternions: Float[np.ndarray, "K T1 N 4"]
     pusher: Float[np.ndarray, "K T1 3"]
 
+    def __getitem__(self, sequence: int) -> Rollouts:
+        """One sequence alone, K = 1."""
+        k = slice(sequence, sequence + 1)
+        return Rollouts(self.names, self.positions[k], self.quaternions[k], self.pusher[k])
+
 
 def check_actions(actions: object) -> Float[np.ndarray, "K T 3"]:
     """Sequences of actions that can be rolled out.

@@ -24,16 +24,17 @@ _FOLDER = "evaluation"  # of the data directory
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure trained fields, the estimators that use them, or predicted pushes, on what nothing was trained on.
+    """Measure fields, the estimators that use them, predicted pushes, or whole episodes, on what was never trained on.
 
     fields: each object alone on unseen views under unseen lights, and scenes of several. estimate: poses and light
     from first frames, along pushes without masks and of goals, what each ingredient is worth, and spoiled inputs.
     dynamics: predicted pushes of two to six objects against the simulator, against a quasi-static model, and against
     the constant pose; objects and pairs of objects that training never saw.
+    mpc: tables that shall become what a goal image shows, in 30 pushes; the same planner told the truth; no action.
     Results are kept in the output folder: a killed evaluation goes on when started again, and may be run in pieces.
     """
 
-    what: tyro.conf.Positional[Literal["fields", "estimate", "dynamics"]]
+    what: tyro.conf.Positional[Literal["fields", "estimate", "dynamics", "mpc"]]
     """What to evaluate."""
     out: Path | None = None
     """Folder for results and pictures; DATA_DIR/evaluation by default."""
@@ -49,8 +50,12 @@ class Evaluate:
     """With estimate: what to measure; first frames are in any case."""
     bad: int = 0
     """With estimate: number of spoiled inputs (100 gives ten of each kind)."""
+    cost: Literal["pose", "image"] = "pose"
+    """With mpc: futures are compared with the goal's poses, or rendered and compared with the goal image."""
+    oracle: bool = True
+    """With mpc: also measure the planner that is told the truth."""
     workers: int = 2
-    """With dynamics: processes that simulate side by side."""
+    """With dynamics and mpc: processes that simulate side by side."""
     data: Path | None = None
     """With --weights: measure on the test images of this set in the OSF format instead of the simulator's."""
     weights: Path | None = None
@@ -64,6 +69,8 @@ class Evaluate:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
         if self.what == "dynamics":
             return self._dynamics()
+        if self.what == "mpc":
+            return self._mpc()
         last, show = self._estimates() if self.what == "estimate" else (follow(self._steps()), _show)
         assert last is not None
         assert last.report is not None, "the last step brings the report"
@@ -117,6 +124,26 @@ class Evaluate:
         assert last.report is not None, "the last step brings the report"
         if not self.json:
             _show_dynamics(config.folder, last.report)
+        return last.report
+
+    def _mpc(self) -> dict[str, Any]:
+        """Measure whole episodes."""
+        from osfcore.evaluate.mpc import EvaluateMpc, evaluate_mpc
+        from osfcore.fields.library import FieldLibrary
+        from osfcore.objects.library import AssetLibrary
+
+        if self.data is not None or self.weights is not None:
+            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
+        config = EvaluateMpc(
+            self._folder, self.data_dir, self.tasks, self.objects, self.seed, self.cost, self.names, self.oracle
+        )
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        with worker_pool(self.workers) as executor:
+            last = follow(evaluate_mpc(config, fields, assets, executor))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        if not self.json:
+            _show_mpc(config.folder, last.report)
         return last.report
 
 
@@ -196,6 +223,31 @@ def _show_dynamics(folder: Path, result: dict[str, Any]) -> None:
         )
         print(f"Objects never seen ({', '.join(result['unseen_objects'])}): {told}")
     print(f"{result['rollout_steps_per_s']} steps of scenes a second. Pictures and figures: {folder}")
+
+
+def _show_mpc(folder: Path, result: dict[str, Any]) -> None:
+    """The report for people, a line for each part."""
+    low, high = result["success_2cm_interval"]
+    print(
+        f"{result['tasks']} tasks with {result['objects']} objects, {result['cost']} cost: "
+        f"{_percent(result['success_2cm'])} within 2 cm ({100 * low:.0f} to {_percent(high)}), "
+        f"{_percent(result['success_2cm_15deg'])} also within 15 deg."
+    )
+    moved = ", ".join(f"{_percent(share)} of {count}" for count, share in result["success_by_moved"].items())
+    print(f"By number of objects that had to move: {moved}.")
+    print(
+        f"These end {_number(result['final_mm_mean'])} mm from their goals (median {_number(result['final_mm_median'])} "
+        f"mm, {_number(result['final_deg_median'])} deg), from {_number(result['start_mm_mean'])} mm."
+    )
+    if result["oracle_success_2cm"] is not None:
+        print(
+            f"Told the truth, the same planner: {_percent(result['oracle_success_2cm'])}, "
+            f"{_number(result['oracle_final_mm_mean'])} mm."
+        )
+    print(
+        f"A plan takes {_number(result['replan_s_median'])} s, an estimate {_number(result['estimate_s_median'], 2)} s, "
+        f"an episode {_number(result['episode_s_median'], 0)} s. Pictures and figures: {folder}"
+    )
 
 
 def _errors(row: dict[str, Any]) -> str:

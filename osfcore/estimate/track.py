@@ -31,6 +31,8 @@ from osfcore.poses import Pose
 from osfcore.progress import Progress
 from osfcore.scene import Observation, SceneState
 
+_ALLOWANCE, _MOST_USUAL = 1.25, 0.06  # times what is usual, which is no more than this [radiance]
+
 
 @dataclass(frozen=True, slots=True)
 class TrackEffort:
@@ -73,9 +75,18 @@ class TrackEffort:
     reach: float = 0.03
 
 
+def usual_residuals(models: Models, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
+    """By how much each object's images differ from what is rendered where it stands [radiance].
+
+    Fields err, some more than others and more under some lights: what is normal here tells later what is not.
+    """
+    return object_residuals(gather(models, views_of(observation, FINE_SIDE, samples=2),
+                                   Guess.of(state, observation.pusher)))  # fmt: skip
+
+
 def estimate_next(
     models: Models, observation: Observation, expected: SceneState, rng: np.random.Generator,
-    effort: TrackEffort | None = None,
+    effort: TrackEffort | None = None, usual: Float[np.ndarray, "N"] | None = None,
 ) -> Iterator[EstimateStep]:  # fmt: skip
     """Find poses again; the last step holds the estimate.
 
@@ -85,6 +96,7 @@ def estimate_next(
         expected: the last estimate, or what was predicted from it, with the light as last estimated.
         rng: of the search.
         effort: how much work to do.
+        usual: residuals that are normal for these objects here, see `usual_residuals`; none are expected by default.
 
     Raises:
         InvalidInput: if the expected state is of other objects.
@@ -93,7 +105,8 @@ def estimate_next(
     models.check(observation.names)
     if expected.names != observation.names:
         raise InvalidInput("objects of the expected state", ", ".join(expected.names), ", ".join(observation.names))
-    yield from _Track(models, observation, expected, rng, effort or TrackEffort()).steps()
+    allowed = np.zeros(len(expected.names)) if usual is None else _ALLOWANCE * np.minimum(usual, _MOST_USUAL)
+    yield from _Track(models, observation, expected, rng, effort or TrackEffort(), allowed).steps()
 
 
 class _Track:
@@ -101,8 +114,9 @@ class _Track:
 
     def __init__(
         self, models: Models, observation: Observation, expected: SceneState, rng: np.random.Generator,
-        effort: TrackEffort,
+        effort: TrackEffort, allowed: Float[np.ndarray, "N"],
     ) -> None:  # fmt: skip
+        self._allowed = allowed
         self._models, self._rng, self._effort = models, rng, effort
         self._guess = Guess.of(expected, observation.pusher)
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
@@ -121,7 +135,7 @@ class _Track:
         if before.surroundings > self._effort.lamp_above:
             at = yield from self._search_light(at)
             before = self._at_half(at.guess)
-        misfit = object_residuals(before) > self._effort.stays_below
+        misfit = object_residuals(before) > np.maximum(self._effort.stays_below, self._allowed)
         if misfit.any():
             at = yield from self._descend(at, misfit, self._coarse, 1)
             misfit &= self._misfits(at.guess)
@@ -145,7 +159,7 @@ class _Track:
 
     def _misfits(self, guess: Guess) -> Bool[np.ndarray, "N"]:
         """Which objects do not fit where they were found."""
-        return object_residuals(self._at_half(guess)) > self._effort.fits_below
+        return object_residuals(self._at_half(guess)) > np.maximum(self._effort.fits_below, self._allowed)
 
     def _search_light(self, at: Descent) -> Iterator[EstimateStep]:  # returns the Descent
         """The light that explains the images with the objects as expected, if it does so far better than the last."""
@@ -254,7 +268,7 @@ class _Track:
         return at
 
     def _fine_misfits(self, guess: Guess) -> Bool[np.ndarray, "N"]:
-        return object_residuals(self._closely(guess)) > self._effort.fits_finely_below
+        return object_residuals(self._closely(guess)) > np.maximum(self._effort.fits_finely_below, self._allowed)
 
     def _closely(self, guess: Guess) -> Evidence:
         """How well a guess explains the fine images; they are rendered again only for another guess."""

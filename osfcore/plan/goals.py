@@ -48,9 +48,17 @@ class PoseGoal:
         for name in moved:
             if name not in state.names:
                 raise InvalidInput("object of the goal", name, f"one of {', '.join(state.names)}")
-        poses = [moved.get(name) or state.pose(name) for name in state.names]
-        positions, quaternions = ([getattr(pose, part) for pose in poses] for part in ("position", "quaternion"))
-        return PoseGoal(state.names, Pose(np.array(positions), np.array(quaternions)))
+        return PoseGoal(state.names, state.poses).replaced(moved)
+
+    def pose(self, name: str) -> Pose:
+        """Where one object should be."""
+        return self.poses[self.names.index(name)]
+
+    def replaced(self, poses: Mapping[str, Pose]) -> PoseGoal:
+        """The goal with some objects elsewhere."""
+        every = [poses.get(name) or self.pose(name) for name in self.names]
+        positions, quaternions = ([getattr(pose, part) for pose in every] for part in ("position", "quaternion"))
+        return PoseGoal(self.names, Pose(np.array(positions), np.array(quaternions)))
 
     def offsets_m(self, state: SceneState) -> Float[np.ndarray, "N 2"]:
         """How far each object has to go, horizontally, in the order of the state [m]."""

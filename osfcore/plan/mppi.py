@@ -2,13 +2,14 @@
 
 Deviations: sequences are not drawn around the last plan alone but from three sources (the last plan, pushes worth
 trying, random walks), and the softmax average is taken over a second round, drawn around the best of the first: the
-average of a way around the left and one around the right leads into the object.
+average of a way around the left and one around the right leads into the object. Noise is added to the pusher's path, not to its velocity, so that
+what comes late in a sequence is disturbed no more than what comes early.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,9 @@ from osfcore.errors import InvalidInput
 from osfcore.plan.goals import Cost, PoseGoal
 from osfcore.plan.proposals import Proposals
 from osfcore.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts
-from osfcore.scene import MAX_SPEED_M_S, SceneState
+from osfcore.scene import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S, SceneState
+
+_WALK_M = 0.06  # noise of random walks
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
 
@@ -30,15 +33,15 @@ class PlanSettings:
         samples: sequences of actions in each of both rounds (K).
         horizon: actions in each (T).
         temperature: of the softmax, as a share of the spread of costs in the better half of the second round.
-        noise_m_s: sigma of velocities around the plan [m/s].
-        knots: velocities drawn per sequence, with straight lines between them.
+        noise_m: sigma of the pusher's path around the plan [m].
+        knot_every: actions between the places where the noise is drawn, with straight lines between them.
     """
 
-    samples: int = 192
-    horizon: int = 15
-    temperature: float = 0.15
-    noise_m_s: float = 0.06
-    knots: int = 5
+    samples: int = 128
+    horizon: int = 25
+    temperature: float = 0.03
+    noise_m: float = 0.008
+    knot_every: int = 3
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -50,8 +53,8 @@ class PlanSettings:
             ("number of samples", self.samples, 8, MAX_SEQUENCES),
             ("horizon [actions]", self.horizon, 1, MAX_HORIZON),
             ("temperature", self.temperature, 1e-6, 1e6),
-            ("noise [m/s]", self.noise_m_s, 0.0, MAX_SPEED_M_S),
-            ("number of knots", self.knots, 1, MAX_HORIZON),
+            ("noise [m]", self.noise_m, 0.0, PUSHER_REACH_M),
+            ("actions between knots", self.knot_every, 1, MAX_HORIZON),
         ):
             if not low <= value <= high:
                 raise InvalidInput(what, value, f"between {low} and {high}")
@@ -63,17 +66,20 @@ class PlanRound:
 
     Attributes:
         number: of the round, from 0.
-        actions: the plan so far [m/s].
-        cost: of the best sequence so far.
+        actions: the plan so far [m/s]: the best sequence of the first round, the softmax average of the second.
         rollouts: all futures of the round.
         costs: theirs.
     """
 
     number: int
     actions: Float[np.ndarray, "T 3"]
-    cost: float
     rollouts: Rollouts
     costs: Float[np.ndarray, "K"]
+
+    @property
+    def best(self) -> Rollouts:
+        """The future of the sequence that costs least, K = 1; the plan's own lies close to it."""
+        return self.rollouts[int(self.costs.argmin())]
 
 
 class Planner:
@@ -93,6 +99,11 @@ class Planner:
     def forget(self) -> None:
         """Begin anew: the goal or the scene is another one."""
         self._last = None
+
+    def upcoming(self, count: int) -> Float[np.ndarray, "count 3"]:
+        """The next actions of the last plan; at rest after its end, and where there is no plan [m/s]."""
+        plan = np.zeros((0, 3)) if self._last is None else self._last[:count]
+        return np.concatenate([plan, np.zeros((count - len(plan), 3))])
 
     def executed(self, count: int) -> None:
         """The first actions of the last plan have been taken."""
@@ -117,27 +128,32 @@ class Planner:
             before: the same objects one action ago.
         """
         first = self._first_round(state, goal, rng)
-        rollouts = self._rollout(state, first, before)
+        round_ = self._scored(0, state, first, cost, before)
+        yield round_
+        second = self._around(round_.actions, self.settings.samples, rng, self.settings.noise_m)
+        round_ = self._scored(1, state, second, cost, before)
+        mean = np.einsum("k,kta->ta", _softmax(round_.costs, self.settings.temperature), second)
+        round_ = replace(round_, actions=mean)
+        self._last = round_.actions
+        yield round_
+
+    def _scored(
+        self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
+    ) -> PlanRound:
+        rollouts = self._rollout(state, actions, before)
         costs = cost(rollouts)
-        best = int(costs.argmin())
-        yield PlanRound(0, first[best], float(costs[best]), rollouts, costs)
-        second = self._around(first[best], self.settings.samples, rng)
-        rollouts = self._rollout(state, second, before)
-        costs = cost(rollouts)
-        mean = np.einsum("k,kta->ta", _softmax(costs, self.settings.temperature), second)
-        self._last = mean
-        yield PlanRound(1, mean, float(costs.min()), rollouts, costs)
+        return PlanRound(number, actions[int(costs.argmin())], rollouts, costs)
 
     def _first_round(self, state: SceneState, goal: PoseGoal, rng: np.random.Generator) -> Float[np.ndarray, "K T 3"]:
         """The last plan and some around it, pushes worth trying, and random walks."""
         settings = self.settings
         still = np.zeros((settings.horizon, 3))
         last = still if self._last is None else self._resized(self._last)
-        off = max(int((np.linalg.norm(goal.offsets_m(state), axis=1) > 0).sum()), 1)
-        pushes = self._proposals.draw(state, goal, max(settings.samples // (2 * off), 1), settings.horizon, rng)
-        rest = max(settings.samples - len(pushes) - 1, 2)
-        walks = self._around(still, rest // 3 + 1, rng, MAX_SPEED_M_S / 2)
-        return np.concatenate([self._around(last, rest - rest // 3, rng), pushes, walks])
+        share = settings.samples // 8
+        walks = self._around(still, share, rng, _WALK_M)
+        kept = self._around(last, share, rng, settings.noise_m)
+        pushes = self._proposals.draw(state, goal, settings.samples - 2 * share, settings.horizon, rng)
+        return np.concatenate([kept, walks, pushes])
 
     def _resized(self, plan: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:
         """The plan at today's horizon, which may have been changed since."""
@@ -145,18 +161,19 @@ class Planner:
         return np.concatenate([plan[:horizon], np.zeros((max(horizon - len(plan), 0), 3))])
 
     def _around(
-        self, plan: Float[np.ndarray, "T 3"], count: int, rng: np.random.Generator, noise_m_s: float | None = None
+        self, plan: Float[np.ndarray, "T 3"], count: int, rng: np.random.Generator, noise_m: float
     ) -> Float[np.ndarray, "K T 3"]:
-        """The plan itself, and sequences around it whose differences change slowly."""
-        settings = self.settings
-        noise = settings.noise_m_s if noise_m_s is None else noise_m_s
-        knots = rng.normal(0, noise, (count, settings.knots, 2))
+        """The plan itself, and sequences whose paths lie around its own."""
+        horizon, every = self.settings.horizon, self.settings.knot_every
+        knots = rng.normal(0, noise_m, (count, -(-horizon // every) + 1, 2))
         knots[0] = 0
-        place = np.linspace(0, settings.knots - 1, settings.horizon)
-        low = np.floor(place).astype(int).clip(0, max(settings.knots - 2, 0))
+        knots[:, 0] = 0  # the pusher is where it is
+        place = np.arange(horizon + 1) / every
+        low = np.floor(place).astype(int)
         share = (place - low)[:, None]
-        smooth = (1 - share) * knots[:, low] + share * knots[:, np.minimum(low + 1, settings.knots - 1)]
-        return (plan + np.pad(smooth, ((0, 0), (0, 0), (0, 1)))).clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
+        path = (1 - share) * knots[:, low] + share * knots[:, np.minimum(low + 1, knots.shape[1] - 1)]
+        velocity = np.pad(np.diff(path, axis=1) / STEP_S, ((0, 0), (0, 0), (0, 1)))
+        return (plan + velocity).clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
 
 
 def _softmax(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:

@@ -1,14 +1,16 @@
-"""Pushes worth trying: go around to the far side of an object, then push it toward its goal.
+"""Pushes worth trying: one object after another, each from its far side.
 
 Random velocities touch an object in one step of eight, so sampling alone rarely finds that the pusher has to walk
-around an object first. Each proposal is a whole sequence of actions: a way that touches nothing to a place behind an
-object, then a straight push at some angle, off its middle by some amount, about as far as it has to go. MPPI takes it
-from there.
+around an object first, let alone that three objects have to be pushed one after another. Each proposal is a whole
+sequence of actions: a way that touches nothing to a place behind an object, a straight push toward its goal at some
+angle, off its middle by some amount, about as far as it has to go; then the same with the next object, as if the first
+had arrived. All orders of the objects are tried. MPPI takes it from there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import islice, permutations
 
 import numpy as np
 from jaxtyping import Float
@@ -16,15 +18,17 @@ from jaxtyping import Float
 from osfcore.dynamics.contact import part_outlines
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.plan.goals import PoseGoal
-from osfcore.plan.travel import CLEARANCE_M, FreeSpace, actions_along
-from osfcore.scene import PUSHER_RADIUS_M, PUSHER_REACH_M, SceneState
+from osfcore.plan.pushes import Pushes, straight_pushes
+from osfcore.plan.travel import FreeSpace, Ways, actions_along, duration_s
+from osfcore.poses import Pose
+from osfcore.scene import PUSHER_REACH_M, STEP_S, SceneState
 
 _DONE_M = 0.004  # an object this close to its goal is not pushed on purpose
-_ANGLE_RAD = 0.2  # sigma of the push's direction around that of the goal
-_ASIDE = 0.2  # sigma of the push's offset from the middle, of half the object's breadth
-_LENGTHS = (0.6, 1.15)  # of the distance to go
 _SPEEDS = (0.4, 1.0)  # of the highest
-_SPARE_M = 0.003  # from the place behind an object to what must stay clear
+_ORDERS = 6  # all of three objects
+_SPARE = 3  # times as many pushes are drawn as needed: some begin where there is no room
+
+Outlines = list[Float[np.ndarray, "K 2"]]  # of an object's convex parts
 
 
 class Proposals:
@@ -38,55 +42,96 @@ class Proposals:
         self._tables = {name: ShapeTable((shape,)) for name, shape in shapes.items()}
 
     def draw(
-        self, state: SceneState, goal: PoseGoal, each: int, horizon: int, rng: np.random.Generator
+        self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "P T 3"]:
-        """Up to `each` pushes for every object that is off its goal; none where there is no room for the pusher.
+        """About `count` sequences; none where everything is where it should be or there is no room for the pusher.
 
         Args:
             state: of the scene, with its pusher.
             goal: where everything should be.
-            each: number of pushes an object.
+            count: of sequences.
             horizon: length of the sequences.
-            rng: draws angles, offsets, lengths and speeds.
+            rng: draws orders, angles, offsets, lengths and speeds.
         """
-        assert state.pusher is not None
-        parts = [part_outlines(self._tables[name], 0, state.pose(name)).astype(float) for name in state.names]
-        space = FreeSpace([outline for outlines_of in parts for outline in outlines_of])
-        starts, ends = [], []
-        for offset, outlines_of in zip(goal.offsets_m(state), parts, strict=True):
-            if np.linalg.norm(offset) > _DONE_M:
-                start, end = _pushes(np.concatenate(outlines_of), offset, each, rng)
-                clear = np.abs(start).max(axis=1) <= PUSHER_REACH_M
-                clear &= space.is_free(start)
-                starts.append(start[clear])
-                ends.append(end[clear])
-        if not sum(map(len, starts)):
+        offsets = goal.offsets_m(state)
+        off = [n for n, offset in enumerate(offsets) if np.linalg.norm(offset) > _DONE_M]
+        if not off:
             return np.zeros((0, horizon, 3))
-        behind, beyond = np.concatenate(starts), np.concatenate(ends).clip(-PUSHER_REACH_M, PUSHER_REACH_M)
-        sequences = []
-        for way, end in zip(space.ways(state.pusher[:2], behind), beyond, strict=True):
-            speeds = np.append(np.ones(len(way) - 1), rng.uniform(*_SPEEDS))
-            sequences.append(actions_along(np.vstack([way, end]), horizon, speeds))
-        return np.array(sequences)
+        here = [self._outlines(name, state.pose(name)) for name in state.names]
+        there = [self._outlines(name, goal.pose(name)) for name in state.names]
+        orders = _orders(off, rng)
+        chains = _Chains(state, here, there, offsets, horizon, rng)
+        each = -(-count // len(orders))
+        found = [actions for order in orders for actions in chains.draw(order, each)]
+        return np.array(found).reshape(-1, horizon, 3)
+
+    def _outlines(self, name: str, pose: Pose) -> Outlines:
+        return list(part_outlines(self._tables[name], 0, pose).astype(float))
 
 
-def _pushes(
-    outline: Float[np.ndarray, "K 2"], offset: Float[np.ndarray, "2"], count: int, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2"]]:
-    """Where pushes of one object start, free of it, and where they end [m]."""
-    distance = np.linalg.norm(offset)
-    angle = np.arctan2(offset[1], offset[0]) + rng.normal(0, _ANGLE_RAD, count)
-    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    side = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    along, across = outline @ direction.T, outline @ side.T  # K x P
-    low, high = across.min(axis=0), across.max(axis=0)
-    aside = (low + high) / 2 + rng.normal(0, _ASIDE, count).clip(-1, 1) * (high - low) / 2
-    reach = np.abs(across - aside) <= PUSHER_RADIUS_M + 0.01  # what of the outline the pusher meets on its line
-    back = np.where(reach, along, np.inf).min(axis=0)
-    back = np.where(np.isfinite(back), back, along.min(axis=0))
-    touching = back - PUSHER_RADIUS_M
-    away = touching - CLEARANCE_M - _SPARE_M
-    length = distance * rng.uniform(*_LENGTHS, count)
-    starts = away[:, None] * direction + aside[:, None] * side
-    ends = (touching + length)[:, None] * direction + aside[:, None] * side
-    return starts, ends
+def _orders(off: list[int], rng: np.random.Generator) -> list[tuple[int, ...]]:
+    if len(off) <= 3:
+        return list(islice(permutations(off), _ORDERS))
+    return [tuple(rng.permutation(off).tolist()) for _ in range(_ORDERS)]
+
+
+class _Chains:
+    """Draws sequences of pushes; what several of them need is found once."""
+
+    def __init__(
+        self, state: SceneState, here: list[Outlines], there: list[Outlines], offsets: Float[np.ndarray, "N 2"],
+        horizon: int, rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        assert state.pusher is not None
+        self._pusher, self._here, self._there, self._offsets = state.pusher[:2], here, there, offsets
+        self._horizon, self._rng = horizon, rng
+        self._spaces: dict[frozenset[int], FreeSpace] = {}
+        self._ways: dict[tuple[frozenset[int], int], Ways] = {}
+
+    def draw(self, order: tuple[int, ...], count: int) -> list[Float[np.ndarray, "T 3"]]:
+        """Sequences that push objects in this order, as far as time and room allow."""
+        corners = [[self._pusher] for _ in range(count)]
+        speeds: list[list[float]] = [[] for _ in range(count)]
+        limit_s = self._horizon * STEP_S
+        for stage, number in enumerate(order):
+            space, ways = self._after(order[:stage])
+            pushes = self._clear_pushes(number, space, count)
+            if pushes is None:
+                break
+            for k in range(count):
+                if speeds[k] and duration_s(np.array(corners[k]), np.array(speeds[k])) >= limit_s:
+                    continue
+                way = ways.to(pushes.starts[k])
+                speed = float(self._rng.uniform(*_SPEEDS))
+                corners[k] += [*way[1:], pushes.ends[k]]
+                speeds[k] += [1.0] * (len(way) - 1) + [speed]
+        if not speeds[0]:
+            return []
+        return [actions_along(np.array(c), self._horizon, np.array(s)) for c, s in zip(corners, speeds, strict=True)]
+
+    def _after(self, pushed: tuple[int, ...]) -> tuple[FreeSpace, Ways]:
+        """Where the pusher can go once some objects have arrived, from behind the last of them."""
+        key = frozenset(pushed)
+        if key not in self._spaces:
+            outlines = [self._there[n] if n in key else self._here[n] for n in range(len(self._here))]
+            self._spaces[key] = FreeSpace([outline for parts in outlines for outline in parts])
+        space = self._spaces[key]
+        last = pushed[-1] if pushed else -1
+        if (key, last) not in self._ways:
+            self._ways[key, last] = space.ways_from(self._pusher if last < 0 else self._end(last))
+        return space, self._ways[key, last]
+
+    def _end(self, number: int) -> Float[np.ndarray, "2"]:
+        """Where the pusher is after it has brought an object to its goal."""
+        pushes = straight_pushes(np.concatenate(self._here[number]), self._offsets[number], 1, None)
+        return pushes.ends[0].clip(-PUSHER_REACH_M, PUSHER_REACH_M)
+
+    def _clear_pushes(self, number: int, space: FreeSpace, count: int) -> Pushes | None:
+        """Pushes of an object that begin where the pusher has room; None if there are none."""
+        outline = np.concatenate(self._here[number])
+        drawn = straight_pushes(outline, self._offsets[number], _SPARE * count, self._rng)
+        clear = np.flatnonzero(space.is_free(drawn.starts))
+        if not len(clear):
+            return None
+        chosen = np.resize(clear, count)
+        return Pushes(drawn.starts[chosen], drawn.ends[chosen].clip(-PUSHER_REACH_M, PUSHER_REACH_M))

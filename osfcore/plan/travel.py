@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from skimage.draw import line
 
 from osfcore.scene import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
 
@@ -42,45 +43,60 @@ class FreeSpace:
             cv2.fillConvexPoly(solid, _cells(outline)[:, ::-1].astype(np.int32), 1)
         distance = ndimage.distance_transform_edt(solid == 0) if solid.any() else np.full(solid.shape, float(_SIDE))
         self.clearance = CELL_M * np.asarray(distance) - PUSHER_RADIUS_M
+        self._free = self.clearance >= CLEARANCE_M
 
     def is_free(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
         """Whether the pusher clears everything at some places within its reach."""
         cells = _cells(points)
         within = np.all((cells >= 0) & (cells < _SIDE), axis=1)
         rows = cells.clip(0, _SIDE - 1)
-        return within & (self.clearance[rows[:, 0], rows[:, 1]] >= CLEARANCE_M)
+        return within & self._free[rows[:, 0], rows[:, 1]]
 
-    def ways(self, start: Float[np.ndarray, "2"], ends: Float[np.ndarray, "E 2"]) -> list[Float[np.ndarray, "n 2"]]:
-        """The shortest way from one place to each of some others, corner by corner [m]; all within reach."""
+    def ways_from(self, start: Float[np.ndarray, "2"]) -> Ways:
+        """All shortest ways from a place within reach [m]."""
+        return Ways(self, start)
+
+    def cost(self) -> Float[np.ndarray, "S S"]:
+        """Of each cell of a way."""
+        return np.where(self._free, 1.0, _BLOCKED)
+
+    def sees(self, a: Int[np.ndarray, "2"], b: Int[np.ndarray, "2"]) -> bool:
+        """Whether the straight way between two cells is free, but for its ends."""
+        rows, columns = line(*a, *b)
+        return bool(self._free[rows[1:-1], columns[1:-1]].all())
+
+
+class Ways:
+    """Shortest ways from one place.
+
+    Args:
+        space: that they lead through.
+        start: where they begin [m].
+    """
+
+    def __init__(self, space: FreeSpace, start: Float[np.ndarray, "2"]) -> None:
         from skimage.graph import MCP_Geometric
 
-        costs = np.where(self.clearance >= CLEARANCE_M, 1.0, _BLOCKED)
-        search = MCP_Geometric(costs)
-        first = _cells(start[None]).clip(0, _SIDE - 1)
-        search.find_costs(first.tolist())
-        ways = []
-        for end in ends:
-            cells = search.traceback(_cells(end[None]).clip(0, _SIDE - 1)[0].tolist())
-            points = np.array(cells, float) * CELL_M - PUSHER_REACH_M
-            points[0], points[-1] = start, end
-            ways.append(self._straightened(points))
-        return ways
+        self._space, self._start = space, start
+        self._search = MCP_Geometric(space.cost())
+        self._search.find_costs(_cells(start[None]).clip(0, _SIDE - 1).tolist())
 
-    def _straightened(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    def to(self, end: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
+        """The way to a place within reach, corner by corner [m]."""
+        cells = np.array(self._search.traceback(_cells(end[None]).clip(0, _SIDE - 1)[0].tolist()))
+        corners = cells[self._corners(cells)] * CELL_M - PUSHER_REACH_M
+        return np.concatenate([self._start[None], corners[1:-1], end[None]])
+
+    def _corners(self, cells: Int[np.ndarray, "n 2"]) -> list[int]:
         """Fewer corners: each leads to the farthest one in free sight."""
         kept, at = [0], 0
-        while at < len(points) - 1:
-            later = len(points) - 1
-            while later > at + 1 and not self._sees(points[at], points[later]):
+        while at < len(cells) - 1:
+            later = len(cells) - 1
+            while later > at + 1 and not self._space.sees(cells[at], cells[later]):
                 later = at + max((later - at) * 3 // 4, 1)
             at = later
             kept.append(at)
-        return points[kept]
-
-    def _sees(self, a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> bool:
-        count = max(int(np.ceil(np.abs(b - a).max() / (0.5 * CELL_M))), 1)
-        between = a + np.linspace(0, 1, count + 1)[1:-1, None] * (b - a)
-        return bool(self.is_free(between).all())
+        return kept
 
 
 def _cells(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
@@ -97,10 +113,18 @@ def actions_along(
         horizon: number of actions.
         speeds: share of the highest speed on each leg, above 0; all 1 by default.
     """
-    legs = np.abs(np.diff(way, axis=0)).max(axis=1)  # speeds are limited along each axis
-    shares = np.ones(len(legs)) if speeds is None else speeds
-    times = np.concatenate([[0.0], np.cumsum(legs / (MAX_SPEED_M_S * shares))])
+    times = np.concatenate([[0.0], np.cumsum(_legs_s(way, speeds))])
     moments = STEP_S * np.arange(horizon + 1)
     places = np.stack([np.interp(moments, times, way[:, axis]) for axis in range(2)], axis=1)
     velocity = np.diff(places, axis=0) / STEP_S
     return np.pad(velocity, ((0, 0), (0, 1)))
+
+
+def duration_s(way: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:
+    """How long a way takes [s], each leg at its share of the highest speed."""
+    return float(_legs_s(way, speeds).sum())
+
+
+def _legs_s(way: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None) -> Float[np.ndarray, "n-1"]:
+    legs = np.abs(np.diff(way, axis=0)).max(axis=1)  # speeds are limited along each axis
+    return legs / (MAX_SPEED_M_S * (np.ones(len(legs)) if speeds is None else speeds))

@@ -306,6 +306,11 @@ class Tabletop:
             bodies.place_pusher(before)
             raise
 
+    def gap_m(self, name: str) -> float:
+        """From an object to the nearest other one [m]: 0.05 if it is farther away, negative if they penetrate."""
+        others = [other for other in self._names if other != name]
+        return min((self._bodies.distance(name, other) for other in others), default=0.05)
+
     def set_light(self, light: Light) -> None:
         """Move the lamp."""
         self._light = light

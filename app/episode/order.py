@@ -1,0 +1,117 @@
+"""What an episode in the simulator is asked to be, and the world and goal that this means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.settings import EpisodeSettings
+from osfcore.control.target import GoalImage
+from osfcore.errors import InvalidInput, NoRoom
+from osfcore.evaluate.mpc_tasks import draw_goal
+from osfcore.fields.library import FieldLibrary
+from osfcore.files import reading_png
+from osfcore.objects.library import AssetLibrary
+from osfcore.scene import Camera, SceneState, goal_camera
+from osfcore.world.tabletop import SceneRequest, Tabletop
+
+_GOALS = 30  # random ones that are tried until one has room
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeOrder:
+    """An episode in the simulator.
+
+    Attributes:
+        out: folder for its results.
+        data_dir: where objects, and fields and networks trained on this machine, are.
+        names: the objects; None for a random choice.
+        objects: how many, where names are not given.
+        seed: of the scene, its light, a random goal, and the searches.
+        goal: PNG of how the table should look, from the goal camera; None for a random goal.
+        moved: how many objects a random goal moves; as the seed will have it if None.
+        settings: how it goes.
+        device: that computes.
+    """
+
+    out: Path
+    data_dir: Path
+    names: tuple[str, ...] | None = None
+    objects: int = 3
+    seed: int = 0
+    goal: Path | None = None
+    moved: int | None = None
+    settings: EpisodeSettings = field(default_factory=EpisodeSettings)
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Given:
+    """What an episode begins with.
+
+    Attributes:
+        world: with the scene on the table.
+        goal: the image.
+        truth: how the table truly should be, where that is known.
+        moved: objects that truly should move, where that is known.
+    """
+
+    world: Tabletop
+    goal: GoalImage
+    truth: SceneState | None
+    moved: tuple[str, ...]
+
+
+def given(order: EpisodeOrder) -> Given:
+    """Set the table and take or draw the goal.
+
+    Raises:
+        OsfError: if the objects, the image or the numbers are not as they must be.
+    """
+    assets, fields = AssetLibrary(order.data_dir / "objects"), FieldLibrary(order.data_dir)
+    for name in order.names or ():
+        fields.info(name)
+    among = tuple(name for name in fields.names() if assets.has(name))
+    world = Tabletop(assets, request=SceneRequest(names=order.names, count=order.objects, among=among))
+    world.arrange(order.seed)
+    if order.moved is not None and not 1 <= order.moved <= len(world.names):
+        raise InvalidInput("number of objects that move", order.moved, f"between 1 and {len(world.names)}")
+    if order.goal is not None:
+        return Given(world, read_goal(order.goal, goal_camera()), None, ())
+    start = world.truth()
+    for attempt in range(_GOALS):
+        rng = np.random.default_rng([order.seed, attempt])
+        count = int(rng.integers(1, len(world.names) + 1)) if order.moved is None else order.moved
+        world.restore(start)
+        found = draw_goal(world, count, rng)
+        if found is not None:
+            camera = goal_camera()
+            image = world.render((camera,), with_pusher=False).images[0]
+            world.restore(start)
+            return Given(world, GoalImage(camera, image), *found)
+    raise NoRoom(world.names, _GOALS)
+
+
+def read_goal(path: Path, camera: Camera) -> GoalImage:
+    """A goal image from a file, seen by the camera at whatever size the image has.
+
+    Raises:
+        CorruptFile: if it is no PNG.
+        InvalidInput: if its sides are not in the proportion of the camera's, or out of range.
+    """
+    image = _pixels(path)
+    height, width = image.shape[:2]
+    if width * camera.height != height * camera.width:
+        allowed = f"in proportion {camera.width}:{camera.height}, as the goal camera sees"
+        raise InvalidInput(f"size of {path.name} [px]", f"{width} x {height}", allowed)
+    return GoalImage(camera.resized(width, height), image)
+
+
+def _pixels(path: Path) -> Float[np.ndarray, "h w 3"]:
+    from PIL import Image
+
+    with reading_png(path, "it is no PNG image"), Image.open(path, formats=("PNG",)) as image:
+        return np.asarray(image.convert("RGB"), np.float32) / 255

@@ -1,0 +1,153 @@
+"""What an episode yields: everything that a page, a report or a test may want to know, as it happens."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.estimate.steps import EstimateStep
+from osfcore.estimated import EstimatedState
+from osfcore.plan.goals import PoseGoal
+from osfcore.plan.mppi import PlanRound
+from osfcore.scene import Camera, Observation, SceneState
+
+Look = Literal["first", "goal", "next", "search"]
+Matter = Literal["goal", "lamp", "object", "lost", "found", "stalled"]
+Outcome = Literal["reached", "out of steps", "refused"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Observed:
+    """The cameras took their images.
+
+    Attributes:
+        number: actions executed so far.
+        observation: what they and the robot report.
+    """
+
+    number: int
+    observation: Observation
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Looking:
+    """An estimator is at work.
+
+    Attributes:
+        number: actions executed so far.
+        look: at the first frame, at the goal image, at a later frame, or for something that was lost.
+        step: of the estimator.
+    """
+
+    number: int
+    look: Look
+    step: EstimateStep
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GoalFound:
+    """Where everything should be.
+
+    Attributes:
+        goal: the poses.
+        image: how that looks, through the camera: the goal image, or the poses rendered.
+        camera: of the image.
+        estimate: what the goal image was taken for; None where poses were given.
+    """
+
+    goal: PoseGoal
+    image: Float[np.ndarray, "h w 3"]
+    camera: Camera
+    estimate: EstimatedState | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Planning:
+    """A round of planning is done; the last one before `Acted` holds the plan.
+
+    Attributes:
+        number: actions executed so far.
+        round: of the planner.
+    """
+
+    number: int
+    round: PlanRound
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Acted:
+    """An action was executed.
+
+    Attributes:
+        number: of actions executed, this one included.
+        action: velocity of the pusher [m/s].
+    """
+
+    number: int
+    action: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stepped:
+    """One round of the loop is over, or the loop is about to begin.
+
+    Attributes:
+        number: actions executed so far.
+        steps: at most.
+        estimate: where everything is now.
+        offsets_m: of each object from where it should be, on the table's plane [m].
+        offsets_rad: likewise its orientation [rad].
+        image_cost: mean squared difference between the goal image and the estimate rendered under its light.
+        rendered: that rendering.
+        seconds: spent on each stage of this round: "first", "goal", "estimate", "plan", "act"; those that there were.
+    """
+
+    number: int
+    steps: int
+    estimate: EstimatedState
+    offsets_m: Float[np.ndarray, "N"]
+    offsets_rad: Float[np.ndarray, "N"]
+    image_cost: float
+    rendered: Float[np.ndarray, "h w 3"]
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Noticed:
+    """Something that a person should know.
+
+    Attributes:
+        number: actions executed so far.
+        matter: what kind of thing.
+        text: a sentence.
+        names: objects it is about.
+    """
+
+    number: int
+    matter: Matter
+    text: str
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Finished:
+    """The last event.
+
+    Attributes:
+        number: actions executed.
+        outcome: how it ended.
+        text: a sentence.
+        state: as estimated last.
+    """
+
+    number: int
+    outcome: Outcome
+    text: str
+    state: SceneState
+
+
+Event = Observed | Looking | GoalFound | Planning | Acted | Stepped | Noticed | Finished
