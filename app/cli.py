@@ -13,6 +13,7 @@ from app.commands.assets import Assets
 from app.commands.bench import Bench
 from app.commands.check import Check
 from app.commands.collect import Collect
+from app.commands.episode import RunEpisode
 from app.commands.estimate import Estimate
 from app.commands.evaluate import Evaluate
 from app.commands.predict import Predict
@@ -43,6 +44,7 @@ Commands = Annotated[
     | Annotated[Render, tyro.conf.subcommand("render", description="Render a scene through its fields.")]
     | Annotated[Estimate, tyro.conf.subcommand("estimate", description="Find poses and light in images.")]
     | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
+    | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
     | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],

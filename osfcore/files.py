@@ -152,7 +152,7 @@ def reading_png(path: Path, reason: str) -> Iterator[None]:
     """
     try:
         yield
-    except CorruptFile:
+    except OsfError:
         raise
     except (
         OSError,

@@ -235,19 +235,16 @@ def _show_mpc(folder: Path, result: dict[str, Any]) -> None:
     )
     moved = ", ".join(f"{_percent(share)} of {count}" for count, share in result["success_by_moved"].items())
     print(f"By number of objects that had to move: {moved}.")
-    print(
-        f"These end {_number(result['final_mm_mean'])} mm from their goals (median {_number(result['final_mm_median'])} "
-        f"mm, {_number(result['final_deg_median'])} deg), from {_number(result['start_mm_mean'])} mm."
-    )
+    ends = f"{_number(result['final_mm_mean'])} mm (median {_number(result['final_mm_median'])} mm)"
+    print(f"These end {ends} from their goals, from {_number(result['start_mm_mean'])} mm.")
     if result["oracle_success_2cm"] is not None:
         print(
             f"Told the truth, the same planner: {_percent(result['oracle_success_2cm'])}, "
             f"{_number(result['oracle_final_mm_mean'])} mm."
         )
-    print(
-        f"A plan takes {_number(result['replan_s_median'])} s, an estimate {_number(result['estimate_s_median'], 2)} s, "
-        f"an episode {_number(result['episode_s_median'], 0)} s. Pictures and figures: {folder}"
-    )
+    plan, look, whole = (result[f"{stage}_s_median"] for stage in ("replan", "estimate", "episode"))
+    print(f"A plan takes {_number(plan)} s, an estimate {_number(look, 2)} s, an episode {_number(whole, 0)} s.")
+    print(f"Pictures and figures: {folder}")
 
 
 def _errors(row: dict[str, Any]) -> str:

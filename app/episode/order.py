@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from PIL import Image
 
 from osfcore.control.settings import EpisodeSettings
 from osfcore.control.target import GoalImage
-from osfcore.errors import InvalidInput, NoRoom
+from osfcore.errors import CorruptFile, InvalidInput, NoRoom
 from osfcore.evaluate.mpc_tasks import draw_goal
 from osfcore.fields.library import FieldLibrary
 from osfcore.files import reading_png
@@ -18,6 +18,7 @@ from osfcore.objects.library import AssetLibrary
 from osfcore.scene import Camera, SceneState, goal_camera
 from osfcore.world.tabletop import SceneRequest, Tabletop
 
+_MODES = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's, of 8 bits a channel: others would be clipped silently
 _GOALS = 30  # random ones that are tried until one has room
 
 
@@ -76,11 +77,22 @@ def given(order: EpisodeOrder) -> Given:
         fields.info(name)
     among = tuple(name for name in fields.names() if assets.has(name))
     world = Tabletop(assets, request=SceneRequest(names=order.names, count=order.objects, among=among))
+    try:
+        return _begun(order, world)
+    except BaseException:
+        world.close()
+        raise
+
+
+def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
     world.arrange(order.seed)
     if order.moved is not None and not 1 <= order.moved <= len(world.names):
         raise InvalidInput("number of objects that move", order.moved, f"between 1 and {len(world.names)}")
     if order.goal is not None:
-        return Given(world, read_goal(order.goal, goal_camera()), None, ())
+        goal = read_goal(order.goal, goal_camera())
+        if order.moved is not None:
+            raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
+        return Given(world, goal, None, ())
     start = world.truth()
     for attempt in range(_GOALS):
         rng = np.random.default_rng([order.seed, attempt])
@@ -102,16 +114,14 @@ def read_goal(path: Path, camera: Camera) -> GoalImage:
         CorruptFile: if it is no PNG.
         InvalidInput: if its sides are not in the proportion of the camera's, or out of range.
     """
-    image = _pixels(path)
-    height, width = image.shape[:2]
-    if width * camera.height != height * camera.width:
-        allowed = f"in proportion {camera.width}:{camera.height}, as the goal camera sees"
-        raise InvalidInput(f"size of {path.name} [px]", f"{width} x {height}", allowed)
-    return GoalImage(camera.resized(width, height), image)
-
-
-def _pixels(path: Path) -> Float[np.ndarray, "h w 3"]:
-    from PIL import Image
-
-    with reading_png(path, "it is no PNG image"), Image.open(path, formats=("PNG",)) as image:
-        return np.asarray(image.convert("RGB"), np.float32) / 255
+    if not path.is_file():
+        raise CorruptFile(path, "there is no such file")
+    with reading_png(path, "it is no readable PNG image"), Image.open(path, formats=("PNG",)) as image:
+        width, height = image.size  # from the header: nothing is decoded yet
+        if width * camera.height != height * camera.width:
+            allowed = f"in proportion {camera.width}:{camera.height}, as the goal camera sees"
+            raise InvalidInput(f"size of {path.name} [px]", f"{width} x {height}", allowed)
+        seen = camera.resized(width, height)
+        if image.mode not in _MODES:
+            raise CorruptFile(path, "it is no image of 8 bits a channel")
+        return GoalImage(seen, np.asarray(image.convert("RGB"), np.float32) / 255)

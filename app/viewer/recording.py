@@ -36,4 +36,5 @@ def write_recording(path: Path, library: AssetLibrary, states: Iterable[SceneSta
         serializer.insert_sleep(STEP_S)
         write_atomically(path, serializer.serialize())
     finally:
-        server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser says goodbye
+            server.stop()

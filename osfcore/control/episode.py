@@ -30,7 +30,7 @@ from osfcore.control.events import (
 )
 from osfcore.control.search import search_lost
 from osfcore.control.settings import EpisodeSettings
-from osfcore.control.target import GoalImage, alike, settled
+from osfcore.control.target import GoalImage, alike, settled, unmoved
 from osfcore.control.watch import Patience, carried, lamp_moved, offsets
 from osfcore.dynamics.rollout import PushModel
 from osfcore.dynamics.shapes import ObjectShape
@@ -231,6 +231,7 @@ class Episode:
         if isinstance(wanted, GoalImage):
             steps = estimate_goal(self._knowledge.models, wanted.observed(state.names), state)
             found = yield from self._looked("goal", steps)
+            found = unmoved(self._knowledge.models, wanted, found, state)
             goal, light, camera, image = _poses_of(found.state), found.state.light, wanted.camera, wanted.image
             doubts = found.reason
         else:

@@ -42,9 +42,8 @@ def search_lost(
     expected = replace(_with(state, seen.state, lost), pusher=observation.pusher)
     for step in estimate_next(models, observation, expected, rng):
         found = step.estimate
-        if found is not None and sum(map(bool, found.doubts)) > len(lost):
-            step = replace(step, estimate=last)
-        yield step
+        is_worse = found is not None and sum(map(bool, found.doubts)) > len(lost)
+        yield replace(step, estimate=last) if is_worse else step
 
 
 def _with(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
+from osfcore.estimate.models import Models
+from osfcore.estimate.rivals import with_pose
+from osfcore.estimate.tangent import Guess
+from osfcore.estimate.views import FINE_SIDE, views_of
+from osfcore.estimate.whole import loss_of
+from osfcore.estimated import EstimatedState
 from osfcore.objects.asset import Symmetry
 from osfcore.plan.goals import PoseGoal
 from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.scene import Camera, Observation, SceneState
 
+_NO_WORSE = 1.01  # times the loss, by which an object may explain the goal image worse where it is now
 _STAYS_M, _STAYS_RAD = 0.006, 0.12  # a goal this close to where an object is, is where it is
 
 
@@ -44,6 +51,29 @@ class GoalImage:
     def observed(self, names: tuple[str, ...]) -> Observation:
         """The image as an estimator takes it."""
         return Observation((self.camera,), self.image[None], names, None, None, 0.0)
+
+
+def unmoved(models: Models, goal: GoalImage, found: EstimatedState, now: SceneState) -> EstimatedState:
+    """The estimate of a goal image, with objects where they are now if the image shows nothing against it.
+
+    What hides behind something, or lies beyond the image's border, would else be taken to wherever it hid best.
+
+    Args:
+        models: fields of the objects and the table.
+        goal: the image.
+        found: what it was taken for.
+        now: the scene.
+    """
+    views = views_of(goal.observed(found.state.names), FINE_SIDE, samples=2)
+    guess = Guess.of(found.state, None)
+    least, doubts = loss_of(models, views, guess), list(found.doubts)
+    for n, name in enumerate(found.state.names):
+        here = with_pose(guess, n, now.pose(name))
+        loss = loss_of(models, views, here)
+        if loss <= _NO_WORSE * least:
+            guess, least, doubts[n] = here, min(loss, least), ""
+    reasons = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
+    return replace(found, state=guess.state(), doubts=tuple(doubts), reason="; ".join(reasons))
 
 
 def settled(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:

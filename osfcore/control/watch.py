@@ -16,9 +16,7 @@ _CARRIED_M = 0.03  # an object this far from where it was expected, and out of t
 _REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perhaps by way of another object
 
 
-def offsets(
-    goal: PoseGoal, state: SceneState
-) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     """How far each object is from where it should be: on the table's plane [m], and turned [rad]."""
     wanted = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
     turned = rotation_angle(state.poses.quaternion, wanted)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from osfcore import control, dynamics, estimate, plan, render, world
+from osfcore import control, dynamics, estimate, evaluate, plan, render, world
 from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Stepped
 from osfcore.control.settings import CostKind, EpisodeSettings
 from osfcore.dynamics.library import network_path
@@ -155,7 +155,12 @@ class _Runner:
         assert config.names is not None
         self._config, self._fields, self._assets = config, fields, assets
         self._names = config.names
-        self._code = code_sha256(control, dynamics, estimate, plan, render, world)
+        self._told_truth = replace(config.settings, plan=_ORACLE, replan_every=_ORACLE_EVERY)
+        self._given = {
+            "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in self._names},
+            "network": file_sha256(network_path(config.data_dir)),
+            "code": code_sha256(control, dynamics, estimate, evaluate, plan, render, world),
+        }
 
     def oracle(self, number: int) -> TaskResult:
         """A task for the planner that is told the truth."""
@@ -164,9 +169,8 @@ class _Runner:
             config = self._config
             task = self._task(number)
             knowledge = knowledge_of(task.start.names, self._fields, self._assets, config.data_dir)
-            settings = replace(config.settings, plan=_ORACLE, replan_every=_ORACLE_EVERY)
             rng = np.random.default_rng([config.seed, number, 1])
-            ended = run_told_the_truth(task, self._assets, knowledge, settings, rng)
+            ended = run_told_the_truth(task, self._assets, knowledge, self._told_truth, rng)
             kept = self._keep("oracle", number, task, ended, {})
         return kept
 
@@ -210,15 +214,8 @@ class _Runner:
         return TaskCache(config.folder / "mpc" / f"{which}-{config.objects}-{config.seed}")
 
     def _circumstances(self, kind: str) -> dict[str, Any]:
-        config = self._config
-        return {
-            "names": {name: [file_sha256(self._fields.info(name).path), self._assets.digest(name)]
-                      for name in self._names},
-            "network": file_sha256(network_path(config.data_dir)),
-            "settings": asdict(config.settings),
-            "oracle": asdict(_ORACLE) if kind == "oracle" else None,
-            "code": self._code,
-        }  # fmt: skip
+        settings = self._told_truth if kind == "oracle" else replace(self._config.settings, cost=self._config.cost)
+        return {**self._given, "settings": asdict(settings)}
 
     def _keep(self, kind: str, number: int, task: MpcTask, ended: Ended, figures: dict[str, Any]) -> TaskResult:
         symmetries = {name: self._assets.info(name).symmetry for name in task.start.names}
@@ -246,7 +243,9 @@ class _Log:
             case GoalFound():
                 if event.estimate is not None:
                     self.figures["goal_doubt"] = event.estimate.reason
-                    self.figures["goal_mm"] = 1000 * float(np.linalg.norm(event.goal.offsets_m(self._task.goal), axis=1).max())
+                    self.figures["goal_mm"] = 1000 * float(
+                        np.linalg.norm(event.goal.offsets_m(self._task.goal), axis=1).max()
+                    )
             case Noticed():
                 self.figures["noticed"].append([event.number, event.matter, event.text])
             case Acted():

@@ -84,7 +84,7 @@ def scores_of(results: Sequence[TaskResult], key: str) -> list[MpcScore]:
 
 
 def write_pictures(folder: Path, report: MpcReport) -> None:
-    """Draw mpc.png, success against the threshold and errors of 6D poses, and mpc_tasks.png, goals and what was reached.
+    """Draw mpc.png, success by threshold and errors of 6D poses, and mpc_tasks.png, goals and what was reached.
 
     Raises:
         CannotWrite: if the disk refuses.

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from osfcore.errors import InvalidInput
 from osfcore.render.scene_renderer import PLANNING, SceneBatch, SceneRenderer
 from osfcore.rollouts import Rollouts
-from osfcore.scene import Camera, Light
+from osfcore.scene import MIN_IMAGE_SIDE, Camera, Light
 
 SIDE = 64  # longest side of the images that are compared [px]
 EVERY = 3  # actions between rendered states
@@ -38,7 +38,7 @@ class ImageCost:
         if image.shape != (camera.height, camera.width, 3):
             raise InvalidInput("shape of the goal image", image.shape, f"{(camera.height, camera.width, 3)}")
         scale = min(1.0, SIDE / max(camera.width, camera.height))
-        size = round(camera.width * scale), round(camera.height * scale)
+        size = max(round(camera.width * scale), MIN_IMAGE_SIDE), max(round(camera.height * scale), MIN_IMAGE_SIDE)
         self._renderer, self._light = renderer, light
         self._camera = camera.resized(*size)
         self._image = cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA)

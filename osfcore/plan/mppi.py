@@ -2,8 +2,9 @@
 
 Deviations: sequences are not drawn around the last plan alone but from three sources (the last plan, pushes worth
 trying, random walks), and the softmax average is taken over a second round, drawn around the best of the first: the
-average of a way around the left and one around the right leads into the object. Noise is added to the pusher's path, not to its velocity, so that
-what comes late in a sequence is disturbed no more than what comes early.
+average of a way around the left and one around the right leads into the object. That round looks less far ahead: what
+comes later will be planned again before it is done. Noise is added to the pusher's path,
+not to its velocity, so that what comes late in a sequence is disturbed no more than what comes early.
 """
 
 from __future__ import annotations
@@ -35,13 +36,15 @@ class PlanSettings:
         temperature: of the softmax, as a share of the spread of costs in the better half of the second round.
         noise_m: sigma of the pusher's path around the plan [m].
         knot_every: actions between the places where the noise is drawn, with straight lines between them.
+        refined: actions that the second round looks at and changes.
     """
 
-    samples: int = 128
-    horizon: int = 25
+    samples: int = 160
+    horizon: int = 30
     temperature: float = 0.03
     noise_m: float = 0.008
     knot_every: int = 3
+    refined: int = 12
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -55,6 +58,7 @@ class PlanSettings:
             ("temperature", self.temperature, 1e-6, 1e6),
             ("noise [m]", self.noise_m, 0.0, PUSHER_REACH_M),
             ("actions between knots", self.knot_every, 1, MAX_HORIZON),
+            ("refined actions", self.refined, 1, MAX_HORIZON),
         ):
             if not low <= value <= high:
                 raise InvalidInput(what, value, f"between {low} and {high}")
@@ -66,8 +70,9 @@ class PlanRound:
 
     Attributes:
         number: of the round, from 0.
-        actions: the plan so far [m/s]: the best sequence of the first round, the softmax average of the second.
-        rollouts: all futures of the round.
+        actions: the plan so far [m/s]: the best sequence of the first round; in the second its first actions are the
+            softmax average.
+        rollouts: all futures of the round; those of the second are shorter.
         costs: theirs.
     """
 
@@ -130,12 +135,13 @@ class Planner:
         first = self._first_round(state, goal, rng)
         round_ = self._scored(0, state, first, cost, before)
         yield round_
-        second = self._around(round_.actions, self.settings.samples, rng, self.settings.noise_m)
+        begin, rest = np.split(round_.actions, [self.settings.refined])
+        keep_end = self.settings.knot_every < len(begin) and len(rest) > 0
+        second = self._around(begin, self.settings.samples, rng, self.settings.noise_m, keep_end=keep_end)
         round_ = self._scored(1, state, second, cost, before)
         mean = np.einsum("k,kta->ta", _softmax(round_.costs, self.settings.temperature), second)
-        round_ = replace(round_, actions=mean)
-        self._last = round_.actions
-        yield round_
+        self._last = np.concatenate([mean, rest])
+        yield replace(round_, actions=self._last)
 
     def _scored(
         self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
@@ -161,17 +167,34 @@ class Planner:
         return np.concatenate([plan[:horizon], np.zeros((max(horizon - len(plan), 0), 3))])
 
     def _around(
-        self, plan: Float[np.ndarray, "T 3"], count: int, rng: np.random.Generator, noise_m: float
+        self,
+        plan: Float[np.ndarray, "T 3"],
+        count: int,
+        rng: np.random.Generator,
+        noise_m: float,
+        *,
+        keep_end: bool = False,
     ) -> Float[np.ndarray, "K T 3"]:
-        """The plan itself, and sequences whose paths lie around its own."""
-        horizon, every = self.settings.horizon, self.settings.knot_every
-        knots = rng.normal(0, noise_m, (count, -(-horizon // every) + 1, 2))
+        """The plan itself, and sequences whose paths lie around its own.
+
+        Args:
+            plan: what they lie around.
+            count: how many.
+            rng: draws the noise.
+            noise_m: its sigma [m].
+            keep_end: all end where the plan ends.
+        """
+        horizon, every = len(plan), self.settings.knot_every
+        times = np.minimum(np.arange(-(-horizon // every) + 1) * every, horizon)
+        knots = rng.normal(0, noise_m, (count, len(times), 2))
         knots[0] = 0
         knots[:, 0] = 0  # the pusher is where it is
-        place = np.arange(horizon + 1) / every
-        low = np.floor(place).astype(int)
-        share = (place - low)[:, None]
-        path = (1 - share) * knots[:, low] + share * knots[:, np.minimum(low + 1, knots.shape[1] - 1)]
+        if keep_end:
+            knots[:, -1] = 0
+        moments = np.arange(horizon + 1)
+        low = (np.searchsorted(times, moments, side="right") - 1).clip(0, len(times) - 2)
+        share = ((moments - times[low]) / (times[low + 1] - times[low]))[:, None]
+        path = (1 - share) * knots[:, low] + share * knots[:, low + 1]
         velocity = np.pad(np.diff(path, axis=1) / STEP_S, ((0, 0), (0, 0), (0, 1)))
         return (plan + velocity).clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
 

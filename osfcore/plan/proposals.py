@@ -18,13 +18,13 @@ from jaxtyping import Float
 from osfcore.dynamics.contact import part_outlines
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable
 from osfcore.plan.goals import PoseGoal
-from osfcore.plan.pushes import Pushes, straight_pushes
+from osfcore.plan.pushes import Pushes, sides, straight_pushes
 from osfcore.plan.travel import FreeSpace, Ways, actions_along, duration_s
 from osfcore.poses import Pose
 from osfcore.scene import PUSHER_REACH_M, STEP_S, SceneState
 
 _DONE_M = 0.004  # an object this close to its goal is not pushed on purpose
-_SPEEDS = (0.4, 1.0)  # of the highest
+_SPEEDS = (0.6, 1.0)  # of the highest
 _ORDERS = 6  # all of three objects
 _SPARE = 3  # times as many pushes are drawn as needed: some begin where there is no room
 
@@ -63,7 +63,7 @@ class Proposals:
         chains = _Chains(state, here, there, offsets, horizon, rng)
         each = -(-count // len(orders))
         found = [actions for order in orders for actions in chains.draw(order, each)]
-        return np.array(found).reshape(-1, horizon, 3)
+        return np.array(found[:count]).reshape(-1, horizon, 3)
 
     def _outlines(self, name: str, pose: Pose) -> Outlines:
         return list(part_outlines(self._tables[name], 0, pose).astype(float))
@@ -84,6 +84,7 @@ class _Chains:
     ) -> None:  # fmt: skip
         assert state.pusher is not None
         self._pusher, self._here, self._there, self._offsets = state.pusher[:2], here, there, offsets
+        self._sides = [sides(outlines) for outlines in here]
         self._horizon, self._rng = horizon, rng
         self._spaces: dict[frozenset[int], FreeSpace] = {}
         self._ways: dict[tuple[frozenset[int], int], Ways] = {}
@@ -123,13 +124,12 @@ class _Chains:
 
     def _end(self, number: int) -> Float[np.ndarray, "2"]:
         """Where the pusher is after it has brought an object to its goal."""
-        pushes = straight_pushes(np.concatenate(self._here[number]), self._offsets[number], 1, None)
+        pushes = straight_pushes(self._sides[number], self._offsets[number], 1, None)
         return pushes.ends[0].clip(-PUSHER_REACH_M, PUSHER_REACH_M)
 
     def _clear_pushes(self, number: int, space: FreeSpace, count: int) -> Pushes | None:
         """Pushes of an object that begin where the pusher has room; None if there are none."""
-        outline = np.concatenate(self._here[number])
-        drawn = straight_pushes(outline, self._offsets[number], _SPARE * count, self._rng)
+        drawn = straight_pushes(self._sides[number], self._offsets[number], _SPARE * count, self._rng)
         clear = np.flatnonzero(space.is_free(drawn.starts))
         if not len(clear):
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ _ANGLE_RAD = 0.2  # sigma of the push's direction around that of the goal
 _ASIDE = 0.2  # sigma of the push's offset from the middle, of half the object's breadth
 _LENGTHS = (0.6, 1.15)  # of the distance to go
 _SPARE_M = 0.003  # from the place behind an object to what must stay clear
+_APART_M = 0.005
 _MEETS_M = PUSHER_RADIUS_M + 0.01  # beside the pusher's line, what of an outline it may meet
 
 
@@ -30,13 +32,25 @@ class Pushes:
     ends: Float[np.ndarray, "P 2"]
 
 
+def sides(outlines: Sequence[Float[np.ndarray, "K 2"]]) -> Float[np.ndarray, "n 2"]:
+    """Points at most 5 mm apart all along the outlines of an object's convex parts [m]."""
+    found = []
+    for outline in outlines:
+        closed = np.vstack([outline, outline[:1]])
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+        at = np.linspace(0, length[-1], max(int(np.ceil(length[-1] / _APART_M)), 1), endpoint=False)
+        between = np.stack([np.interp(at, length, closed[:, axis]) for axis in range(2)], axis=1)
+        found += [outline, between]
+    return np.concatenate(found)
+
+
 def straight_pushes(
     outline: Float[np.ndarray, "K 2"], offset: Float[np.ndarray, "2"], count: int, rng: np.random.Generator | None
 ) -> Pushes:
     """Pushes that bring an object about as far as it has to go.
 
     Args:
-        outline: of the object from above [m].
+        outline: of the object from above, points all along it, see `sides` [m].
         offset: how far it has to go [m], not zero.
         count: how many to draw.
         rng: draws directions, places beside the middle and lengths; None for pushes straight through the middle.

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput, OsfError
-from osfcore.rollouts import MAX_HORIZON, MAX_SEQUENCES, check_actions
+from osfcore.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts, check_actions
 
 
 @given(count=st.integers(1, 5), horizon=st.integers(1, 8), seed=st.integers(0, 10**6))
@@ -40,6 +40,20 @@ def test_the_first_bad_action_is_named_and_nothing_is_clipped(value, axis):
     actions[2, 3, axis] = actions[3, 0, axis] = value
     with pytest.raises(InvalidInput, match=r"action 3 of sequence 2 \[m/s\]"):
         check_actions(actions)
+
+
+@given(count=st.integers(1, 4), objects=st.integers(0, 3), data=st.data())
+def test_one_sequence_alone_is_a_future_by_itself(count, objects, data):
+    k = data.draw(st.integers(0, count - 1))
+    rng = np.random.default_rng(0)
+    told = Rollouts(
+        tuple("abc"[:objects]),
+        *(rng.normal(size=(count, 5, *rest)) for rest in ((objects, 3), (objects, 4), (3,))),
+    )
+    alone = told[k]
+    assert alone.names == told.names
+    for part in ("positions", "quaternions", "pusher"):
+        np.testing.assert_array_equal(getattr(alone, part), getattr(told, part)[[k]])
 
 
 scalars = st.none() | st.booleans() | st.floats(allow_nan=True) | st.text(max_size=3) | st.integers()

@@ -1,16 +1,19 @@
 import json
 from functools import partial
 
+import numpy as np
 import pytest
 
 import osfcore.evaluate.estimate_parts
 import osfcore.evaluate.fields
 from app.cli import main
 from app.commands.evaluate import Evaluate
+from osfcore.control.events import Finished
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.evaluate import bench_dynamics, dynamics
+from osfcore.evaluate import bench_dynamics, dynamics, mpc
 from osfcore.evaluate.estimate_parts import EvaluateEstimate
 from osfcore.evaluate.fields import EvaluateFields
+from osfcore.evaluate.mpc_runs import Ended
 from osfcore.world.collect_images import CollectObject, collect_object
 from tests.core.evaluate.oracle import Oracle
 from tests.core.evaluate.solids import SOLIDS, write_fields
@@ -149,6 +152,61 @@ def test_predicted_pushes_are_measured(data_dir, library, monkeypatch, capsys):
     assert "2 objects" in shown
     assert main([*arguments, "--data", "set"]) == 1
     assert "osf eval fields" in capsys.readouterr().err
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
+    made, image = [], np.full((16, 16, 3), 0.5)
+
+    def ours(task, _assets, _knowledge, settings, _rng):
+        made.append(settings.cost)
+        yield Finished(0, "reached", "The table looks like the goal.", task.goal)
+        yield Ended(task.goal, image, image)
+
+    monkeypatch.setattr(mpc, "run_from_images", ours)
+    monkeypatch.setattr(mpc, "run_told_the_truth", lambda task, *_: Ended(task.goal, image, image))
+    monkeypatch.setattr(mpc, "knowledge_of", lambda *_: None)
+    return made
+
+
+def test_episodes_are_measured(data_dir, runs, capsys):
+    arguments = ["eval", "mpc", "--data-dir", str(data_dir), "--tasks", "2", "--objects", "1", "--workers", "1"]
+    assert main([*arguments, "--names", "009_gelatin_box", "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert (result["tasks"], result["objects"], result["success_2cm"], result["oracle_success_2cm"]) == (2, 1, 1, 1)
+    assert (result["noaction_success_2cm"], result["final_mm_mean"], result["replan_s_median"]) == (0, 0, None)
+    assert "Told the truth" in told.err
+    assert json.loads((data_dir / "evaluation" / "mpc.json").read_text()) == result
+    assert main([*arguments, "--names", "009_gelatin_box"]) == 0  # taken over
+    shown = capsys.readouterr().out
+    assert runs == ["pose", "pose"]
+    for words in ("2 tasks with 1 objects, pose cost: 100.0 %", "100.0 % of 1", "Told the truth", "A plan takes - s"):
+        assert words in shown, words
+    assert main([*arguments, "--cost", "image", "--no-oracle"]) == 0
+    assert "Told the truth" not in capsys.readouterr().out
+    assert runs[2:] == ["image", "image"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--names", "teapot"], "teapot"),
+        (["--tasks", "0"], "number of tasks is 0"),
+        (["--objects", "7"], "between 1 and 6"),
+        (["--workers", "0"], "workers"),
+        (["--data", "set"], "osf eval fields"),
+    ],
+)
+def test_a_mistake_about_episodes_is_one_sentence(data_dir, runs, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert main(["eval", "mpc", "--out", str(out), "--data-dir", str(data_dir), *arguments]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("osf: ")
+    assert words in line
+    assert not out.exists()
+    assert not runs
 
 
 def test_the_command_explains_itself(capsys):

@@ -38,6 +38,22 @@ def test_an_object_that_is_not_there_is_told():
         PoseGoal.of(STATE, {"teapot": THERE})
 
 
+def test_each_object_has_its_goal():
+    goal = PoseGoal.of(STATE, {"a": THERE})
+    np.testing.assert_array_equal(goal.pose("a").matrix(), THERE.matrix())
+    np.testing.assert_array_equal(goal.pose("b").matrix(), STATE.pose("b").matrix())
+
+
+def test_a_replaced_goal_is_another_one_with_the_rest_as_it_was():
+    goal = PoseGoal.of(STATE, {"a": THERE})
+    turned = Pose(np.array([-0.2, 0.0, 0.03]), quaternion_exp(np.array([0, 0, 1.0])))
+    other = goal.replaced({"b": turned})
+    assert other.names == goal.names
+    np.testing.assert_array_equal(other.poses.matrix(), [THERE.matrix(), turned.matrix()])
+    np.testing.assert_array_equal(goal.pose("b").matrix(), STATE.pose("b").matrix())
+    np.testing.assert_array_equal(goal.replaced({}).poses.matrix(), goal.poses.matrix())
+
+
 def test_a_goal_that_is_met_costs_nothing():
     assert PoseCost(PoseGoal.of(STATE, {"a": THERE}))(futures((0.1, 0.2))) == pytest.approx(0)
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.plan.travel import CELL_M, CLEARANCE_M, FreeSpace, actions_along
+from osfcore.plan.travel import CELL_M, CLEARANCE_M, FreeSpace, actions_along, duration_s
 from osfcore.scene import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 
 BOX = np.array([[-0.05, -0.03], [0.05, -0.03], [0.05, 0.03], [-0.05, 0.03]])
@@ -27,7 +27,9 @@ def distance_to_box(points) -> np.ndarray:
 
 def test_on_an_empty_table_ways_are_straight():
     start, ends = np.array([-0.2, 0.1]), np.array([[0.3, 0.05], [-0.2, 0.1], [0.0, -0.3]])
-    for end, way in zip(ends, FreeSpace([]).ways(start, ends), strict=True):
+    ways = FreeSpace([]).ways_from(start)
+    for end in ends:
+        way = ways.to(end)
         np.testing.assert_array_equal(way[[0, -1]], [start, end])
         assert length_of(way) == pytest.approx(np.linalg.norm(end - start))
 
@@ -38,13 +40,13 @@ def test_ways_go_around_what_stands_in_them(x, y, u, v):
     start, end = np.array([x, y]), np.array([u, v])
     if not space.is_free(np.stack([start, end])).all():
         return
-    way = space.ways(start, end[None])[0]
+    way = space.ways_from(start).to(end)
     assert distance_to_box(along(way)).min() > PUSHER_RADIUS_M + CLEARANCE_M - 2 * CELL_M
     assert length_of(way) < np.linalg.norm(end - start) + 0.25
 
 
 def test_the_other_side_of_a_box_is_reached_by_the_shorter_way_around():
-    way = FreeSpace([BOX]).ways(np.array([-0.02, -0.1]), np.array([[-0.02, 0.1]]))[0]
+    way = FreeSpace([BOX]).ways_from(np.array([-0.02, -0.1])).to(np.array([-0.02, 0.1]))
     assert along(way)[:, 0].min() < -0.05 - PUSHER_RADIUS_M  # by the left end
     assert along(way)[:, 0].max() < 0.0
     aside = 0.05 + PUSHER_RADIUS_M + CLEARANCE_M - 0.02
@@ -55,10 +57,17 @@ def test_from_a_place_in_contact_a_way_leads_out():
     space = FreeSpace([BOX])
     start = np.array([0.0, 0.03 + PUSHER_RADIUS_M])
     assert not space.is_free(start[None])[0]
-    way = space.ways(start, np.array([[0.0, -0.2]]))[0]
+    way = space.ways_from(start).to(np.array([0.0, -0.2]))
     points = along(way)
     inside = distance_to_box(points) < PUSHER_RADIUS_M - CELL_M
     assert not inside.any()
+
+
+def test_a_way_does_not_depend_on_those_asked_for_before():
+    space, start, end = FreeSpace([BOX]), np.array([-0.2, 0.0]), np.array([0.2, 0.01])
+    ways = space.ways_from(start)
+    ways.to(np.array([0.0, 0.3]))
+    np.testing.assert_array_equal(ways.to(end), space.ways_from(start).to(end))
 
 
 def test_out_of_reach_is_not_free():
@@ -85,3 +94,21 @@ def test_actions_take_as_long_as_the_slower_axis_and_then_rest():
     np.testing.assert_allclose(actions[2:], 0, atol=1e-12)
     half = actions_along(np.array([[0.0, 0.0], [0.12, 0.03]]), 4, np.array([0.5]))
     np.testing.assert_allclose(half, [[0.15, 0.0375, 0]] * 4)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_a_way_ends_when_it_is_said_to(seed):
+    rng = np.random.default_rng(seed)
+    way = rng.uniform(-0.3, 0.3, (rng.integers(2, 6), 2))
+    speeds = rng.uniform(0.2, 1, len(way) - 1)
+    last = int(np.ceil(duration_s(way, speeds) / STEP_S))
+    reached = way[0] + STEP_S * np.cumsum(actions_along(way, last + 2, speeds)[:, :2], axis=0)
+    np.testing.assert_allclose(reached[last - 1 :], np.broadcast_to(way[-1], (3, 2)), atol=1e-9)
+    assert np.linalg.norm(reached[last - 2] - way[-1]) > 0 or last < 2
+
+
+def test_durations_add_up_and_grow_as_speeds_fall():
+    way = np.array([[0.0, 0.0], [0.12, 0.03], [0.12, -0.06]])
+    assert duration_s(way) == pytest.approx((0.12 + 0.09) / MAX_SPEED_M_S)
+    assert duration_s(way, np.array([0.5, 0.25])) == pytest.approx((0.12 / 0.5 + 0.09 / 0.25) / MAX_SPEED_M_S)
+    assert duration_s(way[:1]) == 0

@@ -182,6 +182,27 @@ def test_hand_moves_are_checked(world):
         world.move_pusher(world.truth().poses.position[0])
 
 
+def test_gaps_are_to_the_nearest_object_and_end_at_five_centimetres(library):
+    boxes = ("003_cracker_box", "009_gelatin_box")
+    tabletop = Tabletop(library, request=SceneRequest(names=boxes))
+    tabletop.arrange(0)
+    place = np.array([-0.2, 0, 0.5])
+    tabletop.move_object(boxes[0], Pose(place, Pose.identity().quaternion))
+    gaps = []
+    for shift in (0.3, 0.1, 0.09):
+        tabletop.move_object(boxes[1], Pose(place + [shift, 0, 0], Pose.identity().quaternion))
+        gaps.append(tabletop.gap_m(boxes[1]))
+        assert tabletop.gap_m(boxes[0]) == pytest.approx(gaps[-1], abs=1e-4)
+    tabletop.close()
+    assert gaps[0] == 0.05
+    assert 0 < gaps[2] < gaps[1] < 0.05
+    assert gaps[1] - gaps[2] == pytest.approx(0.01, abs=1e-3)
+    alone = Tabletop(library, request=SceneRequest(names=boxes[:1]))
+    alone.arrange(0)
+    assert alone.gap_m(boxes[0]) == 0.05
+    alone.close()
+
+
 def test_light_changes_the_picture_and_nothing_else(world):
     before, image = world.truth(), world.observe().images
     world.set_light(Light.from_angles(1.0, 0.2))

@@ -1,0 +1,180 @@
+"""What an episode leaves in its folder: report.json, steps.csv, frames, video, a recording, the goal image."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from app.episode.frames import frame, write_video
+from app.episode.order import EpisodeOrder, Given
+from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.evaluate.images import as_bytes, write_png
+from osfcore.evaluate.mpc_scores import score_of
+from osfcore.evaluate.mpc_tasks import MpcTask
+from osfcore.files import write_atomically, write_json
+from osfcore.poses import Pose
+from osfcore.scene import SceneState
+from osfcore.scenefile import Scene, scene_to_json
+from osfcore.statefile import estimated_to_json
+
+REPORT_FILE, CSV_FILE, VIDEO_FILE, RECORDING_FILE = "report.json", "steps.csv", "video.mp4", "episode.viser"
+GOAL_FILE, FRAMES_FOLDER = "goal.png", "frames"
+
+
+class EpisodeRecord:
+    """Takes an episode's events and writes its results.
+
+    Args:
+        order: what was asked for.
+        begin: world and goal.
+    """
+
+    def __init__(self, order: EpisodeOrder, begin: Given) -> None:
+        self._order, self._begin = order, begin
+        self._views: Float[np.ndarray, "V h w 3"] | None = None
+        self._goal: GoalFound | None = None
+        self._steps: list[dict[str, Any]] = []
+        self._notices: list[dict[str, Any]] = []
+        self._frames: list[UInt8[np.ndarray, "H W 3"]] = []
+        self._actions: list[list[float]] = []
+        self._end: Finished | None = None
+        self._start = begin.world.truth()
+        self.states = [self._start]
+        for left in (order.out / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
+            left.unlink()
+
+    def take(self, event: Event) -> None:
+        """Note an event, and draw a frame where a step is over.
+
+        Raises:
+            CannotWrite: if the disk refuses.
+        """
+        match event:
+            case Observed():
+                self._views = event.observation.images
+            case GoalFound():
+                self._goal = event
+                write_png(self._order.out / GOAL_FILE, as_bytes(event.image))
+            case Acted():
+                self._actions.append(event.action.tolist())
+                self.states.append(self._begin.world.truth())
+            case Noticed():
+                self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
+            case Stepped():
+                self._steps.append(self._told(event))
+                self._draw(event)
+            case Finished():
+                self._end = event
+            case _:
+                pass
+
+    def finish(self, seconds: float) -> dict[str, Any]:
+        """Write what is whole only at the end; the report.
+
+        Raises:
+            CannotWrite: if the disk refuses.
+        """
+        write_video(self._order.out / VIDEO_FILE, self._frames)
+        self._write_csv()
+        report = self._report(seconds)
+        write_json(self._order.out / REPORT_FILE, report)
+        return report
+
+    def _told(self, event: Stepped) -> dict[str, Any]:
+        """A step as the report has it; lengths in mm, angles in degrees."""
+        truth, estimate = self._begin.world.truth(), event.estimate
+        off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
+        told = {
+            "step": event.number,
+            "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
+            "image_cost": event.image_cost,
+            "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m),
+            "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)),
+            "estimate_off_mm": _by_name(truth.names, 1000 * off),
+            "estimate": estimated_to_json(estimate),
+            "truth": _scene(truth),
+        }
+        if self._begin.truth is not None:
+            told["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._begin.truth))
+        return told
+
+    def _draw(self, event: Stepped) -> None:
+        assert self._goal is not None
+        assert self._views is not None
+        now = self._begin.world.render((self._goal.camera,)).images[0]
+        title = f"step {event.number} of {event.steps}"
+        picture = frame(self._goal.image, now, event.rendered, self._views, title)
+        write_png(self._order.out / FRAMES_FOLDER / f"{len(self._frames):03d}.png", picture)
+        self._frames.append(picture)
+
+    def _write_csv(self) -> None:
+        names = self._start.names
+        keys = ("to_goal_mm", "to_goal_deg", "estimate_off_mm", "truly_to_goal_mm")
+        present = [key for key in keys if self._steps and key in self._steps[0]]
+        stages = ("first", "goal", "estimate", "plan", "act")
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["step", "image_cost", *(f"{stage}_s" for stage in stages),
+                        *(f"{name} {key}" for key in present for name in names)])  # fmt: skip
+        for step in self._steps:
+            seconds = [step["seconds"].get(stage, "") for stage in stages]
+            values = [step[key][name] for key in present for name in names]
+            table.writerow([step["step"], step["image_cost"], *seconds, *values])
+        write_atomically(self._order.out / CSV_FILE, text.getvalue().encode())
+
+    def _report(self, seconds: float) -> dict[str, Any]:
+        end, order = self._end, self._order
+        report: dict[str, Any] = {
+            "outcome": None if end is None else end.outcome,
+            "text": None if end is None else end.text,
+            "steps_done": len(self._actions),
+            "seconds": round(seconds, 2),
+            "seed": order.seed,
+            "objects": list(self._start.names),
+            "settings": asdict(order.settings),
+            "goal": None if self._goal is None else _goal_to_json(self._goal),
+            "noticed": self._notices,
+            "actions": self._actions,
+            "steps": self._steps,
+        }
+        if self._begin.truth is not None:
+            task = MpcTask(0, self._start, self._begin.truth, self._begin.moved)
+            score = score_of(task, self._begin.world.truth(), self._symmetries())
+            report["moved"], report["score"] = list(self._begin.moved), score.to_json()
+            report["success_2cm"] = score.is_success()
+        return report
+
+    def _symmetries(self) -> Mapping[str, Any]:
+        return {name: asset.info.symmetry for name, asset in self._begin.world.assets.items()}
+
+
+def _by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+    return {name: round(float(value), 3) for name, value in zip(names, values, strict=True)}
+
+
+def _shift(state: SceneState, goal: SceneState) -> Float[np.ndarray, "N"]:
+    there = np.array([goal.pose(name).position for name in state.names])
+    return np.linalg.norm(state.poses.position - there, axis=1)
+
+
+def _scene(state: SceneState) -> dict[str, Any]:
+    scene = scene_to_json(Scene(state, ()))
+    del scene["cameras"]
+    return scene
+
+
+def _goal_to_json(goal: GoalFound) -> dict[str, Any]:
+    names, poses = goal.goal.names, goal.goal.poses
+    wanted = [_pose_to_json(name, poses[n]) for n, name in enumerate(names)]
+    estimate = None if goal.estimate is None else estimated_to_json(goal.estimate)
+    return {"objects": wanted, "estimate": estimate}
+
+
+def _pose_to_json(name: str, pose: Pose) -> dict[str, Any]:
+    return {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}

@@ -1,0 +1,85 @@
+"""Runs an episode in the simulator, from an order to a folder of results, step by step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from app.episode.order import EpisodeOrder, given
+from app.episode.record import RECORDING_FILE, EpisodeRecord
+from osfcore.control.episode import Episode
+from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning
+from osfcore.evaluate.mpc_runs import knowledge_of
+from osfcore.fields.library import FieldLibrary
+from osfcore.objects.library import AssetLibrary
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EpisodeStep:
+    """How far an episode is.
+
+    Attributes:
+        done: actions executed.
+        total: actions at most.
+        note: what is being done.
+        event: what just happened, if anything did.
+        report: with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    event: Event | None = None
+    report: dict[str, Any] | None = None
+
+
+def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
+    """Run an episode; the last step brings the report, and the folder holds everything.
+
+    Raises:
+        OsfError: if the order cannot be met, or the disk refuses.
+    """
+    from app.viewer.recording import write_recording
+
+    total = order.settings.steps
+    yield EpisodeStep(0, total, "Loading fields and setting the table")
+    begin = given(order)
+    try:
+        assets = AssetLibrary(order.data_dir / "objects")
+        knowledge = knowledge_of(begin.world.names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
+        record = EpisodeRecord(order, begin)
+        rng = np.random.default_rng([order.seed, 1])
+        began, done, note = time.perf_counter(), 0, ""
+        for event in Episode(begin.world, knowledge, begin.goal, order.settings, rng).run():
+            record.take(event)
+            done = event.number if isinstance(event, Acted) else done
+            note = _note(event) or note
+            yield EpisodeStep(done, total, note, event)
+        yield EpisodeStep(done, total, "Writing video and recording")
+        report = record.finish(time.perf_counter() - began)
+        write_recording(order.out / RECORDING_FILE, assets, record.states)
+        yield EpisodeStep(done, total, str(report["text"]), report=report)
+    finally:
+        begin.world.close()
+
+
+def _note(event: Event) -> str | None:
+    """What is being done, for a person; None if this event changes nothing about it."""
+    match event:
+        case Looking():
+            where = {"first": "first frame", "goal": "goal image", "next": "table", "search": "lost objects"}
+            return f"Looking at the {where[event.look]}: {event.step.progress.note}"
+        case GoalFound():
+            return "Knows where everything should be"
+        case Planning():
+            return "Planning pushes"
+        case Acted():
+            return "Pushing"
+        case Noticed():
+            return event.text
+        case _:
+            return None

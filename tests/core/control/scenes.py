@@ -1,0 +1,38 @@
+"""A box and a can on the table, and what is known of them."""
+
+import numpy as np
+
+from osfcore.control.episode import Knowledge
+from osfcore.dynamics.library import load_push_model, load_shapes
+from osfcore.estimate.models import Models
+from osfcore.estimated import EstimatedState
+from osfcore.fields.library import FieldLibrary
+from osfcore.objects.asset import Symmetry
+from osfcore.scene import Light, SceneState
+from osfcore.world.tabletop import SceneRequest, Tabletop
+
+GELATIN, CAN = NAMES = ("009_gelatin_box", "005_tomato_soup_can")
+LIGHT = Light.from_angles(0.8, 0.7)
+
+
+def knowledge() -> Knowledge:
+    """Of both objects."""
+    fields = FieldLibrary(None)
+    models = Models({name: fields.load(name) for name in NAMES}, fields.load_table())
+    dynamics, shapes = load_push_model(None, fields, NAMES), load_shapes(None, fields, NAMES)
+    return Knowledge(models, dynamics, shapes, {name: Symmetry("none") for name in NAMES})
+
+
+def table(library) -> Tabletop:
+    """A world with both objects at rest, far enough from each other."""
+    world = Tabletop(library, request=SceneRequest(names=NAMES, light=LIGHT))
+    world.arrange(2)
+    return world
+
+
+def sure(state: SceneState, doubts: tuple[str, ...] | None = None) -> EstimatedState:
+    """An estimate without errors, perhaps doubted."""
+    count = len(state.names)
+    doubts = ("",) * count if doubts is None else doubts
+    reason = "; ".join(f"{n}: {d}" for n, d in zip(state.names, doubts, strict=True) if d)
+    return EstimatedState(state, np.full(count, 1e-3), np.full(count, 1e-2), 1e-2, doubts, reason)
