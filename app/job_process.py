@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import queue
 import signal
 import threading
 import time
@@ -14,7 +15,23 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
+from app.messages import (
+    Act,
+    AskStage,
+    CancelJob,
+    ChangeJob,
+    Failure,
+    JobCancelled,
+    JobDone,
+    JobRests,
+    JobStep,
+    ObserveScene,
+    PauseJob,
+    Reply,
+    ResumeJob,
+    StepJob,
+    TakeImage,
+)
 from app.processes import end_own_group, import_quietly, own_group, silence_stdout
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
@@ -30,10 +47,12 @@ class Place:
     Attributes:
         data_dir: of the service.
         folder: the job's own, for what it makes; exists.
+        orders: what the service tells the job; set in the job's own process.
     """
 
     data_dir: Path
     folder: Path
+    orders: Orders | None = None
 
     @property
     def library(self) -> AssetLibrary:
@@ -83,6 +102,12 @@ def _estimate(params: dict[str, Any], place: Place) -> Iterator[Any]:
     yield from estimate_job(params, place)
 
 
+def _episode(params: dict[str, Any], place: Place) -> Iterator[Any]:
+    from app.episode.job import episode_job
+
+    yield from episode_job(params, place)
+
+
 KINDS: dict[str, Callable[[dict[str, Any], Place], Iterator[Any]]] = {
     "collect_pushes": _collect_pushes,
     "collect_object": _collect_object,
@@ -90,6 +115,7 @@ KINDS: dict[str, Callable[[dict[str, Any], Place], Iterator[Any]]] = {
     "fetch_assets": _fetch_assets,
     "train_field": _train_field,
     "estimate": _estimate,
+    "episode": _episode,
 }
 _WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
 _NOT_EXTRA = ("done", "total", "note", "seen")
@@ -111,6 +137,7 @@ def _run(connection: Connection, orders: Orders, kind: str, params: dict[str, An
     result: dict[str, Any] = {}
     last = 0.0
     try:
+        place = dataclasses.replace(place, orders=orders)
         with contextlib.closing(KINDS[kind](params, place)) as steps:  # pyright: ignore[reportArgumentType]
             for step in steps:
                 result = _extras(step)
@@ -118,6 +145,8 @@ def _run(connection: Connection, orders: Orders, kind: str, params: dict[str, An
                 if now - last >= STEP_INTERVAL_S or step.done == step.total:
                     connection.send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
                     last = now
+                if getattr(step, "ends_round", False) and orders.rests_now():
+                    connection.send(JobRests())
                 if orders.must_stop():
                     return JobCancelled()
     except OsfError as error:
@@ -139,12 +168,45 @@ class Orders:
         self._may_run = threading.Event()
         self._may_run.set()
         self._is_cancelled = threading.Event()
+        self._rests_after_round = threading.Event()
+        self._answers: queue.SimpleQueue[Reply | Failure] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         threading.Thread(target=self._listen, name="orders", daemon=True).start()
 
     def must_stop(self) -> bool:
         """Whether the job was cancelled; waits here while it is paused."""
         self._may_run.wait()
         return self._is_cancelled.is_set()
+
+    def rests_now(self) -> bool:
+        """Whether the job was to rest after a round; then it is paused from now on."""
+        if not self._rests_after_round.is_set():
+            return False
+        self._rests_after_round.clear()
+        self._may_run.clear()
+        return True
+
+    def changes(self) -> list[dict[str, Any]]:
+        """Parameters that were sent since the last call, the latest last."""
+        found = []
+        with contextlib.suppress(queue.Empty):
+            while True:
+                found.append(self._changes.get_nowait())
+        return found
+
+    def ask(self, command: Act | ObserveScene | TakeImage) -> Any:  # noqa: ANN401  each command says what answers it
+        """Have something done with the scene that this job drives, and wait for the answer.
+
+        Raises:
+            StageError: if the stage refused it, or is not there.
+        """
+        from app.stage_link import StageError
+
+        self._connection.send(AskStage(command))
+        answer = self._answers.get()
+        if isinstance(answer, Failure):
+            raise StageError(answer.kind, answer.text)
+        return answer.value
 
     def _listen(self) -> None:
         while True:
@@ -158,7 +220,15 @@ class Orders:
                 case PauseJob():
                     self._may_run.clear()
                 case ResumeJob():
+                    self._rests_after_round.clear()
                     self._may_run.set()
+                case StepJob():
+                    self._rests_after_round.set()
+                    self._may_run.set()
+                case ChangeJob(params):
+                    self._changes.put(params)
+                case Reply() | Failure():
+                    self._answers.put(order)
                 case CancelJob():
                     self._is_cancelled.set()
                     self._may_run.set()

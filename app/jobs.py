@@ -20,8 +20,23 @@ from typing import Any
 
 from app.field_files import clear_workshop
 from app.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended, job_fields, job_from_fields
+from app.job_clock import JobClock
 from app.job_process import Place, job_main
-from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
+from app.messages import (
+    AskStage,
+    CancelJob,
+    ChangeJob,
+    Command,
+    Failure,
+    JobCancelled,
+    JobDone,
+    JobRests,
+    JobStep,
+    PauseJob,
+    Reply,
+    ResumeJob,
+    StepJob,
+)
 from app.processes import end, launch
 from app.store import CannotStore, Store, now_utc
 from osfcore.errors import OsfError, UnknownName
@@ -49,7 +64,7 @@ class _Run:
     id: str
     process: SpawnProcess
     connection: Connection
-    clock: _Clock
+    clock: JobClock
     cancel_at: float | None = None  # when patience with a cancelled job ends
 
 
@@ -62,6 +77,7 @@ class Jobs:
         publish: told of every change, and of what running jobs let the live view draw.
         max_queued: how many may wait.
         cancel_grace_s: how long a cancelled job may take to stop by itself.
+        serve: carries out what a job asks for with the scene that it drives.
     """
 
     def __init__(
@@ -71,12 +87,14 @@ class Jobs:
         publish: Callable[[JobChanged | JobSeen], None],
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
+        serve: Callable[[Command], Any] | None = None,
     ) -> None:
         self._store = store
         self._data_dir = data_dir
         self._publish = publish
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
+        self._serve = serve
         self._changed = threading.Condition(threading.RLock())
         self._jobs: dict[str, Job] = {}
         self._numbers: dict[str, int] = {}
@@ -206,7 +224,31 @@ class Jobs:
         """
         return self._switch(job, "paused", "running", ResumeJob())
 
-    def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob) -> Job:
+    def step(self, job: str) -> Job:
+        """Let a paused job go on to the end of its round, and rest again.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it is not paused.
+        """
+        return self._switch(job, "paused", "running", StepJob())
+
+    def change(self, job: str, params: dict[str, Any]) -> Job:
+        """Let a running or paused job work with other parameters from now on.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it neither runs nor pauses.
+        """
+        with self._changed:
+            found = self.get(job)
+            if found.state not in ("running", "paused") or self._run is None or self._run.cancel_at is not None:
+                raise WrongJobState(found, "changed")
+            self._order(ChangeJob(params))
+            self._set(replace(self._jobs[job], params={**found.params, **params}))
+            return self.get(job)
+
+    def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
         with self._changed:
             found = self.get(job)
             if found.state != before or self._run is None or self._run.cancel_at is not None:
@@ -237,7 +279,7 @@ class Jobs:
         if job.kind != "fetch_assets":
             folder.mkdir(parents=True, exist_ok=True)
         process, connection = launch(job_main, f"osf-job-{job.id}", job.kind, job.params, Place(self._data_dir, folder))
-        self._run = _Run(job.id, process, connection, _Clock())
+        self._run = _Run(job.id, process, connection, JobClock())
         self._set(replace(job, state="running", started_at=now_utc(), note="Starting"))
         self._tell_queue()
 
@@ -257,6 +299,10 @@ class Jobs:
                     self._progress(message)
                     if message.seen is not None:
                         self._publish(JobSeen(self._jobs[run.id], message.seen))
+                elif isinstance(message, AskStage):
+                    self._answer(run, message)
+                elif isinstance(message, JobRests):
+                    self._rest(run)
                 else:
                     outcome = message
             with self._changed:
@@ -307,7 +353,24 @@ class Jobs:
             job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
             self._set(job, is_progress=True)
 
-    def _order(self, order: PauseJob | ResumeJob | CancelJob) -> None:
+    def _answer(self, run: _Run, asked: AskStage) -> None:
+        """Carry out what a job asks for, with the scene that it drives and no other."""
+        scene = self._jobs[run.id].params.get("scene")
+        try:
+            if self._serve is None or asked.command.id != scene:
+                raise UnknownName("scene of this job", asked.command.id, [str(scene)])
+            answer: Reply | Failure = Reply(0, self._serve(asked.command))
+        except OsfError as error:
+            answer = Failure.of(error)
+        self._order(answer)
+
+    def _rest(self, run: _Run) -> None:
+        """The job has come to the end of a round, and waits."""
+        with self._changed:
+            run.clock.switch(is_running=False)
+            self._set(replace(self._jobs[run.id], state="paused", eta_s=None))
+
+    def _order(self, order: PauseJob | ResumeJob | StepJob | ChangeJob | CancelJob | Reply | Failure) -> None:
         assert self._run is not None
         try:
             self._run.connection.send(order)
@@ -376,30 +439,3 @@ class Jobs:
 
 def _with_advice(job: Job, text: str) -> str:
     return f"{text} {RESUMES_NOTE}" if job.kind == "train_field" else text
-
-
-class _Clock:
-    """How fast a job goes, pauses left out."""
-
-    def __init__(self) -> None:
-        self._first: tuple[int, float] | None = None
-        self._paused_at: float | None = None
-        self._paused_s = 0.0
-
-    def switch(self, *, is_running: bool) -> None:
-        now = time.monotonic()
-        if not is_running:
-            self._paused_at = now
-        elif self._paused_at is not None:
-            self._paused_s += now - self._paused_at
-            self._paused_at = None
-
-    def left_s(self, done: int, total: int) -> float | None:
-        """Time left [s], once there is something to go by."""
-        now = time.monotonic() - self._paused_s
-        if self._first is None:
-            self._first = (done, now)
-        first_done, start = self._first
-        if done <= first_done:
-            return None
-        return round((now - start) / (done - first_done) * (total - done), 1)

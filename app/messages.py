@@ -274,6 +274,18 @@ class JobStep:
     seen: object = None
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class AskStage:
+    """A job wants something done with the scene that it drives. Answered by a Reply or Failure, numbered 0."""
+
+    command: Act | ObserveScene | TakeImage
+
+
+@dataclass(frozen=True, slots=True)
+class JobRests:
+    """A job has come to the end of the round after which it was to rest."""
+
+
 @dataclass(frozen=True, slots=True)
 class JobDone:
     """A job has finished."""
@@ -294,6 +306,18 @@ class PauseJob:
 @dataclass(frozen=True, slots=True)
 class ResumeJob:
     """Go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepJob:
+    """Go on to the end of the current round, then rest; for kinds of jobs that have rounds."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ChangeJob:
+    """From now on, work with these parameters; for kinds of jobs that look at changes."""
+
+    params: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)

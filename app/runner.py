@@ -81,7 +81,9 @@ class Runner:
         self._store = store
         self.library = library
         self.hub = Hub()
-        self.jobs = Jobs(store, settings.data_dir, self._on_job, settings.max_queued_jobs, settings.cancel_grace_s)
+        self.jobs = Jobs(
+            store, settings.data_dir, self._on_job, settings.max_queued_jobs, settings.cancel_grace_s, self._serve
+        )
         self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets)
         self._stage = StageLink(
             library.root,
@@ -366,6 +368,10 @@ class Runner:
             self.hub.publish(Notice("warning", f"No first scene could be made. {error}"))
 
     # Inside
+
+    def _serve(self, command: Command) -> Any:  # noqa: ANN401  each command says what answers it
+        """Carry out what a job asks for with its own scene."""
+        return self._change(command) if isinstance(command, Act) else self._stage.call(command)
 
     def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
         self.scene(command.id)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from PIL import Image
 
 from osfcore.control.settings import EpisodeSettings
@@ -64,6 +65,25 @@ class Given:
     goal: GoalImage
     truth: SceneState | None
     moved: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SimulatedTable:
+    """A simulated table as reports see it.
+
+    Attributes:
+        world: the simulation.
+    """
+
+    world: Tabletop
+
+    def truth(self) -> SceneState:
+        """Where everything truly is."""
+        return self.world.truth()
+
+    def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """What a camera sees, the pusher included."""
+        return self.world.render((camera,)).images[0]
 
 
 def given(order: EpisodeOrder) -> Given:

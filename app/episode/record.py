@@ -5,21 +5,23 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from app.episode.frames import frame, write_video
-from app.episode.order import EpisodeOrder, Given
 from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.settings import EpisodeSettings
 from osfcore.evaluate.images import as_bytes, write_png
 from osfcore.evaluate.mpc_scores import score_of
 from osfcore.evaluate.mpc_tasks import MpcTask
 from osfcore.files import write_atomically, write_json
+from osfcore.objects.asset import Symmetry
 from osfcore.poses import Pose
-from osfcore.scene import SceneState
+from osfcore.scene import Camera, SceneState
 from osfcore.scenefile import Scene, scene_to_json
 from osfcore.statefile import estimated_to_json
 
@@ -27,16 +29,53 @@ REPORT_FILE, CSV_FILE, VIDEO_FILE, RECORDING_FILE = "report.json", "steps.csv", 
 GOAL_FILE, FRAMES_FOLDER = "goal.png", "frames"
 
 
+class Table(Protocol):
+    """What only a simulation tells of a table; for reports, never for the loop."""
+
+    def truth(self) -> SceneState:
+        """Where everything truly is."""
+        ...
+
+    def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """What a camera would see, the pusher included."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class About:
+    """What a record says besides what happens.
+
+    Attributes:
+        seed: of the searches, and of the scene where the episode made it.
+        settings: at the beginning.
+        goal: how the table truly should be; None where nobody knows.
+        moved: objects that truly should move, where that is known.
+        symmetries: which orientations of the objects look the same.
+    """
+
+    seed: int
+    settings: EpisodeSettings
+    goal: SceneState | None
+    moved: tuple[str, ...]
+    symmetries: Mapping[str, Symmetry]
+
+
 class EpisodeRecord:
     """Takes an episode's events and writes its results.
 
     Args:
-        order: what was asked for.
-        begin: world and goal.
+        folder: for them.
+        table: that the episode is about.
+        about: what it was asked to be.
+
+    Attributes:
+        states: true ones, at the beginning and after each action.
     """
 
-    def __init__(self, order: EpisodeOrder, begin: Given) -> None:
-        self._order, self._begin = order, begin
+    states: list[SceneState]
+
+    def __init__(self, folder: Path, table: Table, about: About) -> None:
+        self._folder, self._table, self._about = folder, table, about
         self._views: Float[np.ndarray, "V h w 3"] | None = None
         self._goal: GoalFound | None = None
         self._steps: list[dict[str, Any]] = []
@@ -44,9 +83,9 @@ class EpisodeRecord:
         self._frames: list[UInt8[np.ndarray, "H W 3"]] = []
         self._actions: list[list[float]] = []
         self._end: Finished | None = None
-        self._start = begin.world.truth()
+        self._start = table.truth()
         self.states = [self._start]
-        for left in (order.out / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
+        for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
             left.unlink()
 
     def take(self, event: Event) -> None:
@@ -60,10 +99,10 @@ class EpisodeRecord:
                 self._views = event.observation.images
             case GoalFound():
                 self._goal = event
-                write_png(self._order.out / GOAL_FILE, as_bytes(event.image))
+                write_png(self._folder / GOAL_FILE, as_bytes(event.image))
             case Acted():
                 self._actions.append(event.action.tolist())
-                self.states.append(self._begin.world.truth())
+                self.states.append(self._table.truth())
             case Noticed():
                 self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
             case Stepped():
@@ -80,15 +119,15 @@ class EpisodeRecord:
         Raises:
             CannotWrite: if the disk refuses.
         """
-        write_video(self._order.out / VIDEO_FILE, self._frames)
+        write_video(self._folder / VIDEO_FILE, self._frames)
         self._write_csv()
         report = self._report(seconds)
-        write_json(self._order.out / REPORT_FILE, report)
+        write_json(self._folder / REPORT_FILE, report)
         return report
 
     def _told(self, event: Stepped) -> dict[str, Any]:
         """A step as the report has it; lengths in mm, angles in degrees."""
-        truth, estimate = self._begin.world.truth(), event.estimate
+        truth, estimate = self._table.truth(), event.estimate
         off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
         told = {
             "step": event.number,
@@ -100,17 +139,17 @@ class EpisodeRecord:
             "estimate": estimated_to_json(estimate),
             "truth": _scene(truth),
         }
-        if self._begin.truth is not None:
-            told["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._begin.truth))
+        if self._about.goal is not None:
+            told["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._about.goal))
         return told
 
     def _draw(self, event: Stepped) -> None:
         assert self._goal is not None
         assert self._views is not None
-        now = self._begin.world.render((self._goal.camera,)).images[0]
+        now = self._table.photo(self._goal.camera)
         title = f"step {event.number} of {event.steps}"
         picture = frame(self._goal.image, now, event.rendered, self._views, title)
-        write_png(self._order.out / FRAMES_FOLDER / f"{len(self._frames):03d}.png", picture)
+        write_png(self._folder / FRAMES_FOLDER / f"{len(self._frames):03d}.png", picture)
         self._frames.append(picture)
 
     def _write_csv(self) -> None:
@@ -126,32 +165,29 @@ class EpisodeRecord:
             seconds = [step["seconds"].get(stage, "") for stage in stages]
             values = [step[key][name] for key in present for name in names]
             table.writerow([step["step"], step["image_cost"], *seconds, *values])
-        write_atomically(self._order.out / CSV_FILE, text.getvalue().encode())
+        write_atomically(self._folder / CSV_FILE, text.getvalue().encode())
 
     def _report(self, seconds: float) -> dict[str, Any]:
-        end, order = self._end, self._order
+        end, about = self._end, self._about
         report: dict[str, Any] = {
             "outcome": None if end is None else end.outcome,
             "text": None if end is None else end.text,
             "steps_done": len(self._actions),
             "seconds": round(seconds, 2),
-            "seed": order.seed,
+            "seed": about.seed,
             "objects": list(self._start.names),
-            "settings": asdict(order.settings),
+            "settings": asdict(about.settings),
             "goal": None if self._goal is None else _goal_to_json(self._goal),
             "noticed": self._notices,
             "actions": self._actions,
             "steps": self._steps,
         }
-        if self._begin.truth is not None:
-            task = MpcTask(0, self._start, self._begin.truth, self._begin.moved)
-            score = score_of(task, self._begin.world.truth(), self._symmetries())
-            report["moved"], report["score"] = list(self._begin.moved), score.to_json()
+        if about.goal is not None:
+            task = MpcTask(0, self._start, about.goal, about.moved)
+            score = score_of(task, self._table.truth(), about.symmetries)
+            report["moved"], report["score"] = list(about.moved), score.to_json()
             report["success_2cm"] = score.is_success()
         return report
-
-    def _symmetries(self) -> Mapping[str, Any]:
-        return {name: asset.info.symmetry for name, asset in self._begin.world.assets.items()}
 
 
 def _by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:

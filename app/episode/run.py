@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from app.episode.order import EpisodeOrder, given
-from app.episode.record import RECORDING_FILE, EpisodeRecord
+from app.episode.order import EpisodeOrder, SimulatedTable, given
+from app.episode.record import RECORDING_FILE, About, EpisodeRecord
 from osfcore.control.episode import Episode
 from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning
 from osfcore.evaluate.mpc_runs import knowledge_of
@@ -51,13 +51,15 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
     try:
         assets = AssetLibrary(order.data_dir / "objects")
         knowledge = knowledge_of(begin.world.names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
-        record = EpisodeRecord(order, begin)
+        symmetries = {name: assets.info(name).symmetry for name in begin.world.names}
+        about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries)
+        record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = np.random.default_rng([order.seed, 1])
         began, done, note = time.perf_counter(), 0, ""
         for event in Episode(begin.world, knowledge, begin.goal, order.settings, rng).run():
             record.take(event)
             done = event.number if isinstance(event, Acted) else done
-            note = _note(event) or note
+            note = note_of(event) or note
             yield EpisodeStep(done, total, note, event)
         yield EpisodeStep(done, total, "Writing video and recording")
         report = record.finish(time.perf_counter() - began)
@@ -67,7 +69,7 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         begin.world.close()
 
 
-def _note(event: Event) -> str | None:
+def note_of(event: Event) -> str | None:
     """What is being done, for a person; None if this event changes nothing about it."""
     match event:
         case Looking():

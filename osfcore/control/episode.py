@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -52,6 +54,7 @@ from osfcore.rollouts import Rollouts
 from osfcore.scene import Camera, Light, SceneState, goal_camera
 from osfcore.world.protocol import World
 
+StepT = TypeVar("StepT")
 _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
@@ -145,6 +148,7 @@ class Episode:
 
     def _begin(self) -> Iterator[Event]:
         observation = self._world.observe(masks=self._start is None)
+        self._check_objects(observation.names)
         yield Observed(0, observation)
         if self._start is None:
             self._estimate = yield from self._looked("first", estimate_first(
@@ -157,14 +161,16 @@ class Episode:
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
 
+    def _check_objects(self, names: tuple[str, ...]) -> None:
+        if isinstance(self._wanted, PoseGoal) and set(self._wanted.names) != set(names):
+            raise InvalidInput("objects of the goal", ", ".join(self._wanted.names), ", ".join(names))
+
     def _looked(self, look: Look, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # returns the EstimatedState
-        began, estimate = time.perf_counter(), None
-        for step in steps:
+        estimate = None
+        for step in self._timed(look if look in ("first", "goal") else "estimate", steps):
             estimate = step.estimate
             yield Looking(self._number, look, step)
         assert estimate is not None, "the last step brings the estimate"
-        stage = look if look in ("first", "goal") else "estimate"
-        self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - began
         return estimate
 
     def _look_again(self) -> Iterator[Event]:
@@ -223,11 +229,7 @@ class Episode:
     # The goal
 
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
-        wanted, state = self._wanted, self._estimate.state
-        names = wanted.names if isinstance(wanted, PoseGoal) else state.names
-        if set(names) != set(state.names):
-            raise InvalidInput("objects of the goal", ", ".join(names), ", ".join(state.names))
-        found, doubts = None, ""
+        wanted, state, found, doubts = self._wanted, self._estimate.state, None, ""
         if isinstance(wanted, GoalImage):
             steps = estimate_goal(self._knowledge.models, wanted.observed(state.names), state)
             found = yield from self._looked("goal", steps)
@@ -251,14 +253,12 @@ class Episode:
     # Planning and acting
 
     def _plan(self) -> Iterator[Event]:
-        began = time.perf_counter()
         left = self.settings.steps - self._number
         plan = self.settings.plan
         self._planner.settings = replace(plan, horizon=min(plan.horizon, left))
         self._goal = alike(self._goal, self._estimate.state, self._knowledge.symmetries)
         rounds = self._planner.plan(self._estimate.state, self._goal, self._cost(), self._rng, self._before)
-        for one in rounds:
-            self._seconds["plan"] = time.perf_counter() - began
+        for one in self._timed("plan", rounds):
             yield Planning(self._number, one)
 
     def _cost(self) -> Cost:
@@ -267,7 +267,6 @@ class Episode:
         return ImageCost(self._knowledge.models.together, self._camera, self._image, self._light)
 
     def _act(self) -> Iterator[Event]:
-        began = time.perf_counter()
         actions = self._planner.upcoming(min(self.settings.replan_every, self.settings.steps - self._number))
         state = self._estimate.state
         futures = self._knowledge.dynamics.rollout(state, actions[None], self._before)
@@ -276,12 +275,30 @@ class Episode:
         self._planner.executed(len(actions))
         self._before = state if len(actions) == 1 else _future(futures, len(actions) - 1, state)
         self._expected = _future(futures, len(actions), state)
-        self._seconds["act"] = time.perf_counter() - began
 
     def _execute(self, action: Float[np.ndarray, "3"]) -> Acted:
-        self._world.act(action)
+        with self._watched("act"):
+            self._world.act(action)
         self._number += 1
         return Acted(self._number, action)
+
+    # Time: what whoever drives this takes between two events does not count
+
+    @contextmanager
+    def _watched(self, stage: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - began
+
+    def _timed(self, stage: str, steps: Iterator[StepT]) -> Iterator[StepT]:
+        while True:
+            with self._watched(stage):
+                step = next(steps, None)
+            if step is None:
+                return
+            yield step
 
     # Telling
 

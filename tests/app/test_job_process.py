@@ -5,8 +5,22 @@ from threading import Event
 import pytest
 
 from app.job_process import KINDS, Orders, Place, job_main
-from app.messages import CancelJob, Failure, JobCancelled, JobDone, JobStep, PauseJob, ResumeJob
+from app.messages import (
+    AskStage,
+    CancelJob,
+    ChangeJob,
+    Failure,
+    JobCancelled,
+    JobDone,
+    JobStep,
+    PauseJob,
+    Reply,
+    ResumeJob,
+    StepJob,
+    TakeImage,
+)
 from app.processes import end, launch
+from app.stage_link import StageError
 from tests.app.conftest import until
 
 TABLE = {"images": 60, "size": 16, "seed": 0}
@@ -101,6 +115,53 @@ def test_pausing_holds_and_cancelling_frees():
     theirs.close()
 
 
+@pytest.fixture
+def wired():
+    """Orders of a job, and the service's end of the pipe."""
+    ours, theirs = Pipe()
+    lost = Event()
+    yield Orders(theirs, on_lost=lost.set), ours
+    ours.close()
+    assert lost.wait(10)
+    theirs.close()
+
+
+def test_a_single_step_rests_after_its_round(wired):
+    orders, ours = wired
+    ours.send(PauseJob())
+    until(lambda: not orders._may_run.is_set())
+    ours.send(StepJob())
+    until(orders._may_run.is_set)
+    assert not orders.must_stop()  # it goes on in the middle of the round
+    assert orders.rests_now()
+    assert not orders._may_run.is_set()
+    ours.send(ResumeJob())
+    until(orders._may_run.is_set)
+    assert not orders.rests_now()
+
+
+def test_changes_come_in_order_and_once(wired):
+    orders, ours = wired
+    ours.send(ChangeJob({"a": 1}))
+    ours.send(ChangeJob({"a": 2}))
+    until(lambda: orders._changes.qsize() == 2)
+    assert orders.changes() == [{"a": 1}, {"a": 2}]
+    assert orders.changes() == []
+
+
+def test_a_job_asks_for_what_it_wants_done_with_its_scene(wired):
+    orders, ours = wired
+    asked = TakeImage("s1", "goal", 32)
+    ours.send(Reply(0, b"picture"))
+    assert orders.ask(asked) == b"picture"
+    message = ours.recv()
+    assert isinstance(message, AskStage)
+    assert message.command == asked
+    ours.send(Failure(0, "UnknownName", "There is no such scene."))
+    with pytest.raises(StageError, match="no such scene"):
+        orders.ask(asked)
+
+
 def test_every_kind_that_rest_tells_of_exists():
     assert set(KINDS) == {
         "collect_pushes",
@@ -109,5 +170,6 @@ def test_every_kind_that_rest_tells_of_exists():
         "fetch_assets",
         "train_field",
         "estimate",
+        "episode",
     }
     assert Place(Path("d"), Path("f")).library.root == Path("d/objects")

@@ -1,6 +1,7 @@
 import os
 import signal
 import time
+from multiprocessing import Pipe
 
 import pytest
 
@@ -8,7 +9,7 @@ import app.jobs as jobs_module
 from app.field_files import workshop
 from app.job import JobSeen
 from app.jobs import RESUMES_NOTE, STOPPED_NOTE, Jobs, QueueFull, WrongJobState
-from app.messages import JobStep
+from app.messages import AskStage, JobDone, JobRests, JobStep, PauseJob, StepJob, TakeImage
 from app.store import CannotStore, Store
 from osfcore.errors import UnknownName
 from tests.app.conftest import until
@@ -252,3 +253,61 @@ def test_an_estimate_is_ended_without_grace(open_jobs, monkeypatch):
     os.kill(jobs._run.process.pid, signal.SIGSTOP)  # as in a step that takes long
     monkeypatch.setattr(jobs_module, "_ENDED_AT_ONCE", (LONG[0],))
     assert jobs.cancel(job.id).state == "cancelled"
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """The job's end of the pipe, so that a test can play the job."""
+    ours, theirs = Pipe()
+    monkeypatch.setattr(jobs_module, "launch", lambda *_: (None, ours))
+    monkeypatch.setattr(jobs_module, "end", lambda *_: None)
+    yield theirs
+    theirs.close()
+
+
+def test_a_job_may_rest_after_a_round_and_go_on_by_single_steps(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit("episode", {"scene": "s1"})
+    until_state(jobs, job, "running")
+    jobs.pause(job.id)
+    assert isinstance(played.recv(), PauseJob)
+    assert jobs.step(job.id).state == "running"
+    assert isinstance(played.recv(), StepJob)
+    played.send(JobRests())
+    until_state(jobs, job, "paused")
+    jobs.resume(job.id)
+    with pytest.raises(WrongJobState):
+        jobs.step(job.id)  # it runs anyway
+
+
+def test_parameters_of_a_live_job_can_be_changed(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit("episode", {"scene": "s1", "settings": {"steps": 30}})
+    until_state(jobs, job, "running")
+    assert jobs.change(job.id, {"settings": {"steps": 5}}).params == {"scene": "s1", "settings": {"steps": 5}}
+    assert played.recv().params == {"settings": {"steps": 5}}
+    played.send(JobDone({}))
+    until_state(jobs, job, "done")
+    with pytest.raises(WrongJobState):
+        jobs.change(job.id, {"settings": {}})
+
+
+def test_what_a_job_asks_for_is_done_with_its_own_scene_only(played, open_jobs):
+    asked = []
+
+    def serve(command):
+        asked.append(command)
+        if command.camera == "7":
+            raise UnknownName("camera", "7", ["0", "goal"])
+        return b"picture"
+
+    jobs, _ = open_jobs(serve=serve)
+    job = jobs.submit("episode", {"scene": "s1"})
+    until_state(jobs, job, "running")
+    played.send(AskStage(TakeImage("s1", "goal", 32)))
+    assert played.recv().value == b"picture"
+    played.send(AskStage(TakeImage("s1", "7", 32)))
+    assert "camera" in played.recv().text
+    played.send(AskStage(TakeImage("s2", "goal", 32)))
+    assert "s2" in played.recv().text
+    assert [command.id for command in asked] == ["s1", "s1"]

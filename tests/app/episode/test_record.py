@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from app.episode.frames import HEIGHT, WIDTH
-from app.episode.order import EpisodeOrder, Given
-from app.episode.record import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE, EpisodeRecord
+from app.episode.order import SimulatedTable
+from app.episode.record import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE, About, EpisodeRecord
 from osfcore.control.events import Acted, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.control.settings import EpisodeSettings
-from osfcore.control.target import GoalImage
 from osfcore.errors import CannotWrite
 from osfcore.estimated import EstimatedState
 from osfcore.evaluate.images import as_bytes
@@ -43,10 +42,12 @@ class Told:
         self.world.arrange(2)
         self.goal = shifted(self.world.truth(), BOX, 0.06)
         self.image = np.random.default_rng(0).random((SIDE, SIDE, 3))
-        self.order = EpisodeOrder(out, library.root, NAMES, seed=5, settings=EpisodeSettings(steps=9))
+        self.out = out
 
     def record(self, truth, moved=(BOX,)):
-        return EpisodeRecord(self.order, Given(self.world, GoalImage(goal_camera(SIDE), self.image), truth, moved))
+        symmetries = {name: asset.info.symmetry for name, asset in self.world.assets.items()}
+        about = About(5, EpisodeSettings(steps=9), truth, moved, symmetries)
+        return EpisodeRecord(self.out, SimulatedTable(self.world), about)
 
     def begin(self, record):
         record.take(Observed(0, self.world.observe()))
@@ -93,11 +94,11 @@ def rows(out):
 
 def test_the_report_is_what_the_file_holds(told, whole):
     _, report = whole
-    assert json.loads((told.order.out / REPORT_FILE).read_text()) == json.loads(json.dumps(report))
+    assert json.loads((told.out / REPORT_FILE).read_text()) == json.loads(json.dumps(report))
     assert (report["outcome"], report["text"]) == ("out of steps", "2 actions are done.")
     assert (report["seed"], report["objects"], report["seconds"]) == (5, list(NAMES), 12.35)
     assert report["settings"]["steps"] == 9
-    assert report["settings"]["plan"]["samples"] == told.order.settings.plan.samples
+    assert report["settings"]["plan"]["samples"] == EpisodeSettings().plan.samples
     assert report["actions"] == [ACTION.tolist()] * 2
     assert report["steps_done"] == 2
     assert report["noticed"] == [{"step": 2, "matter": "lamp", "text": "The lamp was moved."}]
@@ -121,7 +122,7 @@ def test_lengths_are_in_mm_and_angles_in_degrees(whole):
 
 def test_the_table_has_a_row_for_every_step(told, whole):
     _, report = whole
-    table = rows(told.order.out)
+    table = rows(told.out)
     assert len(table) == len(report["steps"])
     for row, step in zip(table, report["steps"], strict=True):
         assert (int(row["step"]), float(row["image_cost"])) == (step["step"], step["image_cost"])
@@ -132,7 +133,7 @@ def test_the_table_has_a_row_for_every_step(told, whole):
 
 
 def test_pictures_and_video_show_every_step(told, whole):
-    out = told.order.out
+    out = told.out
     seen = cv2.imread(str(out / GOAL_FILE))[..., ::-1]
     np.testing.assert_array_equal(seen, as_bytes(told.image))
     frames = sorted((out / FRAMES_FOLDER).iterdir())
@@ -168,11 +169,11 @@ def test_where_the_true_goal_is_unknown_nothing_is_said_about_it(told):
     report = told.end(record, 0)
     assert not {"score", "moved", "success_2cm"} & set(report)
     assert "truly_to_goal_mm" not in report["steps"][0]
-    (row,) = rows(told.order.out)
+    (row,) = rows(told.out)
     assert not [column for column in row if "truly" in column]
 
 
 def test_a_folder_that_cannot_be_written_is_told(told):
-    told.order.out.write_text("")
+    told.out.write_text("")
     with pytest.raises(CannotWrite, match="goal.png"):
         told.begin(told.record(told.goal))

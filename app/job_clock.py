@@ -1,0 +1,33 @@
+"""How fast a job goes, and how long it will take."""
+
+from __future__ import annotations
+
+import time
+
+
+class JobClock:
+    """Time left of a job, pauses left out."""
+
+    def __init__(self) -> None:
+        self._first: tuple[int, float] | None = None
+        self._paused_at: float | None = None
+        self._paused_s = 0.0
+
+    def switch(self, *, is_running: bool) -> None:
+        """The job pauses, or goes on."""
+        now = time.monotonic()
+        if not is_running:
+            self._paused_at = now
+        elif self._paused_at is not None:
+            self._paused_s += now - self._paused_at
+            self._paused_at = None
+
+    def left_s(self, done: int, total: int) -> float | None:
+        """Time left [s], once there is something to go by."""
+        now = time.monotonic() - self._paused_s
+        if self._first is None:
+            self._first = (done, now)
+        first_done, start = self._first
+        if done <= first_done:
+            return None
+        return round((now - start) / (done - first_done) * (total - done), 1)

@@ -1,0 +1,29 @@
+import pytest
+
+import app.job_clock as module
+from app.job_clock import JobClock
+
+
+@pytest.fixture
+def now(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_time_left_goes_by_what_was_done(now):
+    clock = JobClock()
+    assert clock.left_s(0, 10) is None  # nothing to go by yet
+    now[0] += 4
+    assert clock.left_s(2, 10) == pytest.approx(16)
+
+
+def test_pauses_do_not_count(now):
+    clock = JobClock()
+    clock.left_s(0, 10)
+    now[0] += 2
+    clock.switch(is_running=False)
+    now[0] += 1000
+    clock.switch(is_running=True)
+    now[0] += 2
+    assert clock.left_s(2, 10) == pytest.approx(16)
