@@ -67,6 +67,8 @@ class Evaluate:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
+        if self.what != "fields" and (self.data is not None or self.weights is not None):
+            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
         if self.what == "dynamics":
             return self._dynamics()
         if self.what == "mpc":
@@ -102,8 +104,6 @@ class Evaluate:
         from osfcore.fields.library import FieldLibrary
         from osfcore.objects.library import AssetLibrary
 
-        if self.data is not None or self.weights is not None:
-            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
         config = EvaluateEstimate(self._folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         return follow(evaluate_estimate(config, fields, assets)), partial(_show_estimate, config.folder)
@@ -114,8 +114,6 @@ class Evaluate:
         from osfcore.fields.library import FieldLibrary
         from osfcore.objects.library import AssetLibrary
 
-        if self.data is not None or self.weights is not None:
-            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
         config = EvaluateDynamics(self._folder, self.tasks, self.seed, self.names, self.data_dir)
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         with worker_pool(self.workers) as executor:
@@ -132,8 +130,6 @@ class Evaluate:
         from osfcore.fields.library import FieldLibrary
         from osfcore.objects.library import AssetLibrary
 
-        if self.data is not None or self.weights is not None:
-            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
         config = EvaluateMpc(
             self._folder, self.data_dir, self.tasks, self.objects, self.seed, self.cost, self.names, self.oracle
         )

@@ -8,7 +8,9 @@ from app.job_process import Place
 from osfcore.control.events import Acted, Stepped
 from osfcore.errors import InvalidInput
 from osfcore.evaluate.images import as_bytes, write_png
-from osfcore.scene import goal_camera
+from osfcore.poses import Pose
+from osfcore.progress import Progress
+from osfcore.scene import Light, SceneState, goal_camera
 from tests.app.episode.test_remote import NAMES, Stage, stage  # noqa: F401  a fixture
 from tests.core.control.scenes import sure
 
@@ -39,17 +41,11 @@ def sighted(monkeypatch, stage):  # noqa: F811
 
     def found(*_, **__):
         state = stage.world.truth()
-        yield core.EstimateStep(core_progress(), "done", state, estimate=sure(state))
+        yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 
     for name in ("estimate_first", "estimate_next"):
         monkeypatch.setattr(core, name, found)
     monkeypatch.setattr(core, "usual_residuals", lambda *_: np.zeros(len(NAMES)))
-
-
-def core_progress():
-    from osfcore.progress import Progress
-
-    return Progress(1, 1, "Done")
 
 
 def params(stage, shift=0.06, settings=SMALL):  # noqa: F811
@@ -92,7 +88,7 @@ def test_a_goal_image_is_read_from_the_inputs(place, stage, sighted, monkeypatch
     def explained(_models, observation, _prior):
         np.testing.assert_allclose(observation.images[0], image, atol=1 / 255)
         state = stage.world.truth()
-        yield core.EstimateStep(core_progress(), "done", state, estimate=sure(state))
+        yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 
     monkeypatch.setattr(core, "estimate_goal", explained)
     monkeypatch.setattr(core, "unmoved", lambda _models, _goal, found, _now: found)
@@ -109,5 +105,9 @@ def test_settings_in_json_are_checked_like_any(stage):  # noqa: F811
 
 
 def test_rounds_end_where_a_step_of_the_loop_does():
-    assert not Episoding(0, 3, "Pushing").ends_round
-    assert Stepped.__name__ == "Stepped"
+    state = sure(SceneState((), Pose(np.zeros((0, 3)), np.zeros((0, 4))), Light(np.array([0.0, 0, 1])), None))
+    image = np.zeros((16, 16, 3))
+    stepped = Stepped(1, 3, state, np.zeros(0), np.zeros(0), 0.0, image, {})
+    assert Episoding(1, 3, "Looking", seen=stepped).ends_round
+    assert not Episoding(1, 3, "Pushing", seen=Acted(1, np.zeros(3))).ends_round
+    assert not Episoding(0, 3, "Loading").ends_round
