@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 
@@ -21,6 +22,18 @@ def test_every_command_explains_itself(command, capsys):
         main([*command, "--help"])
     assert stop.value.code == 0
     assert "usage: osf" in capsys.readouterr().out
+
+
+def test_threads_do_not_spin_while_they_wait_unless_told_to(monkeypatch, capsys):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert os.environ["OMP_WAIT_POLICY"] == "active"
+    assert "usage" in capsys.readouterr().out
 
 
 def test_json_is_the_last_line_and_keys_are_stable(data_dir):
