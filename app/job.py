@@ -9,9 +9,9 @@ from typing import Any, Literal
 from app.store import now_utc
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 
-State = Literal["queued", "running", "paused", "done", "failed", "cancelled"]
+State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files
-FINISHED: tuple[State, ...] = ("done", "failed", "cancelled")
+FINISHED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
 
 
 class WrongJobState(OsfError):

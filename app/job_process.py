@@ -30,7 +30,7 @@ from app.messages import (
     Reply,
     ResumeJob,
     StepJob,
-    TakeImage,
+    TakeView,
 )
 from app.processes import end_own_group, import_quietly, own_group, silence_stdout
 from osfcore.errors import OsfError
@@ -142,7 +142,7 @@ def _run(connection: Connection, orders: Orders, kind: str, params: dict[str, An
             for step in steps:
                 result = _extras(step)
                 now = time.monotonic()
-                if now - last >= STEP_INTERVAL_S or step.done == step.total:
+                if now - last >= STEP_INTERVAL_S or step.done == step.total or getattr(step, "must_be_told", False):
                     connection.send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
                     last = now
                 if getattr(step, "ends_round", False) and orders.rests_now():
@@ -194,7 +194,7 @@ class Orders:
                 found.append(self._changes.get_nowait())
         return found
 
-    def ask(self, command: Act | ObserveScene | TakeImage) -> Any:  # noqa: ANN401  each command says what answers it
+    def ask(self, command: Act | ObserveScene | TakeView) -> Any:  # noqa: ANN401  each command says what answers it
         """Have something done with the scene that this job drives, and wait for the answer.
 
         Raises:

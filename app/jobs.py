@@ -21,6 +21,7 @@ from typing import Any
 from app.field_files import clear_workshop
 from app.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended, job_fields, job_from_fields
 from app.job_clock import JobClock
+from app.job_ends import DIED, STOPPED, after
 from app.job_process import Place, job_main
 from app.messages import (
     AskStage,
@@ -41,9 +42,6 @@ from app.processes import end, launch
 from app.store import CannotStore, Store, now_utc
 from osfcore.errors import OsfError, UnknownName
 
-STOPPED_NOTE = "The service stopped while this job was running; start it again."
-DIED_NOTE = "The job's process ended unexpectedly; it may have run out of memory."
-RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."
 _ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
 _LOOK_INTERVAL_S = 0.2
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
@@ -111,7 +109,7 @@ class Jobs:
             self._jobs[job.id], self._numbers[job.id] = job, number
         for job in list(self._jobs.values()):
             if job.state in ("running", "paused"):
-                self._fail_stopped(job)
+                self._set(after(job, STOPPED, self.folder(job.id)))
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
@@ -195,7 +193,8 @@ class Jobs:
             if found.is_finished:
                 raise WrongJobState(found, "cancelled")
             if found.state == "queued":
-                self._forget_work(found)
+                shutil.rmtree(self.folder(job), ignore_errors=True)
+                self._forget_workshop(found)
                 self._set(ended(self._jobs[job], "cancelled", note="Cancelled"))
                 self._tell_queue()
                 return self.get(job)
@@ -293,7 +292,7 @@ class Jobs:
                 try:
                     message = run.connection.recv()
                 except (EOFError, OSError):
-                    outcome = Failure(0, "Died", DIED_NOTE)
+                    outcome = DIED
                     break
                 if isinstance(message, JobStep):
                     self._progress(message)
@@ -311,7 +310,7 @@ class Jobs:
                 if self._untold is not None:
                     self._set(self._untold, is_progress=True)
                 if self._is_stopping:
-                    outcome = Failure(0, "Stopped", STOPPED_NOTE)
+                    outcome = STOPPED
                 elif run.cancel_at is not None and time.monotonic() > run.cancel_at:
                     outcome = JobCancelled()
         end(run.process, 0.0 if isinstance(outcome, Failure | JobCancelled) else 1.0)
@@ -320,27 +319,14 @@ class Jobs:
 
     def _finish(self, run: _Run, outcome: object) -> None:
         job = self._jobs[run.id]
-        folder = self.folder(job.id)
         if run.cancel_at is not None and not isinstance(outcome, JobDone):
             outcome = JobCancelled()  # whatever ended it first, it was asked to
-        match outcome:
-            case JobDone(result):
-                files = tuple(sorted(p.name for p in folder.glob("[!.]*") if p.is_file()))
-                after = ended(job, "done", note="Done", result=result, files=files)
-            case JobCancelled():
-                after = ended(job, "cancelled", note="Cancelled")
-            case Failure(_, kind, text):
-                text = _with_advice(job, text) if kind in ("Died", "Stopped") else text
-                after = ended(job, "failed", note="Failed", error=text)
-            case _:
-                after = ended(job, "failed", note="Failed", error="The job's process told nonsense.")
-        if after.state != "done":
-            shutil.rmtree(folder, ignore_errors=True)
-        if after.state == "cancelled":
-            self._forget_work(job)
+        then = after(job, outcome, self.folder(job.id))
+        if then.state == "cancelled":
+            self._forget_workshop(job)
         with self._changed:
             self._run = None
-            self._set(after)
+            self._set(then)
             self._changed.notify_all()
 
     def _progress(self, step: JobStep) -> None:
@@ -415,10 +401,6 @@ class Jobs:
         for job in self._queue():
             self._keep_and_tell(job)
 
-    def _fail_stopped(self, job: Job) -> None:
-        shutil.rmtree(self.folder(job.id), ignore_errors=True)
-        self._set(ended(job, "failed", note="Failed", error=_with_advice(job, STOPPED_NOTE)))
-
     def _take(self, job: Job, inputs: Path) -> None:
         place = self.inputs(job.id)
         try:
@@ -427,15 +409,10 @@ class Jobs:
         except OSError as error:
             raise CannotStore(place, error.strerror or str(error)) from error
 
-    def _forget_work(self, job: Job) -> None:
-        """Remove what a job that was not done was given, or would find at its next try, unless another works there."""
-        shutil.rmtree(self.folder(job.id), ignore_errors=True)
+    def _forget_workshop(self, job: Job) -> None:
+        """Remove what a cancelled training would find at its next try, unless another works there."""
         if job.kind != "train_field":
             return
         name = job.params["name"]
         if not any(other.id != job.id and other.params["name"] == name for other in self.live("train_field")):
             clear_workshop(self._data_dir, name)
-
-
-def _with_advice(job: Job, text: str) -> str:
-    return f"{text} {RESUMES_NOTE}" if job.kind == "train_field" else text

@@ -18,19 +18,42 @@ from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
 from app import problems, relay
+from app.driver import Driver
+from app.episodes import Episodes
 from app.estimates import Estimates
 from app.field_shelf import FieldShelf
+from app.goals import Goals
+from app.metrics import Metrics, MetricsMiddleware
 from app.neural.link import NeuralLink
 from app.neural.predictor import WHO, predictor_main
+from app.paths import static_folder
 from app.predictions import Predictions
-from app.routes import estimates, events, fields, health, jobs, neural, objects, predictions, scenes
+from app.routes import (
+    driver,
+    episodes,
+    estimates,
+    events,
+    fields,
+    goals,
+    health,
+    jobs,
+    metrics,
+    neural,
+    objects,
+    predictions,
+    presets,
+    scenes,
+)
+from app.routes import settings as settings_routes
 from app.runner import Runner
 from app.schemas import FrameEvent, NoticeEvent, Problem
 from app.schemas_estimates import EstimateIn
+from app.schemas_goals import GoalIn
 from app.security import BodyLimitMiddleware, SecurityMiddleware
 from app.services import Services, Shelf
 from app.settings import Settings
 from app.store import Store
+from app.token_gate import TokenMiddleware
 from app.viewer import Viewer
 from osfcore.objects.library import AssetLibrary
 
@@ -41,6 +64,10 @@ _DESCRIPTION = (
     "Errors are application/problem+json with one sentence in `detail`."
 )
 
+_ROUTES = (
+    health, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs, settings_routes,
+    driver, metrics, events,
+)  # fmt: skip
 _UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
 
@@ -58,30 +85,26 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=_lifespan,
         generate_unique_id_function=_operation_id,
     )
-    app.state.settings = settings
+    app.state.settings, app.state.metrics = settings, Metrics()
     limit_of = partial(_body_limit, settings)
     app.add_middleware(BodyLimitMiddleware, limit_of=limit_of)
+    if settings.token is not None:
+        app.add_middleware(TokenMiddleware, token=settings.token.get_secret_value())
     app.add_middleware(  # outermost: also the limit's answer gets its headers and becomes a problem
         SecurityMiddleware,
         allowed_hosts=settings.allowed_hosts,
         allowed_origins=settings.allowed_origins,
         limit_of=limit_of,
     )
+    app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.install(app)
-    for module in (health, objects, fields, scenes, neural, estimates, predictions, jobs, events):
+    for module in _ROUTES:
         app.include_router(module.router)
     app.include_router(relay.router)
     _add_docs(app)
     app.openapi = lambda: _openapi(app)  # pyright: ignore[reportAttributeAccessIssue]
     app.mount("/", StaticFiles(directory=static_folder(), html=True), name="static")
     return app
-
-
-def static_folder() -> Path:
-    """The page's files: inside the installed package, or at the top of a checkout."""
-    here = Path(__file__).parent
-    packaged = here / "static"
-    return packaged if packaged.is_dir() else here.parent / "static"
 
 
 @asynccontextmanager
@@ -103,18 +126,28 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         predictor = NeuralLink(settings.data_dir, predictor_main, WHO)
         stack.push_async_callback(run_in_threadpool, predictor.stop)
         predicted = Predictions(runner, fields.names, predictor)
-        viewer = Viewer(runner, neural, fields.names, found, predicted)
+        wanted = Goals(runner, settings.data_dir, settings.max_goals)
+        await run_in_threadpool(wanted.start)
+        acted = Episodes(runner, fields, wanted, settings.data_dir)
+        viewer = Viewer(runner, neural, fields.names, found, predicted, wanted)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
-        services = Services(settings, store, runner, viewer, shelf, fields, neural, found, predicted)
+        driving = Driver(runner.hub.publish)
+        services = Services(
+            settings, store, runner, viewer, shelf, fields, neural, found, predicted, wanted, acted, driving
+        )
         app.state.services = services
+        app.state.metrics.watch(runner)
         stack.callback(services.closing.set)
         yield
 
 
 def _body_limit(settings: Settings, path: str) -> int:
     """How large a request to a path may be [bytes]: only uploads are large."""
-    return settings.max_upload_bytes if path.rstrip("/") in _UPLOAD_PATHS else settings.max_body_bytes
+    path = path.rstrip("/")
+    if path == goals.UPLOAD_PATH:
+        return max(settings.max_photo_bytes, settings.max_body_bytes)
+    return settings.max_upload_bytes if path in _UPLOAD_PATHS else settings.max_body_bytes
 
 
 def _operation_id(route: APIRoute) -> str:
@@ -126,7 +159,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-        for model in (Problem, FrameEvent, NoticeEvent, EstimateIn):
+        for model in (Problem, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
             schemas[model.__name__] = own

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from osfcore.errors import OsfError
 from osfcore.poses import Pose
-from osfcore.scene import Light, SceneState
+from osfcore.scene import DEFAULT_IMAGE_SIDE, Camera, Light, SceneState
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -112,6 +112,15 @@ class TakeImage:
     pusher: bool = True
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class TakeView:
+    """What any camera would see, as PNG. Answered by bytes."""
+
+    id: str
+    camera: Camera
+    pusher: bool = True
+
+
 @dataclass(frozen=True, slots=True)
 class TakeMask:
     """The visible pixels of one object, as 8-bit PNG of 0 and 255. Answered by bytes."""
@@ -137,6 +146,42 @@ class ObserveScene:
     folder: Path
     goal: bool
     masks: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ComposeGoal:
+    """How a scene could become, seen by the goal camera without the pusher. Answered by a ComposedGoal.
+
+    The scene stays as it is.
+
+    Attributes:
+        id: of the scene.
+        poses: of objects that lie elsewhere; they come to rest as if let go.
+        seed: of a random layout, instead of poses; None for the poses.
+        moved: objects that a random layout moves; as the seed will have it if None.
+        light: in which it is seen; None for the scene's.
+        size: side of the image [px].
+    """
+
+    id: str
+    poses: tuple[tuple[str, Pose], ...] = ()
+    seed: int | None = None
+    moved: int | None = None
+    light: Light | None = None
+    size: int = DEFAULT_IMAGE_SIDE
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ComposedGoal:
+    """How a scene could become.
+
+    Attributes:
+        png: what the goal camera sees.
+        poses: of all objects, at rest.
+    """
+
+    png: bytes
+    poses: tuple[tuple[str, Pose], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +211,10 @@ Command = (
     | EditScene
     | Act
     | TakeImage
+    | TakeView
     | TakeMask
     | ObserveScene
+    | ComposeGoal
     | ShowScene
     | WatchFrames
     | Leave
@@ -278,7 +325,7 @@ class JobStep:
 class AskStage:
     """A job wants something done with the scene that it drives. Answered by a Reply or Failure, numbered 0."""
 
-    command: Act | ObserveScene | TakeImage
+    command: Act | ObserveScene | TakeView
 
 
 @dataclass(frozen=True, slots=True)

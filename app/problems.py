@@ -25,6 +25,10 @@ STATUS_OF_KIND = {
     "ShippedField": 409,
     "MissingFields": 409,
     "NoScene": 409,
+    "NoTable": 409,
+    "NoDraft": 404,
+    "DraftUnsound": 409,
+    "TooManyGoals": 409,
     "NothingToPush": 409,
     "NoPrior": 409,
     "NoImages": 404,
@@ -41,6 +45,7 @@ STATUS_OF_KIND = {
 }
 _TITLES = {
     400: "Bad request",
+    401: "Token needed",
     403: "Forbidden",
     404: "Not found",
     405: "Method not allowed",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import secrets
 import threading
@@ -16,7 +15,6 @@ import numpy as np
 
 from app.field_files import sweep
 from app.hub import Hub
-from app.image_cache import ImageCache
 from app.image_sets import ImageSets
 from app.job import Job, JobChanged, JobSeen, SetInUse, TrainingAlready, check_params
 from app.jobs import Jobs
@@ -24,6 +22,8 @@ from app.messages import (
     Act,
     AdoptScene,
     Command,
+    ComposedGoal,
+    ComposeGoal,
     CreateScene,
     CurrentScene,
     DropScene,
@@ -39,6 +39,7 @@ from app.messages import (
     TakeMask,
     WatchFrames,
 )
+from app.scene_images import SceneImages
 from app.settings import Settings
 from app.stage_link import StageLink, Status
 from app.store import Store, now_utc
@@ -51,9 +52,6 @@ DEMO_OBJECTS = 3
 MAX_SEED = 2**31 - 1
 _RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
-
-
-ImageKey = tuple[int, TakeImage | TakeMask]  # revision of the scene, and what is asked for
 
 
 class SceneHeld(OsfError):
@@ -98,8 +96,9 @@ class Runner:
         self._records: dict[str, SceneRecord] = {}
         self._current: str | None = None
         self._watchers = 0
-        self._images = ImageCache(settings.image_cache_bytes)
-        self._images_in_the_making: dict[ImageKey, asyncio.Future[bytes]] = {}
+        self._images = SceneImages(
+            settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._stage.call_async
+        )
         self._scenes_in_the_making = 0
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
@@ -258,9 +257,7 @@ class Runner:
             OsfError: if something would overlap or makes no sense; then nothing moves.
         """
         self._check_free(scene)
-        if len({name for name, _ in poses}) != len(poses):
-            raise InvalidInput("list of objects", ", ".join(name for name, _ in poses), "without repetition")
-        _stacked([pose for _, pose in poses])
+        _check_poses(poses)
         return self._change(EditScene(scene, light, poses, settle))
 
     def act(self, scene: str, actions: Iterable[object]) -> SceneRecord:
@@ -282,29 +279,7 @@ class Runner:
             InvalidInput: if the size is out of range.
         """
         image_side(command.size)
-        key = (self.scene(command.id).revision, command)
-        found = self._images.get(key)
-        if found is not None:
-            return found
-        making = self._images_in_the_making.get(key)
-        if making is None:
-            making = asyncio.ensure_future(self._make_image(key))
-            self._images_in_the_making[key] = making
-            making.add_done_callback(lambda done: self._image_made(key, done))
-        return await asyncio.shield(making)  # whoever asked first may leave, others still wait
-
-    async def _make_image(self, key: ImageKey) -> bytes:
-        revision, command = key
-        image = await self._stage.call_async(command)
-        # After a change in between, what was made shows the later state, so it is not kept.
-        if revision == self.scene(command.id).revision:
-            self._images.put(key, image)
-        return image
-
-    def _image_made(self, key: ImageKey, done: asyncio.Future[bytes]) -> None:
-        del self._images_in_the_making[key]
-        if not done.cancelled():
-            done.exception()  # taken note of, in case that everybody has left
+        return await self._images.image(command)
 
     def observe(self, scene: str, folder: Path, *, goal: bool, masks: bool) -> SceneRecord:
         """Write what the robot sees of a scene now as an observation folder; tells the scene as it was then.
@@ -315,6 +290,20 @@ class Runner:
         """
         self.scene(scene)
         return self._stage.call(ObserveScene(scene, folder, goal, masks))
+
+    def compose(self, command: ComposeGoal) -> ComposedGoal:
+        """How a scene could become, seen by the goal camera; the scene stays as it is.
+
+        Raises:
+            UnknownName: if there is no such scene or object.
+            SceneHeld: if a job uses the scene.
+            OsfError: if something would overlap, or makes no sense.
+        """
+        self.scene(command.id)
+        self._check_free(command.id)
+        _check_poses(command.poses)
+        image_side(command.size)
+        return self._stage.call(command)
 
     def watch_frames(self, change: int) -> None:
         """Tell that `change` more (or less, if negative) listeners look at live images."""
@@ -439,6 +428,12 @@ class Runner:
         self.hub.publish(event)
         if isinstance(event, JobChanged) and event.job.kind == "fetch_assets" and event.job.state == "done":
             self.ensure_demo_scene()
+
+
+def _check_poses(poses: tuple[tuple[str, Pose], ...]) -> None:
+    if len({name for name, _ in poses}) != len(poses):
+        raise InvalidInput("list of objects", ", ".join(name for name, _ in poses), "without repetition")
+    _stacked([pose for _, pose in poses])
 
 
 def _stacked(poses: list[Pose]) -> Pose:

@@ -113,7 +113,9 @@ class JobOut(BaseModel):
     """A job as it is now."""
 
     id: str
-    kind: Literal["collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field", "estimate"]
+    kind: Literal[
+        "collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field", "estimate", "episode"
+    ]
     params: dict[str, Any]
     state: State
     position: int | None = Field(description="Place in the queue, 1 is next; null when not queued.")

@@ -10,8 +10,11 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from app.driver import Driver
+from app.episodes import Episodes
 from app.estimates import Estimates
 from app.field_shelf import FieldShelf
+from app.goals import Goals
 from app.messages import SceneRecord
 from app.neural.link import NeuralLink
 from app.predictions import Predictions
@@ -73,6 +76,9 @@ class Services:
     neural: NeuralLink
     estimates: Estimates
     predictions: Predictions
+    goals: Goals
+    episodes: Episodes
+    driver: Driver
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
     def scene_out(self, record: SceneRecord) -> SceneOut:

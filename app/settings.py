@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from app.paths import default_data_dir
@@ -27,9 +27,12 @@ class Settings(BaseSettings):
     allowed_origins: Names = Field(
         default=(), description="Origins, such as https://lab.example, that may use the service besides its own."
     )
+    token: SecretStr | None = Field(default=None, min_length=8, description="That every request must bring, if set.")
     demo_scene: bool = Field(default=True, description="Whether a scene is made when there is none.")
     max_body_bytes: int = Field(default=4 << 20, ge=1024)  # a thousand sequences of thirty actions in full precision
     max_upload_bytes: int = Field(default=1 << 30, ge=1024, description="Of a zipped image set or observation.")
+    max_photo_bytes: int = Field(default=20 << 20, ge=1024, description="Of a goal image.")
+    max_goals: int = Field(default=100, ge=1, description="Goal images kept at once.")
     max_image_sets: int = Field(default=20, ge=1, description="Uploaded image sets kept at once.")
     max_scenes: int = Field(default=32, ge=1, description="Scenes kept at once.")
     max_live_worlds: int = Field(default=4, ge=1, description="Scenes whose simulation stays in memory.")

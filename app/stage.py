@@ -23,6 +23,8 @@ from app.messages import (
     Act,
     AdoptScene,
     Command,
+    ComposedGoal,
+    ComposeGoal,
     CreateScene,
     DropScene,
     EditScene,
@@ -39,6 +41,7 @@ from app.messages import (
     StageReady,
     TakeImage,
     TakeMask,
+    TakeView,
     WatchFrames,
 )
 from app.processes import import_quietly, silence_stdout
@@ -150,10 +153,15 @@ class Stage:
                 return self._act(scene, tuple(check_action(a) for a in actions))
             case TakeImage():
                 return self._image(command)
+            case TakeView(scene, camera, pusher):
+                image = self._world(scene).render((camera,), with_pusher=pusher).images[0]
+                return _encoded(_eight_bit(image), ".png")
             case TakeMask():
                 return self._mask(command)
             case ObserveScene():
                 return self._observe(command)
+            case ComposeGoal():
+                return self._compose(command)
             case ShowScene(scene):
                 self._shown = scene
                 self._frames_due = scene is not None
@@ -314,6 +322,19 @@ class Stage:
         seen = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
         write_observation(command.folder, seen)
         return replace(record, state=world.truth())
+
+    def _compose(self, command: ComposeGoal) -> ComposedGoal:
+        from app.episode.composing import composed
+
+        world, time_s = self._world(command.id), self._time_s(command.id)
+        try:
+            goal = composed(world, command)
+            image = world.render((goal_camera(image_side(command.size)),), with_pusher=False).images[0]
+        finally:
+            world.restore(self._record(command.id).state)
+            self._time_offsets[command.id] = time_s
+        poses = tuple((name, goal.pose(name)) for name in goal.names)
+        return ComposedGoal(_encoded(_eight_bit(image), ".png"), poses)
 
     def _take_frames(self) -> None:
         """Send the shown scene's live images if they are wanted and stale."""

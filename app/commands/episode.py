@@ -52,8 +52,8 @@ class RunEpisode:
 
     def run(self) -> dict[str, Any]:
         """Run it with a progress bar; the result is report.json without the single steps."""
+        from app.episode.names import REPORT_FILE
         from app.episode.order import EpisodeOrder
-        from app.episode.record import REPORT_FILE
         from app.episode.run import run_episode
         from osfcore.control.settings import EpisodeSettings
         from osfcore.fields.devices import pick_device

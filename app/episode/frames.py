@@ -5,21 +5,24 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.evaluate.images import as_bytes
 from osfcore.scene import STEP_S
 
 TILE_PX, _BAR_PX = 192, 16
 COLUMNS = 4
 WIDTH, HEIGHT = COLUMNS * TILE_PX, 2 * (TILE_PX + _BAR_PX)  # multiples of 16, as H.264 wants them
+Part = Literal["all", "goal", "now", "estimate", "difference"]
+_TOP = ("goal", "now", "estimate", "difference")
 _DIFFERENCE = 3.0  # by which differences are magnified
 _PAPER, _INK = 24, (230, 230, 230)
 
@@ -55,10 +58,40 @@ def _row(tiles: dict[str, np.ndarray]) -> UInt8[np.ndarray, "H W 3"]:
     row = np.full((TILE_PX + _BAR_PX, WIDTH, 3), _PAPER, np.uint8)
     for column, (label, image) in enumerate(tiles.items()):
         left = column * TILE_PX
-        row[_BAR_PX:, left : left + TILE_PX] = cv2.resize(as_bytes(image), (TILE_PX, TILE_PX))
+        height, width = (round(TILE_PX * side / max(image.shape[:2])) for side in image.shape[:2])
+        row[_BAR_PX : _BAR_PX + height, left : left + width] = cv2.resize(as_bytes(image), (width, height))
         place = (left + 4, _BAR_PX - 4)
         cv2.putText(row, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.36, _INK, 1, cv2.LINE_AA)
     return row
+
+
+def read_frames(folder: Path) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """The frames in a folder, by number.
+
+    Raises:
+        CorruptFile: if one is no picture.
+    """
+    yield from map(read_frame, sorted(folder.glob("[0-9]*.png"), key=lambda path: int(path.stem)))
+
+
+def read_frame(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """One frame.
+
+    Raises:
+        CorruptFile: if it is no picture of a frame's size.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None or picture.shape != (HEIGHT, WIDTH, 3):
+        raise CorruptFile(path, "it is no readable frame")
+    return picture[..., ::-1]
+
+
+def part_of(picture: UInt8[np.ndarray, "H W 3"], part: Part) -> UInt8[np.ndarray, "h w 3"]:
+    """One picture of a frame, without its caption; "all" for the whole."""
+    if part == "all":
+        return picture
+    left = TILE_PX * _TOP.index(part)
+    return picture[_BAR_PX : _BAR_PX + TILE_PX, left : left + TILE_PX]
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]]) -> None:

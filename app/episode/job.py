@@ -1,29 +1,34 @@
 """The job that runs an episode on a scene of the service.
 
 Its parameters name the scene, which it drives while it runs: hands may move things while it pauses. A goal image lies
-in its inputs as `goal.png`; goal poses stand in the parameters. It leaves what `osf episode` leaves.
+in its inputs as `goal.png`; goal poses stand in the parameters. Where everything truly is in the image, if that is
+known, is for the report alone. It leaves what `osf episode` leaves.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.episode.names import GOAL_FILE, RECORDING_FILE
 from app.job import INPUTS
+from osfcore.poses import Pose, rotation_angle
+from osfcore.scene import SceneState
+from osfcore.scenefile import camera_from_json
 
 if TYPE_CHECKING:
+    from app.episode.sketch import PlanSketch
     from app.job_process import Place
     from osfcore.control.events import Event
     from osfcore.control.settings import EpisodeSettings
     from osfcore.control.target import GoalImage
     from osfcore.plan.goals import PoseGoal
 
-GOAL_FILE = "goal.png"  # among the inputs
+_STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,15 +39,21 @@ class Episoding:
         done: actions executed.
         total: actions at most.
         note: what is being done, for a person.
-        report: what came of it, without single steps; only at the end.
-        seen: what just happened.
+        stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
+        steps: rounds whose results are in the report.
+        outcome: how it ended; only at the end.
+        text: the same in a sentence.
+        seen: what just happened, as a picture shows it.
     """
 
     done: int
     total: int
     note: str
-    report: dict[str, Any] | None = None
-    seen: Event | None = None
+    stage: str | None = None
+    steps: int = 0
+    outcome: str | None = None
+    text: str | None = None
+    seen: Event | PlanSketch | None = None
 
     @property
     def ends_round(self) -> bool:
@@ -51,6 +62,13 @@ class Episoding:
 
         return isinstance(self.seen, Stepped)
 
+    @property
+    def must_be_told(self) -> bool:
+        """Whether a view that misses this would show something wrong."""
+        from osfcore.control.events import Looking
+
+        return self.seen is not None and not isinstance(self.seen, Looking)
+
 
 def episode_job(params: dict[str, Any], place: Place) -> Iterator[Episoding]:
     """Run an episode.
@@ -58,12 +76,10 @@ def episode_job(params: dict[str, Any], place: Place) -> Iterator[Episoding]:
     Raises:
         OsfError: if an object has no field, the goal does not fit, the simulation is gone, or the disk refuses.
     """
-    from app.episode.record import RECORDING_FILE, About, EpisodeRecord
+    from app.episode.record import About, EpisodeRecord
     from app.episode.remote import RemoteWorld
-    from app.episode.run import note_of
     from app.viewer.recording import write_recording
     from osfcore.control.episode import Episode
-    from osfcore.control.events import Acted
     from osfcore.evaluate.mpc_runs import knowledge_of
     from osfcore.fields.library import FieldLibrary
 
@@ -72,23 +88,46 @@ def episode_job(params: dict[str, Any], place: Place) -> Iterator[Episoding]:
     yield Episoding(0, settings.steps, "Loading fields, half a minute the first time")
     knowledge = knowledge_of(names, FieldLibrary(place.data_dir), place.library, place.data_dir)
     world = RemoteWorld(place.orders.ask, params["scene"], place.folder)
-    about = About(params["seed"], settings, None, (), knowledge.symmetries)
+    goal, start = params["goal"], world.truth()
+    wanted = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
+    about = About(params["seed"], settings, wanted, _moved(start, wanted), knowledge.symmetries)
     record = EpisodeRecord(place.folder, world, about)
     rng = np.random.default_rng([params["seed"], 1])
-    episode = Episode(world, knowledge, _goal(params["goal"], names, place.folder / INPUTS), settings, rng)
-    began, done, note = time.perf_counter(), 0, ""
+    episode = Episode(world, knowledge, _goal(goal, names, place.folder / INPUTS), settings, rng)
+    told = Episoding(0, settings.steps, "Looking")
     for event in episode.run():
         for change in place.orders.changes():
             episode.settings = settings_of(change["settings"])
         record.take(event)
-        done = event.number if isinstance(event, Acted) else done
-        note = note_of(event) or note
-        yield Episoding(done, episode.settings.steps, note, seen=event)
-    report = record.finish(time.perf_counter() - began)
+        told = _told(told, event, episode.settings.steps)
+        yield told
+    yield replace(told, note="Writing video and recording", seen=None)
+    record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
     world.close()
-    told = {key: value for key, value in report.items() if key not in ("steps", "actions")}
-    yield Episoding(done, episode.settings.steps, str(report["text"]), told)
+    yield replace(told, note=told.text or told.note, seen=None)
+
+
+def _told(before: Episoding, event: Event, total: int) -> Episoding:
+    """How far an episode is after an event."""
+    from app.episode.run import note_of, stage_of
+    from app.episode.sketch import sketch_of
+    from osfcore.control.events import Acted, Finished, Observed, Planning, Stepped
+
+    then = replace(before, total=total, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
+    match event:
+        case Observed():  # its images are on the page already
+            return replace(then, seen=None)
+        case Planning(number, round_):
+            return replace(then, seen=sketch_of(number, round_))
+        case Acted(number):
+            return replace(then, done=number, seen=event)
+        case Stepped():
+            return replace(then, steps=before.steps + 1, seen=event)
+        case Finished(_, outcome, text):
+            return replace(then, outcome=outcome, text=text, note=text, seen=event)
+        case _:
+            return replace(then, seen=event)
 
 
 def settings_of(given: Mapping[str, Any]) -> EpisodeSettings:
@@ -108,11 +147,25 @@ def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> Goa
     """The goal image among the inputs, or the poses in the parameters."""
     from app.episode.order import read_goal
     from osfcore.plan.goals import PoseGoal
-    from osfcore.poses import Pose
-    from osfcore.scene import goal_camera
 
-    if given.get("poses") is None:
-        return read_goal(inputs / GOAL_FILE, goal_camera())
-    poses = {entry["name"]: entry for entry in given["poses"]}
-    positions, quaternions = (np.array([poses[n][part] for n in names], float) for part in ("position", "quaternion"))
-    return PoseGoal(names, Pose(positions, quaternions))
+    if given["poses"] is None:
+        return read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
+    return PoseGoal(names, _poses(given["poses"], names))
+
+
+def _poses(entries: list[dict[str, Any]], names: tuple[str, ...]) -> Pose:
+    """Poses from JSON, in the order of `names`."""
+    by_name = {entry["name"]: entry for entry in entries}
+    positions, quaternions = (np.array([by_name[n][part] for n in names], float) for part in ("position", "quaternion"))
+    return Pose(positions, quaternions)
+
+
+def _moved(start: SceneState, wanted: SceneState | None) -> tuple[str, ...]:
+    """Objects that lie elsewhere in the goal than at the beginning."""
+    if wanted is None:
+        return ()
+    shift_m = np.linalg.norm(wanted.poses.position - start.poses.position, axis=1)
+    turn_rad = rotation_angle(wanted.poses.quaternion, start.poses.quaternion)
+    return tuple(
+        n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > _STAYS_M or rad > _STAYS_RAD
+    )

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from app.episode.composing import random_goal
 from osfcore.control.settings import EpisodeSettings
 from osfcore.control.target import GoalImage
-from osfcore.errors import CorruptFile, InvalidInput, NoRoom
-from osfcore.evaluate.mpc_tasks import draw_goal
+from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.library import FieldLibrary
 from osfcore.files import reading_png
 from osfcore.objects.library import AssetLibrary
@@ -20,7 +20,6 @@ from osfcore.scene import Camera, SceneState, goal_camera
 from osfcore.world.tabletop import SceneRequest, Tabletop
 
 _MODES = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's, of 8 bits a channel: others would be clipped silently
-_GOALS = 30  # random ones that are tried until one has room
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,25 +105,16 @@ def given(order: EpisodeOrder) -> Given:
 
 def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
     world.arrange(order.seed)
-    if order.moved is not None and not 1 <= order.moved <= len(world.names):
-        raise InvalidInput("number of objects that move", order.moved, f"between 1 and {len(world.names)}")
     if order.goal is not None:
         goal = read_goal(order.goal, goal_camera())
         if order.moved is not None:
             raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
         return Given(world, goal, None, ())
-    start = world.truth()
-    for attempt in range(_GOALS):
-        rng = np.random.default_rng([order.seed, attempt])
-        count = int(rng.integers(1, len(world.names) + 1)) if order.moved is None else order.moved
-        world.restore(start)
-        found = draw_goal(world, count, rng)
-        if found is not None:
-            camera = goal_camera()
-            image = world.render((camera,), with_pusher=False).images[0]
-            world.restore(start)
-            return Given(world, GoalImage(camera, image), *found)
-    raise NoRoom(world.names, _GOALS)
+    start, camera = world.truth(), goal_camera()
+    found = random_goal(world, order.seed, order.moved)
+    image = world.render((camera,), with_pusher=False).images[0]
+    world.restore(start)
+    return Given(world, GoalImage(camera, image), *found)
 
 
 def read_goal(path: Path, camera: Camera) -> GoalImage:

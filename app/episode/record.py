@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from app.episode.frames import frame, write_video
+from app.episode.frames import TILE_PX, frame, read_frames, write_video
+from app.episode.names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
 from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.control.settings import EpisodeSettings
 from osfcore.evaluate.images import as_bytes, write_png
@@ -24,9 +26,6 @@ from osfcore.poses import Pose
 from osfcore.scene import Camera, SceneState
 from osfcore.scenefile import Scene, scene_to_json
 from osfcore.statefile import estimated_to_json
-
-REPORT_FILE, CSV_FILE, VIDEO_FILE, RECORDING_FILE = "report.json", "steps.csv", "video.mp4", "episode.viser"
-GOAL_FILE, FRAMES_FOLDER = "goal.png", "frames"
 
 
 class Table(Protocol):
@@ -80,7 +79,7 @@ class EpisodeRecord:
         self._goal: GoalFound | None = None
         self._steps: list[dict[str, Any]] = []
         self._notices: list[dict[str, Any]] = []
-        self._frames: list[UInt8[np.ndarray, "H W 3"]] = []
+        self._began = time.perf_counter()
         self._actions: list[list[float]] = []
         self._end: Finished | None = None
         self._start = table.truth()
@@ -112,17 +111,23 @@ class EpisodeRecord:
                 self._end = event
             case _:
                 pass
+        if isinstance(event, GoalFound | Noticed | Stepped | Finished):
+            self._write()
 
-    def finish(self, seconds: float) -> dict[str, Any]:
-        """Write what is whole only at the end; the report.
+    def finish(self) -> dict[str, Any]:
+        """Write the video, and tell the report.
 
         Raises:
             CannotWrite: if the disk refuses.
         """
-        write_video(self._folder / VIDEO_FILE, self._frames)
-        self._write_csv()
-        report = self._report(seconds)
+        write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
+        return self._write()
+
+    def _write(self) -> dict[str, Any]:
+        """Report and table so far: an episode that is broken off leaves what it has done."""
+        report = self._report()
         write_json(self._folder / REPORT_FILE, report)
+        self._write_csv()
         return report
 
     def _told(self, event: Stepped) -> dict[str, Any]:
@@ -146,11 +151,12 @@ class EpisodeRecord:
     def _draw(self, event: Stepped) -> None:
         assert self._goal is not None
         assert self._views is not None
-        now = self._table.photo(self._goal.camera)
+        camera = self._goal.camera
+        scale = TILE_PX / max(camera.width, camera.height)
+        now = self._table.photo(camera.resized(round(scale * camera.width), round(scale * camera.height)))
         title = f"step {event.number} of {event.steps}"
         picture = frame(self._goal.image, now, event.rendered, self._views, title)
-        write_png(self._folder / FRAMES_FOLDER / f"{len(self._frames):03d}.png", picture)
-        self._frames.append(picture)
+        write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps) - 1:03d}.png", picture)
 
     def _write_csv(self) -> None:
         names = self._start.names
@@ -167,13 +173,13 @@ class EpisodeRecord:
             table.writerow([step["step"], step["image_cost"], *seconds, *values])
         write_atomically(self._folder / CSV_FILE, text.getvalue().encode())
 
-    def _report(self, seconds: float) -> dict[str, Any]:
+    def _report(self) -> dict[str, Any]:
         end, about = self._end, self._about
         report: dict[str, Any] = {
             "outcome": None if end is None else end.outcome,
             "text": None if end is None else end.text,
             "steps_done": len(self._actions),
-            "seconds": round(seconds, 2),
+            "seconds": round(time.perf_counter() - self._began, 2),
             "seed": about.seed,
             "objects": list(self._start.names),
             "settings": asdict(about.settings),

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from app.messages import Act, ObserveScene, SceneRecord, TakeImage
+from app.messages import Act, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import OsfError
 from osfcore.observationfile import read_observation
 from osfcore.scene import Camera, Observation, SceneState, check_action
 
 _SEEN = ".seen"
-Ask = Callable[[Act | ObserveScene | TakeImage], Any]
+Ask = Callable[[Act | ObserveScene | TakeView], Any]
 
 
 class RemoteWorld:
@@ -78,7 +78,7 @@ class RemoteWorld:
         return record.state
 
     def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
-        """What the goal camera sees now, the pusher included, at the size of a camera."""
-        data = self._ask(TakeImage(self._scene, "goal", camera.height))
+        """What a camera would see now, the pusher included, at its size."""
+        data = self._ask(TakeView(self._scene, camera))
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             return np.asarray(image.convert("RGB"), np.float32) / 255

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from app.episode.names import RECORDING_FILE
 from app.episode.order import EpisodeOrder, SimulatedTable, given
-from app.episode.record import RECORDING_FILE, About, EpisodeRecord
+from app.episode.record import About, EpisodeRecord
 from osfcore.control.episode import Episode
 from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning
 from osfcore.evaluate.mpc_runs import knowledge_of
@@ -55,14 +55,14 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries)
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = np.random.default_rng([order.seed, 1])
-        began, done, note = time.perf_counter(), 0, ""
+        done, note = 0, ""
         for event in Episode(begin.world, knowledge, begin.goal, order.settings, rng).run():
             record.take(event)
             done = event.number if isinstance(event, Acted) else done
             note = note_of(event) or note
             yield EpisodeStep(done, total, note, event)
         yield EpisodeStep(done, total, "Writing video and recording")
-        report = record.finish(time.perf_counter() - began)
+        report = record.finish()
         write_recording(order.out / RECORDING_FILE, assets, record.states)
         yield EpisodeStep(done, total, str(report["text"]), report=report)
     finally:
@@ -83,5 +83,18 @@ def note_of(event: Event) -> str | None:
             return "Pushing"
         case Noticed():
             return event.text
+        case _:
+            return None
+
+
+def stage_of(event: Event) -> str | None:
+    """Which part of the loop an event belongs to; None if it says nothing about that."""
+    match event:
+        case Looking():
+            return event.look
+        case Planning():
+            return "plan"
+        case Acted():
+            return "act"
         case _:
             return None

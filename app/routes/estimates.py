@@ -2,13 +2,11 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response, status
-from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
-from pydantic import ValidationError
 from starlette.requests import ClientDisconnect
 
 from app.estimate_job import Mode
@@ -16,7 +14,8 @@ from app.estimates import Asked, Estimates
 from app.job import Job
 from app.problems import NotFound
 from app.routes import problems
-from app.routes.events import Mailbox, job_event
+from app.routes.bodies import JSON, kind_of, parsed, whole_body
+from app.routes.events import followed
 from app.routes.neural import COMPARED, compared, compared_png
 from app.schemas import Seed
 from app.schemas_estimates import EstimateIn, EstimateList, EstimateOut
@@ -24,13 +23,13 @@ from app.services import ServicesDep
 from osfcore.errors import OsfError, UnknownName
 
 UPLOAD_PATH = "/api/estimates"
-_JSON, _ZIP = "application/json", "application/zip"
+_ZIP = "application/zip"
 _SCHEMA_REF = {"$ref": "#/components/schemas/EstimateIn"}
 _BODY = {
     "requestBody": {
         "description": "JSON for a scene of the simulation, or a zipped observation folder, as /docs and README say.",
         "content": {
-            _JSON: {"schema": _SCHEMA_REF, "example": {"mode": "first"}},
+            JSON: {"schema": _SCHEMA_REF, "example": {"mode": "first"}},
             _ZIP: {"schema": {"type": "string", "format": "binary"}},
         },
     }
@@ -73,7 +72,7 @@ async def create(
     The zip holds observation.json and the PNGs that it names, in the format of `osf estimate`; for the modes "next" and
     "goal" also prior.json, a state.json or scene.json of how the objects lay, unless `prior` names an estimate.
     """
-    kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    kind = kind_of(request)
     if kind == _ZIP:
         try:
             job = await services.estimates.of_upload(Asked(mode, seed, prior), request.stream(), file_name)
@@ -107,18 +106,8 @@ def cancel(services: ServicesDep, job: FoundDep) -> EstimateOut:
 @router.get("/{estimate}/events", response_class=EventSourceResponse, responses=problems(404))
 async def follow(services: ServicesDep, job: FoundDep) -> AsyncIterator[ServerSentEvent]:
     """Follow one estimate: "job" events as at /api/events, from how it is now to its end."""
-    mailbox = Mailbox(None)
-    leave = services.runner.hub.subscribe(mailbox.put)
-    try:
-        now = services.estimates.get(job.id)  # again, now that nothing is missed
-        yield job_event(0, now)
-        while not now.is_finished and not services.closing.is_set():
-            letter = await mailbox.next_job(job.id)
-            if letter is not None:
-                now = letter.job
-                yield job_event(letter.event, now)
-    finally:
-        leave()
+    async for event in followed(services, job):
+        yield event
 
 
 @router.get("/{estimate}/images/{view}.png", response_class=Response, responses={**problems(404, 409, 503), **COMPARED})
@@ -150,22 +139,14 @@ def _out(estimates: Estimates, job: Job) -> EstimateOut:
 
 async def _wanted(request: Request, kind: str, max_bytes: int) -> EstimateIn:
     """The JSON of a request; nothing at all asks for the defaults."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > max_bytes:
-            raise HTTPException(status.HTTP_413_CONTENT_TOO_LARGE, f"The request is larger than {max_bytes} bytes.")
+    body = await whole_body(request, max_bytes)
     if not body and not kind:
         return EstimateIn.model_validate({})
-    if kind != _JSON:
-        allowed = f"{_JSON} for a scene, or {_ZIP} for an observation folder"
+    if kind != JSON:
+        allowed = f"{JSON} for a scene, or {_ZIP} for an observation folder"
         raise HTTPException(
             status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, f"The body is {kind or 'untyped'}, but it must be {allowed}."
         )
     if request.query_params:
         raise OsfError(f"{next(iter(request.query_params))} stands in the query, which is for uploads; use the body.")
-    try:
-        return EstimateIn.model_validate_json(bytes(body))
-    except ValidationError as error:
-        entries: list[dict[str, Any]] = [{**entry, "loc": ("body", *entry["loc"])} for entry in error.errors()]
-        raise RequestValidationError(entries) from None
+    return parsed(EstimateIn, body)

@@ -14,10 +14,14 @@ from fastapi import APIRouter, Header, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
+from app.driver import DriverChanged
+from app.goals import DraftChanged, GoalsChanged
 from app.job import Job, JobChanged, job_from_fields
 from app.messages import CurrentScene, FramesTaken, Notice, SceneChanged
 from app.routes import problems
+from app.routes.driver import DriverOut
 from app.schemas import FrameEvent, NoticeEvent
+from app.schemas_goals import DraftOut
 from app.schemas_jobs import JobOut
 from app.services import Services, ServicesDep
 
@@ -35,7 +39,8 @@ class Mailbox:
     def __init__(self, current: str | None) -> None:
         self._loop = asyncio.get_running_loop()
         self._current = current
-        self.letters: deque[JobChanged | Notice] = deque(maxlen=_MAX_WAITING)
+        self.letters: deque[JobChanged | Notice | GoalsChanged | DriverChanged] = deque(maxlen=_MAX_WAITING)
+        self.draft: DraftChanged | None = None
         self.is_scene_new = True
         self.frames: FramesTaken | None = None
         self.arrived = asyncio.Event()
@@ -58,8 +63,10 @@ class Mailbox:
 
     def _put(self, event: object) -> None:
         match event:
-            case JobChanged() | Notice():
+            case JobChanged() | Notice() | GoalsChanged() | DriverChanged():
                 self.letters.append(event)
+            case DraftChanged():
+                self.draft = event
             case CurrentScene(record):
                 self._current = None if record is None else record.id
                 self.is_scene_new, self.frames = True, None
@@ -74,17 +81,26 @@ class Mailbox:
 async def stream(
     services: ServicesDep,
     frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
+    visitor: Annotated[
+        str | None,
+        Query(min_length=1, max_length=64, pattern="^[A-Za-z0-9_-]+$", description="What the page calls itself."),
+    ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: "job", "scene", "frame" and "notice" events."""
+    """Follow what happens: "job", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
-    is_watching = False
+    is_watching = has_arrived = False
     try:
         if frames:
             is_watching = True  # before the call: a page that leaves during it must be counted out again
             await run_in_threadpool(services.runner.watch_frames, 1)
+        if visitor is not None:
+            has_arrived = True
+            services.driver.arrive(visitor)
         yield ServerSentEvent(comment="connected", retry=1000)
+        if services.goals.draft is not None:
+            yield _draft_event(services, DraftChanged(services.goals.draft))
         last = 0
         if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
             last = min(int(last_event_id[:19]), _MAX_EVENT)
@@ -95,6 +111,8 @@ async def stream(
             yield event
     finally:
         leave()
+        if visitor is not None and has_arrived:
+            services.driver.leave(visitor)
         if is_watching:
             services.runner.watch_frames(-1)
 
@@ -106,10 +124,18 @@ async def _follow(
     while not services.closing.is_set():
         while mailbox.letters:
             letter = mailbox.letters.popleft()
-            if isinstance(letter, Notice):
-                yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
-            elif letter.event == 0 or letter.event > last:  # not replayed already
-                yield job_event(letter.event, letter.job)
+            match letter:
+                case Notice():
+                    yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
+                case GoalsChanged():
+                    yield ServerSentEvent(event="goals", raw_data="null")
+                case DriverChanged():
+                    yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
+                case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
+                    yield job_event(letter.event, letter.job)
+        if mailbox.draft is not None:
+            changed, mailbox.draft = mailbox.draft, None
+            yield _draft_event(services, changed)
         now = time.monotonic()
         if mailbox.is_scene_new and now >= scene_at:
             mailbox.is_scene_new, scene_at = False, now + SCENE_INTERVAL_S
@@ -130,6 +156,22 @@ async def _follow(
                 continue
 
 
+async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEvent]:
+    """Events of one job, from how it is now to its end."""
+    mailbox = Mailbox(None)
+    leave = services.runner.hub.subscribe(mailbox.put)
+    try:
+        now = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        yield job_event(0, now)
+        while not now.is_finished and not services.closing.is_set():
+            letter = await mailbox.next_job(job.id)
+            if letter is not None:
+                now = letter.job
+                yield job_event(letter.event, now)
+    finally:
+        leave()
+
+
 def job_event(number: int, job: Job) -> ServerSentEvent:
     """A job as an event; the number is 0 where nothing came after it that could be asked for."""
     return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
@@ -141,6 +183,12 @@ def _scene_event(services: Services) -> ServerSentEvent:
     if record is None:
         return ServerSentEvent(event="scene", raw_data="null")
     return ServerSentEvent(event="scene", data=services.scene_out(record))
+
+
+def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
+    if changed.draft is None:
+        return ServerSentEvent(event="draft", raw_data="null")
+    return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.shelf.labels()))
 
 
 def _frame(taken: FramesTaken) -> FrameEvent:

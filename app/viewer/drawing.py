@@ -67,6 +67,7 @@ class SceneDrawing:
         self._is_light_held = False
         self._has_names = True
         self._has_gizmos = False
+        self._lamp_wishes: dict[str, tuple[bool, str]] = {}
         self._has_lamp = True
         self._add_room()
         self._add_light()
@@ -134,9 +135,15 @@ class SceneDrawing:
         for frustum in self._frustums.values():
             frustum.visible = is_on
 
-    def show_lamp(self, *, is_on: bool, name: str = "") -> None:
-        """Show or hide the scene's own light; with a name, in another colour, so that it is not taken for a guess."""
+    def show_lamp(self, *, is_on: bool, name: str = "", by: str = "") -> None:
+        """Show or hide the scene's own light; with a name, in another colour, so that it is not taken for a guess.
+
+        Each view that draws guesses has its say: the lamp is as usual once none of them wants it otherwise.
+        """
         with self._lock:
+            self._lamp_wishes[by] = is_on, name
+            others = [wish for wish in self._lamp_wishes.values() if wish != (True, "")]
+            is_on, name = max(others, default=(True, ""))
             self._cube.visible = self._light_gizmo.visible = self._has_lamp = is_on
             self._ray.visible = is_on and self._pusher.visible
             self._cube.color = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 from collections.abc import Callable, Iterator
 
@@ -11,7 +10,7 @@ import numpy as np
 import viser
 
 from app.viewer.drawing import LIGHT_COLOUR, LIGHT_CUBE_M
-from app.viewer.ghosts import Mesh, box, coarse, footprint_m, heading_rad, sector, spread, top_m
+from app.viewer.ghosts import Mesh, box, footprint_m, heading_rad, mesh_of, sector, spread, top_m
 from osfcore.errors import OsfError
 from osfcore.estimate.steps import EstimateStep
 from osfcore.estimated import EstimatedState
@@ -20,31 +19,44 @@ from osfcore.poses import Pose
 from osfcore.scene import Light
 
 GHOSTS = 24  # candidates of each object that are drawn
-_TRIED, _GUESS, _SURE, _DOUBTED = (90, 205, 255), (20, 120, 200), (10, 150, 110), (235, 115, 15)
-_TRIED_LIGHT_M, _UNKNOWN_M = 0.018, 0.05
+GUESS = (20, 120, 200)
+_TRIED, _SURE, _DOUBTED = (90, 205, 255), (10, 150, 110), (235, 115, 15)
+_TRIED_LIGHT_M = 0.018
 _SIGMAS = 2.0
 _LEAST_BALL_M, _MOST_BALL_M = 0.006, 0.1
 _LEAST_TURN_RAD, _MOST_TURN_RAD = 0.06, np.pi
 _RING_M = (0.008, 0.035)  # from the object's footprint outwards
 _TABLE_M = 0.0015  # above it, so that it does not flicker
 _LABEL_M = 0.045
+_WIRES, _FAINT_WIRES = 0.9, 0.35  # opacity; things on their way are to be seen through them
 _WIRE_SCALE = 1.01  # or wires and the surface below them would flicker
 _AWAY_M = -0.5  # an object that was not looked at yet is put far below the table
-_log = logging.getLogger(__name__)
+Colour = tuple[int, int, int]
 
 
 class EstimateDrawing:
-    """Nodes below /estimate. Any thread may call.
+    """Nodes below one of their own. Any thread may call.
 
     Args:
         server: to draw in.
         library: knows the objects' shapes.
         is_named: tells whether an object is drawn with its name already, since it is on the table.
+        root: the node.
+        colour: of the guess.
+        has_light: whether the light is drawn, too.
     """
 
     def __init__(
-        self, server: viser.ViserServer, library: AssetLibrary, is_named: Callable[[str], bool] = lambda _: True
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        is_named: Callable[[str], bool] = lambda _: True,
+        *,
+        root: str = "/estimate",
+        colour: Colour = GUESS,
+        has_light: bool = True,
     ) -> None:
+        self._root, self._colour, self._has_light = root, colour, has_light
         self._server = server
         self._is_named = is_named
         self._scene = server.scene
@@ -58,7 +70,7 @@ class EstimateDrawing:
         self._has_candidates = True
         self._lamp: tuple[viser.BoxHandle, viser.LineSegmentsHandle, viser.LabelHandle] | None = None
         self._tried_lights = self._copies(
-            "/estimate/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, colour=LIGHT_COLOUR, opacity=0.5
+            f"{root}/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, colour=LIGHT_COLOUR, opacity=0.5
         )
 
     @property
@@ -73,13 +85,23 @@ class EstimateDrawing:
                 self._begin(step.guess.names)
             self._clear_verdicts()
             for n, name in enumerate(self._names):
-                pose = step.guess.poses[n]
-                _put(self._guesses[name], Pose(pose.position[None], pose.quaternion[None]))
-                self._guesses[name].visible = bool(pose.position[2] > _AWAY_M)
+                self._show_guess(name, step.guess.poses[n], _WIRES)
                 self._show_tried(name, None if step.candidates is None else step.candidates[:, n])
             self._show_light(step.guess.light, step.lights, "guessed light")
             if step.estimate is not None:
                 self._judge(step.estimate)
+
+    def follow(self, estimate: EstimatedState) -> None:
+        """Draw one of many estimates of things on their way: where they are, and which are doubted, without a word."""
+        with self._lock, self._changes():
+            if estimate.state.names != self._names:
+                self._begin(estimate.state.names)
+            self._clear_verdicts()
+            for n, name in enumerate(self._names):
+                self._show_guess(name, estimate.state.poses[n], _FAINT_WIRES)
+                self._show_tried(name, None)
+                self._mark(name, estimate.doubts[n])
+            self._show_light(estimate.state.light, None, "estimated light")
 
     def show_candidates(self, is_on: bool) -> None:
         """Show or hide what is tried."""
@@ -108,22 +130,14 @@ class EstimateDrawing:
         for node in (*self._tried.values(), *self._guesses.values()):
             node.remove()
         self._names = names
-        self._meshes = {name: self._mesh(name) for name in names}
-        self._tried = {name: self._copies(f"/estimate/tried/{name}", self._meshes[name], GHOSTS) for name in names}
+        self._meshes = {name: mesh_of(self._library, name) for name in names}
+        self._tried = {name: self._copies(f"{self._root}/tried/{name}", self._meshes[name], GHOSTS) for name in names}
         self._guesses = {
             name: self._copies(
-                f"/estimate/guess/{name}", self._meshes[name], 1, colour=_GUESS, opacity=0.9, is_wire=True
+                f"{self._root}/guess/{name}", self._meshes[name], 1, colour=self._colour, opacity=_WIRES, is_wire=True
             )
             for name in names
         }
-
-    def _mesh(self, name: str) -> Mesh:
-        try:
-            mesh = self._library.load(name).mesh
-        except OsfError as error:  # what is recognised by its field needs no mesh on this machine
-            _log.info("%s is drawn as a cube: %s", name, error)
-            return box(_UNKNOWN_M)
-        return coarse(mesh.vertices, mesh.faces)
 
     def _label(self, name: str) -> str:
         try:
@@ -137,7 +151,7 @@ class EstimateDrawing:
         mesh: Mesh,
         count: int,
         *,
-        colour: tuple[int, int, int] = _TRIED,
+        colour: Colour = _TRIED,
         opacity: float = 0.2,
         is_wire: bool = False,
     ) -> viser.BatchedMeshHandle:
@@ -159,6 +173,11 @@ class EstimateDrawing:
             visible=False,
         )
 
+    def _show_guess(self, name: str, pose: Pose, opacity: float) -> None:
+        self._guesses[name].opacity = opacity
+        _put(self._guesses[name], Pose(pose.position[None], pose.quaternion[None]))
+        self._guesses[name].visible = bool(pose.position[2] > _AWAY_M)
+
     def _show_tried(self, name: str, candidates: Pose | None) -> None:
         node = self._tried[name]
         if candidates is not None:
@@ -166,6 +185,8 @@ class EstimateDrawing:
         node.visible = candidates is not None and self._has_candidates
 
     def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
+        if not self._has_light:
+            return
         cube, ray, label = self._lamp = self._lamp or self._add_lamp()
         cube.position = label.position = light.position
         ray.points = np.stack([0.55 * light.position, light.position])[None].astype(np.float32)
@@ -179,14 +200,14 @@ class EstimateDrawing:
         scene, nowhere = self._scene, np.zeros((1, 2, 3), np.float32)
         return (
             scene.add_box(
-                "/estimate/light",
+                f"{self._root}/light",
                 color=LIGHT_COLOUR,
                 dimensions=(LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M),
                 cast_shadow=False,
                 receive_shadow=False,
             ),
-            scene.add_line_segments("/estimate/light_ray", nowhere, LIGHT_COLOUR, thickness=0.004),
-            scene.add_label("/estimate/light_name", "", font_screen_scale=0.8, anchor="top-center"),
+            scene.add_line_segments(f"{self._root}/light_ray", nowhere, LIGHT_COLOUR, thickness=0.004),
+            scene.add_label(f"{self._root}/light_name", "", font_screen_scale=0.8, anchor="top-center"),
         )
 
     # The verdict
@@ -194,10 +215,13 @@ class EstimateDrawing:
     def _judge(self, estimate: EstimatedState) -> None:
         for n, name in enumerate(estimate.state.names):
             pose, doubt = estimate.state.poses[n], estimate.doubts[n]
-            self._guesses[name].batched_colors = np.array(_DOUBTED if doubt else _SURE, np.uint8)
+            self._mark(name, doubt)
             self._add_verdict(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
         within = f"± {_told(np.rad2deg(_SIGMAS * estimate.light_std))}°"
         self._show_light(estimate.state.light, None, f"estimated light {within}")
+
+    def _mark(self, name: str, doubt: str) -> None:
+        self._guesses[name].batched_colors = np.array(_DOUBTED if doubt else _SURE, np.uint8)
 
     def _add_verdict(self, name: str, pose: Pose, position_std: float, rotation_std: float, doubt: str) -> None:
         """A ball of two standard deviations on the object's top, a sector of two around its heading, and words."""
@@ -213,10 +237,10 @@ class EstimateDrawing:
         text = text if self._is_named(name) else f"{self._label(name)}: {text}"
         self._verdicts += [
             scene.add_icosphere(
-                f"/estimate/verdict/{name}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False
+                f"{self._root}/verdict/{name}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False
             ),
             scene.add_mesh_simple(
-                f"/estimate/verdict/{name}/turn",
+                f"{self._root}/verdict/{name}/turn",
                 *flat,
                 color=colour,
                 opacity=0.8,
@@ -226,7 +250,7 @@ class EstimateDrawing:
                 position=(pose.position[0], pose.position[1], _TABLE_M),
             ),
             scene.add_label(
-                f"/estimate/verdict/{name}/words",
+                f"{self._root}/verdict/{name}/words",
                 text,
                 position=top + np.array([0.0, 0.0, _LABEL_M + ball_m]),
                 font_screen_scale=0.75,
@@ -239,7 +263,7 @@ class EstimateDrawing:
             node.remove()
         self._verdicts = []
         for guess in self._guesses.values():
-            guess.batched_colors = np.array(_GUESS, np.uint8)
+            guess.batched_colors = np.array(self._colour, np.uint8)
 
 
 def _put(node: viser.BatchedMeshHandle, poses: Pose) -> None:

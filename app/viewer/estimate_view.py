@@ -99,11 +99,18 @@ class EstimateView:
         if self._thread.is_alive():
             self._thread.join()
 
+    def forget(self) -> None:
+        """Remove what a finished estimate has drawn. Any thread may call."""
+        with self._changed:
+            if self._job is None or self._job.is_finished:
+                self._job, self._steps, self._is_due = None, [], True
+                self._changed.notify()
+
     def note(self, event: object) -> None:
         """Take note of an event; those of other kinds are ignored. Any thread may call."""
         with self._changed:
             match event:
-                case JobSeen(job, EstimateStep() as step) if self._is_here(job):
+                case JobSeen(job, EstimateStep() as step) if job.kind == KIND and self._is_here(job):
                     self._job = job
                     self._steps.append(step)
                 case JobChanged(_, job) if job.kind == KIND and self._is_here(job) and self._is_latest(job):
@@ -146,18 +153,12 @@ class EstimateView:
         self._wants_tried.on_update(lambda event: self._drawing.show_candidates(event.target.value))
         self._wants_truth.on_update(lambda _: self._draw_truth())
         self._camera.on_update(lambda _: self._look_again())
-        clear.on_click(lambda _: self._forget())
+        clear.on_click(lambda _: self.forget())
 
     def _cancel_mine(self) -> None:
         job = self._job
         if job is not None:
             self._cancel(job.id)
-
-    def _forget(self) -> None:
-        with self._changed:
-            if self._job is None or self._job.is_finished:
-                self._job, self._steps, self._is_due = None, [], True
-                self._changed.notify()
 
     def _look_again(self) -> None:
         with self._changed:
@@ -210,9 +211,9 @@ class EstimateView:
     def _draw_truth(self) -> None:
         """While a guess is on view, the green cube is the guess; the lamp itself is shown on demand, in its colour."""
         if self._drawing.is_empty:
-            self._table.show_lamp(is_on=True)
+            self._table.show_lamp(is_on=True, by=KIND)
         else:
-            self._table.show_lamp(is_on=self._wants_truth.value, name="true light")
+            self._table.show_lamp(is_on=self._wants_truth.value, name="true light", by=KIND)
 
     def _draw_state(self, job: Job | None) -> None:
         is_live = job is not None and not job.is_finished

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from jaxtyping import Float, Int
 
+from osfcore.errors import OsfError
+from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose, rotate
 
 CELLS = 14  # along the longest side of an object; a ghost has some hundred triangles
 _ARC_STEPS = 24
+_UNKNOWN_M = 0.05
+_MOVED_M, _TURNED = 5e-4, 1e-3
+_log = logging.getLogger(__name__)
 Mesh = tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]
 
 
@@ -33,6 +40,20 @@ def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], ce
     ]
     _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
     return merged.astype(np.float32), kept[np.sort(first)].astype(np.uint32)
+
+
+def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
+    """The coarse mesh of an object.
+
+    What is recognised by its field needs no mesh on this machine, and what is on a table may have been removed since:
+    such an object is a cube.
+    """
+    try:
+        mesh = library.load(name).mesh
+    except OsfError as error:
+        _log.info("%s is drawn as a cube: %s", name, error)
+        return box(_UNKNOWN_M)
+    return coarse(mesh.vertices, mesh.faces, cells)
 
 
 def box(side_m: float) -> Mesh:
@@ -65,6 +86,13 @@ def spread(poses: Pose, count: int) -> Pose:
     """`count` of a batch of poses, evenly chosen; some more than once if there are fewer."""
     rows = np.round(np.linspace(0, len(poses.position) - 1, count)).astype(int)
     return poses[rows]
+
+
+def moves(poses: Pose) -> bool:
+    """Whether an object on its way goes or turns far enough to be seen."""
+    shift = np.abs(poses.position - poses.position[0]).max()
+    turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
+    return bool(shift > _MOVED_M or turn > _TURNED**2)
 
 
 def top_m(vertices: Float[np.ndarray, "P 3"], quaternion: Float[np.ndarray, "4"]) -> float:

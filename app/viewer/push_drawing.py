@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 from collections.abc import Iterator, Sequence
 
@@ -11,8 +10,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.ghosts import Mesh, box, coarse, top_m
-from osfcore.errors import OsfError
+from app.viewer.ghosts import Mesh, mesh_of, moves, top_m
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose
 from osfcore.rollouts import Rollouts
@@ -23,13 +21,11 @@ TRAIL = 5  # pale ghosts between start and end
 _CELLS = 28
 _GHOST_OPACITY, _TRAIL_OPACITY, _PUSHER_OPACITY = 0.5, 0.13, 0.35
 _GHOST_SCALE, _TRAIL_SCALE = 1.01, 1.005  # or ghosts and the surface below them would flicker
-_UNKNOWN_M = 0.05
 _ABOVE_M = 0.012  # ways of objects are drawn above them, that of the pusher above the table
 _FLOOR_M = 0.004
 _LINE_M = 0.004
-_MOVED_M, _TURNED = 5e-4, 1e-3
+_MOVED_M = 5e-4
 _NOWHERE = np.zeros((1, 2, 3), np.float32)
-_log = logging.getLogger(__name__)
 
 
 class PushDrawing:
@@ -85,7 +81,7 @@ class PushDrawing:
             lines = []
             for n, name in enumerate(rollouts.names):
                 poses = Pose(rollouts.positions[0, :, n], rollouts.quaternions[0, :, n])
-                if _moves(poses):
+                if moves(poses):
                     lines.append(self._add_object(name, poses))
             _draw(self._ways, lines)
             self._pusher.visible = True
@@ -107,7 +103,7 @@ class PushDrawing:
                     np.array([state.pose(name).position for state in states]),
                     np.array([state.pose(name).quaternion for state in states]),
                 )
-                if _moves(poses):
+                if moves(poses):
                     lines.append(self._way(name, poses))
             _draw(self._true_ways, lines)
 
@@ -173,20 +169,11 @@ class PushDrawing:
         return poses.position + np.array([0.0, 0.0, self._heights_m[name]])
 
     def _mesh(self, name: str) -> Mesh:
+        if not self._library.has(name):  # removed since the scene was made, and may come back
+            return mesh_of(self._library, name)
         if name not in self._meshes:
-            try:
-                mesh = self._library.load(name).mesh
-                self._meshes[name] = coarse(mesh.vertices, mesh.faces, _CELLS)
-            except OsfError as error:  # removed since the scene was made
-                _log.info("%s is drawn as a cube: %s", name, error)
-                return box(_UNKNOWN_M)
+            self._meshes[name] = mesh_of(self._library, name, _CELLS)
         return self._meshes[name]
-
-
-def _moves(poses: Pose) -> bool:
-    shift = np.abs(poses.position - poses.position[0]).max()
-    turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
-    return bool(shift > _MOVED_M or turn > _TURNED**2)
 
 
 def _spaced(poses: Pose, count: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from pathlib import Path
 import viser
 
 from app.estimates import Estimates
+from app.goals import DraftChanged, Goals
 from app.job import JobChanged
 from app.messages import CurrentScene, SceneRecord
 from app.neural.link import NeuralLink
@@ -22,8 +23,11 @@ from app.playback import Playback
 from app.predictions import Predictions
 from app.runner import Runner
 from app.viewer.drawing import Client, SceneDrawing
+from app.viewer.episode_drawing import EpisodeDrawing
+from app.viewer.episode_view import EpisodeView
 from app.viewer.estimate_drawing import EstimateDrawing
 from app.viewer.estimate_view import EstimateView
+from app.viewer.goal_view import GoalView
 from app.viewer.neural_view import NeuralViews
 from app.viewer.push_view import PushView
 from osfcore.errors import OsfError
@@ -54,6 +58,7 @@ class Viewer:
         fields: Callable[[], Collection[str]],
         estimates: Estimates,
         predictions: Predictions,
+        goals: Goals,
     ) -> None:
         """Prepare the view.
 
@@ -63,7 +68,9 @@ class Viewer:
             fields: names of the objects that have one.
             estimates: finds poses and light in what the cameras see.
             predictions: tells what pushes would do.
+            goals: what tables should become.
         """
+        self._goals = goals
         self._estimates = estimates
         self._predictions = predictions
         self._runner = runner
@@ -106,18 +113,30 @@ class Viewer:
             self._obey,
             self._runner.jobs.cancel,
         )
+        self._goal_view = GoalView(self._server, self._runner.library, self._goals, self._commands, self._obey)
+        self._episode_view = EpisodeView(
+            self._server,
+            (self._drawing, EpisodeDrawing(self._server, self._runner.library, self._drawing.has)),
+            self._runner.jobs,
+            self._obey,
+            self._estimate_view.forget,
+        )
         self._push_view = PushView(self._server, self._runner.library, self._predictions, self._runner.act, self._obey)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._part)
         self._neural_views.start()
         self._playback.start()
         self._estimate_view.start(self._runner.current)
+        self._episode_view.start(self._runner.current)
+        self._goal_view.start(self._runner.current)
         self._push_view.start(self._current_record())
         self._undo = [
             self._runner.hub.subscribe(self._playback.note),
-            self._runner.hub.subscribe(self._on_job),
             self._runner.hub.subscribe(self._estimate_view.note),
+            self._runner.hub.subscribe(self._episode_view.note),
+            self._runner.hub.subscribe(self._goal_view.note),
             self._runner.hub.subscribe(self._push_view.note),
+            self._runner.hub.subscribe(self._on_event),
         ]
         self._show_current()
 
@@ -130,6 +149,8 @@ class Viewer:
         self._playback.stop()
         self._neural_views.stop()
         self._estimate_view.stop()
+        self._episode_view.stop()
+        self._goal_view.stop()
         self._push_view.stop()
         self._commands.shutdown(wait=False, cancel_futures=True)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -206,12 +227,12 @@ class Viewer:
         except Exception:
             _log.exception("a command from the viewer failed")
 
-    def _on_job(self, event: object) -> None:
-        if isinstance(event, JobChanged):
+    def _on_event(self, event: object) -> None:
+        if isinstance(event, JobChanged | DraftChanged | CurrentScene):
             self._update_gizmos()
 
     def _update_gizmos(self) -> None:
-        """Hands may move objects only while no job does."""
+        """Hands may move objects only while no job does, and while the handles are not those of a goal."""
         current = self._runner.current
         is_free = current is not None and self._runner.jobs.holder(current) is None
-        self._drawing.show_gizmos(self._wants_gizmos.value and is_free)
+        self._drawing.show_gizmos(self._wants_gizmos.value and is_free and not self._goal_view.is_composing)

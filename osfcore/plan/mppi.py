@@ -11,19 +11,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
 from osfcore.plan.goals import Cost, PoseGoal
-from osfcore.plan.proposals import Proposals
 from osfcore.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts
 from osfcore.scene import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S, SceneState
 
 _WALK_M = 0.06  # noise of random walks
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
+
+
+class PushSource(Protocol):
+    """Pushes worth trying. What it takes to find them stays out of here: plans are looked at where no torch is."""
+
+    def draw(
+        self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
+    ) -> Float[np.ndarray, "P T 3"]:
+        """About `count` sequences of actions [m/s]."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +106,7 @@ class Planner:
         settings: of the plan.
     """
 
-    def __init__(self, rollout: Rollout, proposals: Proposals, settings: PlanSettings | None = None) -> None:
+    def __init__(self, rollout: Rollout, proposals: PushSource, settings: PlanSettings | None = None) -> None:
         self._rollout, self._proposals = rollout, proposals
         self.settings = settings or PlanSettings()
         self._last: Float[np.ndarray, "T 3"] | None = None

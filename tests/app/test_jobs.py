@@ -8,7 +8,8 @@ import pytest
 import app.jobs as jobs_module
 from app.field_files import workshop
 from app.job import JobSeen
-from app.jobs import RESUMES_NOTE, STOPPED_NOTE, Jobs, QueueFull, WrongJobState
+from app.job_ends import RESUMES_NOTE, STOPPED_NOTE
+from app.jobs import Jobs, QueueFull, WrongJobState
 from app.messages import AskStage, JobDone, JobRests, JobStep, PauseJob, StepJob, TakeImage
 from app.store import CannotStore, Store
 from osfcore.errors import UnknownName

@@ -1,6 +1,7 @@
 import re
 
-from app.main import create_app, static_folder
+from app.main import create_app
+from app.paths import static_folder
 from app.settings import Settings
 
 

@@ -4,9 +4,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.episode.frames import COLUMNS, HEIGHT, TILE_PX, WIDTH, frame, write_video
-from osfcore.errors import CannotWrite, OsfError
-from osfcore.evaluate.images import as_bytes
+from app.episode.frames import (
+    COLUMNS,
+    HEIGHT,
+    TILE_PX,
+    WIDTH,
+    frame,
+    part_of,
+    read_frame,
+    read_frames,
+    write_video,
+)
+from osfcore.errors import CannotWrite, CorruptFile, OsfError
+from osfcore.evaluate.images import as_bytes, write_png
 from osfcore.scene import STEP_S
 
 BAR_PX = HEIGHT // 2 - TILE_PX
@@ -111,3 +121,48 @@ def test_a_place_that_takes_nothing_is_told_in_one_sentence(tmp_path, capfd, fol
         write_video(tmp_path / folder / "video.mp4", [flat(0)] * count)
     assert capfd.readouterr() == ("", "")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_parts_of_a_frame_are_its_pictures_without_captions():
+    goal, now, rendered, *views = images(6)
+    picture = frame(goal, now, rendered, np.array(views), "step 7 of 30")
+    difference = np.clip(3 * np.abs(rendered - goal), 0, 1)
+    for part, image in (("goal", goal), ("now", now), ("estimate", rendered), ("difference", difference)):
+        np.testing.assert_array_equal(part_of(picture, part), as_bytes(image))
+    np.testing.assert_array_equal(part_of(picture, "all"), picture)
+
+
+def test_a_frame_comes_back_from_its_file(tmp_path):
+    picture = frame(*images(3), images(4), "step 1 of 2")
+    write_png(tmp_path / "000.png", picture)
+    np.testing.assert_array_equal(read_frame(tmp_path / "000.png"), picture)
+
+
+def test_frames_come_back_by_number_one_at_a_time(tmp_path):
+    for number in (0, 2, 10, 999, 1000):
+        write_png(tmp_path / f"{number:03d}.png", flat(number % 251))
+    write_png(tmp_path / ".003.png", flat(3))
+    (tmp_path / "notes.txt").write_text("x")
+    frames = read_frames(tmp_path)
+    assert next(frames).max() == 0
+    (tmp_path / "002.png").unlink()  # the next one is read when it is asked for
+    with pytest.raises(CorruptFile, match=r"002\.png"):
+        next(frames)
+    assert [picture.max() for picture in read_frames(tmp_path)] == [0, 10, 999 % 251, 1000 % 251]
+    assert list(read_frames(tmp_path / "none")) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", "cut", "small", None])
+def test_what_is_no_frame_is_told(tmp_path, content):
+    path = tmp_path / "000.png"
+    write_png(
+        path, flat(0)[:16] if content == "small" else as_bytes(np.random.default_rng(0).random((HEIGHT, WIDTH, 3)))
+    )
+    if content == "cut":
+        path.write_bytes(path.read_bytes()[:30])
+    elif content is None:
+        path.unlink()
+    elif content != "small":
+        path.write_bytes(content)
+    with pytest.raises(CorruptFile, match=r"000\.png cannot be used: it is no readable frame"):
+        read_frame(path)

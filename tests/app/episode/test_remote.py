@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from app.episode.remote import RemoteWorld
-from app.messages import Act, ObserveScene, SceneRecord, TakeImage
+from app.messages import Act, ObserveScene, SceneRecord, TakeView
+from app.stage_link import StageError
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.observationfile import write_observation
 from osfcore.scene import default_cameras, goal_camera
@@ -27,8 +30,8 @@ class Stage:
                     self.world.act(action)
             case ObserveScene():
                 write_observation(command.folder, self.world.observe(masks=command.masks))
-            case TakeImage():
-                image = self.world.render((goal_camera(command.size),)).images[0]
+            case TakeView():
+                image = self.world.render((command.camera,), with_pusher=command.pusher).images[0]
                 pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
                 return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
         state = self.world.truth()
@@ -79,9 +82,31 @@ def test_the_truth_is_asked_for_without_moving_anything(remote, stage):
     assert [command.actions for command in stage.asked] == [()]
 
 
-def test_a_photo_shows_the_goal_view_with_the_pusher(remote, stage):
-    camera = goal_camera(SIDE)
-    np.testing.assert_allclose(remote.photo(camera), stage.world.render((camera,)).images[0], atol=0.5 / 255 + 1e-6)
+@pytest.mark.parametrize("size", [(SIDE, SIDE), (3 * SIDE, 2 * SIDE)])
+def test_a_photo_shows_what_any_camera_sees_with_the_pusher(remote, stage, size):
+    camera = replace(goal_camera(size[0]), height=size[1])
+    photo = remote.photo(camera)
+    assert photo.shape == (size[1], size[0], 3)
+    np.testing.assert_allclose(photo, stage.world.render((camera,)).images[0], atol=0.5 / 255 + 1e-6)
+    (command,) = stage.asked
+    assert (command.id, command.pusher) == ("s1", True)
+    assert stage.world.time_s == 0
+
+
+def test_what_the_stage_refuses_is_told(tmp_path):
+    def refuse(_):
+        raise StageError("UnknownName", "There is no scene named 's1'.")
+
+    remote = RemoteWorld(refuse, "s1", tmp_path)
+    for call in (
+        remote.observe,
+        remote.truth,
+        lambda: remote.act(np.zeros(3)),
+        lambda: remote.photo(goal_camera(SIDE)),
+    ):
+        with pytest.raises(OsfError, match="no scene named 's1'"):
+            call()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nobody_resets_a_scene_of_the_service(remote):

@@ -1,12 +1,13 @@
 import contextlib
+import json
 
 import numpy as np
 import pytest
 
 from app.episode import run
+from app.episode.names import RECORDING_FILE, REPORT_FILE
 from app.episode.order import EpisodeOrder
-from app.episode.record import RECORDING_FILE, REPORT_FILE
-from app.episode.run import run_episode
+from app.episode.run import run_episode, stage_of
 from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Observed, Planning, Stepped
 from osfcore.control.settings import EpisodeSettings
 from osfcore.errors import CorruptFile, UnknownName
@@ -108,7 +109,18 @@ def test_who_stops_asking_ends_it(order, told, worlds):
             pass
         assert worlds[0]._physics is not None
     assert worlds[0]._physics is None
-    assert not (order.out / REPORT_FILE).exists()
+    report = json.loads((order.out / REPORT_FILE).read_text())  # what was done is kept
+    assert (report["outcome"], report["steps_done"]) == (None, 0)
+
+
+def test_every_part_of_the_loop_has_a_name():
+    looked = EstimateStep(Progress(1, 1, "Done"), "done", None)
+    for look in ("first", "goal", "next", "search"):
+        assert stage_of(Looking(0, look, looked)) == look
+    assert stage_of(Planning(0, None)) == "plan"
+    assert stage_of(Acted(1, np.zeros(3))) == "act"
+    for event in (Noticed(1, "lamp", "It was moved."), Finished(1, "reached", "Done.", None), Observed(0, None)):
+        assert stage_of(event) is None
 
 
 def test_what_cannot_be_known_leaves_no_world_behind(order, worlds, monkeypatch):

@@ -102,3 +102,16 @@ def test_the_lamp_can_be_hidden_or_named_and_still_follows(live, drawing, shown)
     drawing.show_lamp(is_on=True)
     assert tuple(drawing._cube.color) == own
     assert not drawing._lamp_name.visible
+
+
+def test_the_lamp_is_as_usual_once_no_view_wants_it_otherwise(drawing):
+    drawing.show_lamp(is_on=False, name="true light", by="one")
+    drawing.show_lamp(is_on=True, by="two")
+    assert not drawing._cube.visible
+    drawing.show_lamp(is_on=True, name="true light", by="two")
+    assert drawing._cube.visible
+    assert drawing._lamp_name.text == "true light"
+    drawing.show_lamp(is_on=True, by="two")
+    drawing.show_lamp(is_on=True, by="one")
+    assert drawing._cube.visible
+    assert not drawing._lamp_name.visible

@@ -151,3 +151,27 @@ def test_candidates_can_be_hidden_and_everything_removed(drawing):
     assert drawing.is_empty
     assert all(node._impl.removed for node in kept)
     drawing.show_candidates(True)
+
+
+def test_estimates_of_things_on_their_way_are_drawn_without_a_word(drawing):
+    drawing.show(step(candidates=tried(5), estimate=judged()))
+    before = drawing._guesses[BOX]
+    drawing.follow(judged("it is hardly visible"))
+    assert drawing._guesses[BOX] is before
+    assert drawing._verdicts == []
+    assert not drawing._tried[BOX].visible
+    assert not np.array_equal(before.batched_colors, drawing._guesses[UNKNOWN].batched_colors)
+    assert drawing._lamp[2].text == "estimated light"
+
+
+def test_another_drawing_has_its_own_nodes_and_colour_and_may_do_without_light(server, library):
+    drawing = EstimateDrawing(server, library, root="/elsewhere", colour=(1, 2, 3), has_light=False)
+    drawing.show(step(candidates=tried(4), lights=np.array([[0, 0, 1.0]]), estimate=judged()))
+    nodes_of = [*drawing._tried.values(), *drawing._guesses.values(), *drawing._verdicts, drawing._tried_lights]
+    assert all(node.name.startswith("/elsewhere/") for node in nodes_of)
+    assert drawing._lamp is None
+    assert not drawing._tried_lights.visible
+    drawing.show(step())
+    assert tuple(drawing._guesses[BOX].batched_colors) == (1, 2, 3)
+    drawing.clear()
+    assert drawing.is_empty

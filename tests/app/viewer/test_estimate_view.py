@@ -164,6 +164,14 @@ def test_one_that_waits_does_not_take_the_view_from_one_that_runs(room):
     until(lambda: room.view._status.value == "Looking again")
 
 
+def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
+    other = Job("e", "episode", {"scene": "s", "names": [BOX]}, "running")
+    room.view.note(JobSeen(other, step()))
+    room.view.note(JobChanged(1, other))
+    assert room.view._job is None
+    assert not room.view._is_due
+
+
 def test_why_it_failed_is_told(room):
     room.see(job(), step())
     room.view.note(JobChanged(1, job("failed", error="mask of x is empty.")))

@@ -1,8 +1,19 @@
 import numpy as np
 import pytest
 
-from app.viewer.ghosts import CELLS, box, coarse, footprint_m, heading_rad, sector, spread, top_m
-from osfcore.poses import Pose, quaternion_multiply
+from app.viewer.ghosts import (
+    CELLS,
+    box,
+    coarse,
+    footprint_m,
+    heading_rad,
+    mesh_of,
+    moves,
+    sector,
+    spread,
+    top_m,
+)
+from osfcore.poses import Pose, quaternion_exp, quaternion_multiply
 
 TURN_Y = np.array([0.5**0.5, 0, 0.5**0.5, 0])  # +x goes down, +z to +x
 
@@ -76,3 +87,22 @@ def test_the_heading_follows_turns_about_the_vertical():
     for lying in (np.array([1.0, 0, 0, 0]), TURN_Y):
         before, after = heading_rad(lying), heading_rad(quaternion_multiply(turn, lying))
         assert (after - before) % (2 * np.pi) == pytest.approx(2 * half)
+
+
+def test_an_object_without_a_mesh_here_is_a_cube(library):
+    mesh = library.load("006_mustard_bottle").mesh
+    vertices, faces = mesh_of(library, "006_mustard_bottle", 20)
+    np.testing.assert_array_equal(vertices, coarse(mesh.vertices, mesh.faces, 20)[0])
+    assert len(faces) > 100
+    vertices, faces = mesh_of(library, "my_thing")
+    assert (len(vertices), len(faces)) == (8, 12)
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "turn_rad", "is_seen"), [(0.0, 0.0, False), (1e-4, 1e-4, False), (0.002, 0.0, True), (0.0, 0.05, True)]
+)
+def test_only_what_can_be_seen_to_move_moves(shift_m, turn_rad, is_seen):
+    ends = np.linspace(0, 1, 5)[:, None]
+    turns = quaternion_exp(ends * [0, 0, turn_rad])
+    turns[1::2] *= -1  # the same rotations
+    assert moves(Pose(ends * [shift_m, 0, 0], turns)) == is_seen

@@ -1,0 +1,69 @@
+"""Who drives: several people may watch the same page, and one of them at a time has the controls.
+
+This keeps visitors from getting into each other's way by accident. It is no protection: programs are never asked.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class DriverChanged:
+    """Who drives now, and among how many.
+
+    Attributes:
+        driver: identifier of a page; None while there is none.
+        visitors: pages that are open.
+    """
+
+    driver: str | None
+    visitors: int
+
+
+class Driver:
+    """The pages that are open. Any thread may call.
+
+    Args:
+        publish: told of every change.
+    """
+
+    def __init__(self, publish: Callable[[DriverChanged], None]) -> None:
+        self._publish = publish
+        self._lock = threading.Lock()
+        self._streams: Counter[str] = Counter()  # a page that reconnects has two for a moment
+        self._driver: str | None = None
+
+    def now(self) -> DriverChanged:
+        """Who drives."""
+        with self._lock:
+            return DriverChanged(self._driver, len(self._streams))
+
+    def arrive(self, visitor: str) -> None:
+        """A page has opened its stream; the first one drives."""
+        with self._lock:
+            self._streams[visitor] += 1
+            if self._driver not in self._streams:  # nobody drives, or somebody who never opened a page
+                self._driver = visitor
+        self._publish(self.now())
+
+    def leave(self, visitor: str) -> None:
+        """A stream of a page has ended; if it was the driver's last one, the page that came next drives."""
+        with self._lock:
+            self._streams[visitor] -= 1
+            if self._streams[visitor] <= 0:
+                del self._streams[visitor]
+                if self._driver not in self._streams:
+                    self._driver = next(iter(self._streams), None)
+        self._publish(self.now())
+
+    def take(self, visitor: str) -> DriverChanged:
+        """A page wants to drive from now on."""
+        with self._lock:
+            self._driver = visitor
+        now = self.now()
+        self._publish(now)
+        return now

@@ -1,0 +1,4 @@
+"""Names of what an episode leaves in its folder."""
+
+REPORT_FILE, CSV_FILE, VIDEO_FILE, RECORDING_FILE = "report.json", "steps.csv", "video.mp4", "episode.viser"
+GOAL_FILE, FRAMES_FOLDER = "goal.png", "frames"

@@ -1,0 +1,201 @@
+import contextlib
+import io
+
+import numpy as np
+import pytest
+
+from app.episode.sketch import PlanSketch
+from app.viewer.episode_drawing import GOAL, ON_THE_WAY, PARTS, EpisodeDrawing, cost_colours, on_the_way
+from app.viewer.viewer import LoopbackViser
+from osfcore.control.events import Look, Looking
+from osfcore.estimate.steps import EstimateStep
+from osfcore.estimated import EstimatedState
+from osfcore.plan.goals import PoseGoal
+from osfcore.poses import Pose, quaternion_exp
+from osfcore.progress import Progress
+from osfcore.rollouts import Rollouts
+from osfcore.scene import Light, SceneState
+
+BOX, CAN = "003_cracker_box", "005_tomato_soup_can"
+NAMES = (BOX, CAN)
+LIGHT = Light(np.array([0.6, 0, 0.8]))
+TURNS = np.tile([1.0, 0, 0, 0], (2, 1))
+
+
+@pytest.fixture(scope="module")
+def server():
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+@pytest.fixture
+def drawing(server, library):
+    drawing = EpisodeDrawing(server, library)
+    yield drawing
+    drawing.clear()
+    server.scene.reset()
+
+
+def poses(x=0.1):
+    return Pose(np.array([[x, 0, 0.1], [0.2, 0.2, 0.05]]), TURNS)
+
+
+def estimated(x=0.1, doubt=""):
+    state = SceneState(NAMES, poses(x), LIGHT, None)
+    return EstimatedState(state, np.full(2, 0.001), np.full(2, 0.01), 0.01, (doubt, ""), doubt)
+
+
+def look(kind: Look = "first", x=0.1, candidates=None):
+    step = EstimateStep(Progress(1, 2, ""), "objects", SceneState(NAMES, poses(x), LIGHT, None), candidates)
+    return Looking(0, kind, step)
+
+
+def sketch(ways=5, moments=11, goes_m=0.1):
+    """The box is pushed along +x by the cheapest way; the can stays."""
+    positions = np.tile(poses(0.0).position, (1, moments, 1, 1))
+    positions[0, :, 0, 0] = np.linspace(0, goes_m, moments)
+    pusher = np.linspace([-0.2, 0, 0.06], [0.0, 0, 0.06], moments)[None]
+    best = Rollouts(NAMES, positions, np.tile(TURNS, (1, moments, 1, 1)), pusher)
+    rng = np.random.default_rng(0)
+    return PlanSketch(3, rng.uniform(-0.3, 0.3, (ways, moments, 2)), np.arange(ways) * 0.1 + 1, best)
+
+
+def is_green(colour):
+    return colour[1] > 2 * max(colour[0], colour[2])
+
+
+def is_red(colour):
+    return colour[0] > 2 * max(colour[1], colour[2])
+
+
+def all_nodes(drawing):
+    estimates = (drawing._now, drawing._goal_look)
+    guesses = [node for estimate in estimates for node in estimate._guesses.values()]
+    return [*drawing._goal.values(), *drawing._future.values(), drawing._ways, drawing._best, *guesses]
+
+
+def test_the_goal_is_drawn_in_one_colour_and_stays_the_same_nodes(drawing):
+    drawing.show_goal(PoseGoal(NAMES, poses()))
+    before = dict(drawing._goal)
+    assert set(before) == set(NAMES)
+    np.testing.assert_allclose(before[BOX].position, [0.1, 0, 0.1], atol=1e-6)
+    assert {tuple(node.color) for node in before.values()} == {GOAL}
+    drawing.show_goal(PoseGoal(NAMES[::-1], poses()[::-1]))
+    assert drawing._goal == before
+    drawing.show_goal(PoseGoal(NAMES, poses(0.3)))
+    assert drawing._goal == before
+    np.testing.assert_allclose(before[BOX].position, [0.3, 0, 0.1], atol=1e-6)
+    drawing.show_goal(PoseGoal((BOX,), poses()[:1]))
+    assert set(drawing._goal) == {BOX}
+    assert all(node._impl.removed for node in before.values())
+
+
+def test_a_look_at_the_goal_image_is_drawn_beside_the_table_until_the_goal_is_known(drawing):
+    drawing.show_look(look("first"))
+    drawing.show_look(look("goal", x=0.4))
+    now, goal = drawing._now._guesses[BOX], drawing._goal_look._guesses[BOX]
+    np.testing.assert_allclose(now.batched_positions, [[0.1, 0, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(goal.batched_positions, [[0.4, 0, 0.1]], atol=1e-6)
+    assert not np.array_equal(goal.batched_colors, now.batched_colors)
+    assert drawing._goal_look._lamp is None  # a second green cube would be taken for the table's
+    drawing.show_goal(PoseGoal(NAMES, poses()))
+    assert drawing._goal_look.is_empty
+    assert not drawing._now.is_empty
+
+
+def test_estimates_follow_without_words_and_doubted_objects_have_another_colour(drawing):
+    drawing.show_look(look(candidates=Pose(np.zeros((4, 2, 3)), np.tile(TURNS, (4, 1, 1)))))
+    before = drawing._now._guesses[BOX]
+    assert drawing._now._tried[BOX].visible
+    drawing.show_estimate(estimated(0.2, "it is hardly visible"))
+    assert drawing._now._guesses[BOX] is before
+    np.testing.assert_allclose(before.batched_positions, [[0.2, 0, 0.1]], atol=1e-6)
+    assert not drawing._now._tried[BOX].visible
+    assert not np.array_equal(before.batched_colors, drawing._now._guesses[CAN].batched_colors)
+    assert drawing._now._verdicts == []
+    np.testing.assert_allclose(drawing._now._lamp[0].position, LIGHT.position)
+
+
+def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(drawing):
+    drawing.show_plan(sketch(ways=5, moments=11))
+    assert drawing._ways.points.shape == drawing._ways.colors.shape == (50, 2, 3)
+    assert is_green(drawing._ways.colors[0, 0])
+    assert is_red(drawing._ways.colors[-1, 1])
+    assert drawing._ways.points[0, 0, 2] > drawing._ways.points[-1, 0, 2]  # cheap ones lie above dear ones
+    np.testing.assert_allclose(drawing._ways.points[0, 1], drawing._ways.points[1, 0])
+    np.testing.assert_allclose(drawing._best.points[[0, -1], [0, 1], 0], [-0.2, 0.0], atol=1e-6)
+    assert drawing._best.points[..., 2].max() < 0.02  # on the table
+    before = drawing._ways
+    drawing.show_plan(sketch(ways=3, moments=4))
+    assert drawing._ways is before
+    assert drawing._ways.points.shape == drawing._ways.colors.shape == (9, 2, 3)
+
+
+def test_the_best_future_is_drawn_at_its_end_and_paler_on_the_way_there(drawing):
+    drawing.show_plan(sketch())
+    box, can = drawing._future[BOX], drawing._future[CAN]
+    assert box.visible
+    assert not can.visible  # it stays
+    x = box.batched_positions[:, 0]
+    assert len(x) == ON_THE_WAY + 1
+    assert np.all(np.diff(x) > 0)
+    assert x[-1] == pytest.approx(0.1)
+    assert x[0] > 0.01
+    assert np.all(box.batched_opacities[:-1] < box.batched_opacities[-1])
+    drawing.show_plan(sketch(goes_m=0.0))
+    assert drawing._future[BOX] is box
+    assert not box.visible
+    drawing.show_plan(None)
+    assert not any(node.visible for node in (drawing._ways, drawing._best, box, can))
+
+
+def test_parts_can_be_hidden_also_before_they_are_drawn(drawing):
+    for part in PARTS:
+        drawing.show_part(part, False)
+    drawing.show_goal(PoseGoal(NAMES, poses()))
+    drawing.show_estimate(estimated())
+    drawing.show_plan(sketch())
+    roots = {part: root.name for part, root in drawing._roots.items()}
+    assert all(any(node.name.startswith(f"{root}/") for root in roots.values()) for node in all_nodes(drawing))
+    assert not any(root.visible for root in drawing._roots.values())
+    assert not drawing.shows_light
+    drawing.show_part("estimate", True)
+    assert drawing.shows_light
+    assert [part for part, root in drawing._roots.items() if root.visible] == ["estimate"]
+
+
+def test_everything_can_be_removed(drawing):
+    drawing.show_goal(PoseGoal(NAMES, poses()))
+    drawing.show_look(look("goal"))
+    drawing.show_estimate(estimated())
+    drawing.show_plan(sketch())
+    drawing.clear()
+    assert not drawing.shows_light
+    assert drawing._goal == {}
+    assert drawing._now.is_empty
+    assert drawing._goal_look.is_empty
+    assert not any(node.visible for node in all_nodes(drawing))
+
+
+def test_one_way_that_goes_badly_wrong_does_not_paint_the_others_green():
+    colours = cost_colours(np.array([1.0, 2.0, 3.0, 4.0, 1000.0]))
+    assert is_green(colours[0])
+    assert is_red(colours[-1])
+    assert len(np.unique(colours, axis=0)) == 5
+    assert np.all(np.diff(colours[:, 1].astype(int)) <= 0)
+    assert all(is_green(colour) for colour in cost_colours(np.ones(4)))
+
+
+def test_ghosts_on_the_way_are_spread_over_the_way_and_not_over_the_wait():
+    x = 0.02 * np.maximum(np.arange(11) - 6, 0)
+    waits = Pose(np.stack([x, 0 * x, 0 * x], axis=1), np.tile(TURNS[0], (11, 1)))
+    rows = on_the_way(waits, 3)
+    assert rows == sorted(rows)
+    assert x[rows].min() > 0.01
+    angles = np.linspace(0, 1, 11)
+    turns = Pose(np.zeros((11, 3)), quaternion_exp(angles[:, None] * np.array([0, 0, 1.0])))
+    np.testing.assert_allclose(angles[on_the_way(turns, 3)], [0.25, 0.5, 0.75], atol=0.1)
+    assert on_the_way(waits[:2], 3) == [1, 1, 1]
