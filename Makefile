@@ -50,6 +50,7 @@ soak: dev
 bench: dev
 	$(BIN)/python -m tests.bench.bench_world
 	$(BIN)/python -m tests.bench.bench_service
+	$(BIN)/python -m tests.bench.bench_episode
 
 clean:
 	rm -rf $(VENV) .cache .pytest_cache .ruff_cache .hypothesis test-artifacts

@@ -24,8 +24,9 @@ from app.runner import Runner
 from app.store import CannotStore
 from osfcore.control.settings import EpisodeSettings
 from osfcore.errors import InvalidInput, OsfError, UnknownName
-from osfcore.files import as_mapping, list_of, read_json
-from osfcore.scene import check_seed
+from osfcore.files import as_mapping, entry_of, list_of, read_json
+from osfcore.poses import unit_quaternion
+from osfcore.scene import SceneState, check_seed
 from osfcore.scenefile import camera_to_json, scene_from_json
 
 KIND = "episode"
@@ -206,6 +207,7 @@ class Episodes:
 
         Raises:
             UnknownName: if there is none of this name.
+            CorruptFile: if what it would be made of is damaged.
             CannotWrite: if it cannot be made.
         """
         names = self.files(job)
@@ -224,8 +226,7 @@ class Episodes:
             return
         from app.viewer.recording import write_recording
 
-        report = self.report(job) or {"steps": []}
-        states = [scene_from_json(step["truth"]).state for step in report["steps"]]
+        states = read_json(path.with_name(REPORT_FILE), _as_states)
         write_recording(path, self._runner.library, states)
 
     def _folder(self, job: Job) -> Path:
@@ -249,6 +250,8 @@ def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
     given = [name for name, _ in poses]
     if len(set(given)) != len(given) or set(given) != set(names):
         raise InvalidInput("objects of the goal", ", ".join(given) or "none", f"{', '.join(names)}, each once")
+    for name, pose in poses:
+        unit_quaternion(pose.quaternion, f"quaternion of {name}")
     return poses
 
 
@@ -256,3 +259,10 @@ def _as_report(data: object) -> dict[str, Any]:
     report = as_mapping(data, "report")
     list_of(report, "steps", "report")
     return report
+
+
+def _as_states(data: object) -> list[SceneState]:
+    steps = [as_mapping(step, "step") for step in list_of(_as_report(data), "steps", "report")]
+    if not steps:
+        raise InvalidInput("number of steps", 0, "1 at least")
+    return [scene_from_json(entry_of(step, "truth", "step")).state for step in steps]

@@ -23,7 +23,9 @@ class JobClock:
             self._paused_at = None
 
     def left_s(self, done: int, total: int) -> float | None:
-        """Time left [s], once there is something to go by."""
+        """Time left [s], once there is something to go by; it counts from when the total is known."""
+        if total == 0:
+            return None
         now = time.monotonic() - self._paused_s
         if self._first is None:
             self._first = (done, now)

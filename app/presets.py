@@ -10,7 +10,7 @@ from app.goal_store import GoalRecord
 from app.goals import Goals
 from app.messages import SceneRecord
 from app.runner import Runner
-from osfcore.errors import UnknownName
+from osfcore.errors import OsfError, UnknownName
 from osfcore.scene import Light
 
 
@@ -85,10 +85,14 @@ def set_up(wanted: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     """Make a preset's table, which is then shown, and its goal.
 
     Raises:
-        OsfError: if an object is not on this machine, or there are too many scenes or goals.
+        OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
     """
     scene = runner.create_scene(names=wanted.objects, seed=wanted.seed, light=wanted.light)
-    goal = goals.draw(scene.id, wanted.goal_seed, wanted.moved, wanted.title, wanted.goal_light)
+    try:
+        goal = goals.draw(scene.id, wanted.goal_seed, wanted.moved, wanted.title, wanted.goal_light)
+    except OsfError:
+        runner.delete_scene(scene.id)
+        raise
     return scene, goal
 
 

@@ -37,7 +37,7 @@ class Episoding:
 
     Attributes:
         done: actions executed.
-        total: actions at most.
+        total: actions at most; 0 until the goal is known, for looking tells nothing of how long acting takes.
         note: what is being done, for a person.
         stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
         steps: rounds whose results are in the report.
@@ -85,7 +85,7 @@ def episode_job(params: dict[str, Any], place: Place) -> Iterator[Episoding]:
 
     assert place.orders is not None, "the job's process sets it"
     settings, names = settings_of(params["settings"]), tuple(params["names"])
-    yield Episoding(0, settings.steps, "Loading fields, half a minute the first time")
+    yield Episoding(0, 0, "Loading fields, half a minute the first time")
     knowledge = knowledge_of(names, FieldLibrary(place.data_dir), place.library, place.data_dir)
     world = RemoteWorld(place.orders.ask, params["scene"], place.folder)
     goal, start = params["goal"], world.truth()
@@ -94,7 +94,7 @@ def episode_job(params: dict[str, Any], place: Place) -> Iterator[Episoding]:
     record = EpisodeRecord(place.folder, world, about)
     rng = np.random.default_rng([params["seed"], 1])
     episode = Episode(world, knowledge, _goal(goal, names, place.folder / INPUTS), settings, rng)
-    told = Episoding(0, settings.steps, "Looking")
+    told = Episoding(0, 0, "Looking")
     for event in episode.run():
         for change in place.orders.changes():
             episode.settings = settings_of(change["settings"])
@@ -112,8 +112,10 @@ def _told(before: Episoding, event: Event, total: int) -> Episoding:
     """How far an episode is after an event."""
     from app.episode.run import note_of, stage_of
     from app.episode.sketch import sketch_of
-    from osfcore.control.events import Acted, Finished, Observed, Planning, Stepped
+    from osfcore.control.events import Acted, Finished, GoalFound, Observed, Planning, Stepped
 
+    is_known = before.total > 0 or isinstance(event, GoalFound)
+    total = total if is_known else 0
     then = replace(before, total=total, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
     match event:
         case Observed():  # its images are on the page already

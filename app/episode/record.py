@@ -189,10 +189,11 @@ class EpisodeRecord:
             "steps": self._steps,
         }
         if about.goal is not None:
+            report["moved"] = list(about.moved)
+        if about.goal is not None and about.moved:  # else there is nothing to score
             task = MpcTask(0, self._start, about.goal, about.moved)
             score = score_of(task, self._table.truth(), about.symmetries)
-            report["moved"], report["score"] = list(about.moved), score.to_json()
-            report["success_2cm"] = score.is_success()
+            report["score"], report["success_2cm"] = score.to_json(), score.is_success()
         return report
 
 

@@ -12,10 +12,18 @@ from app.episode.names import RECORDING_FILE
 from app.episode.order import EpisodeOrder, SimulatedTable, given
 from app.episode.record import About, EpisodeRecord
 from osfcore.control.episode import Episode
-from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning
+from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning, Stepped
 from osfcore.evaluate.mpc_runs import knowledge_of
 from osfcore.fields.library import FieldLibrary
 from osfcore.objects.library import AssetLibrary
+
+
+_FOUND = {
+    "first": "Knows where everything is",
+    "goal": "Comparing the goal image with the table",
+    "next": "Knows where everything is now",
+    "search": "Knows where everything is now",
+}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,11 +81,13 @@ def note_of(event: Event) -> str | None:
     """What is being done, for a person; None if this event changes nothing about it."""
     match event:
         case Looking():
+            if event.step.estimate is not None:
+                return _FOUND[event.look]
             where = {"first": "first frame", "goal": "goal image", "next": "table", "search": "lost objects"}
             return f"Looking at the {where[event.look]}: {event.step.progress.note}"
         case GoalFound():
             return "Knows where everything should be"
-        case Planning():
+        case Stepped() | Planning():
             return "Planning pushes"
         case Acted():
             return "Pushing"
@@ -92,7 +102,7 @@ def stage_of(event: Event) -> str | None:
     match event:
         case Looking():
             return event.look
-        case Planning():
+        case Stepped() | Planning():
             return "plan"
         case Acted():
             return "act"

@@ -7,15 +7,17 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Response, status
 from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import ValidationError
 
 from app.episode.frames import Part
+from app.episode.names import REPORT_FILE
 from app.job import Job
 from app.problems import NotFound
 from app.routes import PNG, problems
 from app.routes.events import followed
 from app.schemas_episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
 from app.services import Services, ServicesDep
-from osfcore.errors import UnknownName
+from osfcore.errors import CorruptFile, UnknownName
 
 router = APIRouter(prefix="/api/episodes", tags=["episodes"], responses=problems())
 _MEDIA_TYPES = {
@@ -136,4 +138,10 @@ def file(
 
 def _out(services: Services, job: Job) -> EpisodeOut:
     episodes = services.episodes
-    return EpisodeOut.of_job(job, episodes.settings(job), episodes.report(job), episodes.files(job))
+    settings, files, report = episodes.settings(job), episodes.files(job), episodes.report(job)
+    try:
+        return EpisodeOut.of_job(job, settings, report, files)
+    except (ValidationError, TypeError) as error:
+        if report is None:
+            raise
+        raise CorruptFile(services.runner.jobs.folder(job.id) / REPORT_FILE, "it does not describe steps") from error

@@ -31,11 +31,11 @@ async function call(method, path, body) {
 }
 
 /** Sends a file; `onProgress` is told the share that has been sent. */
-export function upload(path, file, onProgress) {
+export function upload(path, file, onProgress = () => {}, type = "application/zip") {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest(); // fetch tells no progress of what it sends
     request.open("POST", `api/${path}`);
-    request.setRequestHeader("Content-Type", "application/zip");
+    request.setRequestHeader("Content-Type", type);
     request.upload.addEventListener("progress", (event) => event.lengthComputable && onProgress(event.loaded / event.total));
     request.addEventListener("error", () => reject(new ApiError("The service cannot be reached, or refused a file of this size.", 0)));
     request.addEventListener("load", async () => {

@@ -2,7 +2,6 @@
 import { byId, el } from "./dom.js";
 import { enlargeComparison, isComparing } from "./neural.js";
 import { current, watch } from "./state.js";
-import { toast } from "./toasts.js";
 
 const NAMES = ["0", "1", "2", "3", "goal"];
 const tiles = new Map();
@@ -106,8 +105,4 @@ export function setUpCameras() {
     }
     shown = scene?.id ?? null;
   });
-}
-
-export function tellMissingScene() {
-  toast("There is no scene yet; make one under Scenes.", "warning");
 }

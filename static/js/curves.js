@@ -3,12 +3,12 @@ import { el } from "./dom.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT, FOOT] = [344, 132, 16];
-const COLOURS = ["#2a84c0", "#e07b2a", "#3a9a5b", "#c8486a", "#8b6fc9", "#9a7350", "#c75fa6", "#4aa3a3"];
+export const COLOURS = ["#2a84c0", "#e07b2a", "#3a9a5b", "#c8486a", "#8b6fc9", "#9a7350", "#c75fa6", "#4aa3a3"];
 const LETTER_PX = 5.6;
 
 const colourOf = (number, count) => (number === count ? "var(--text)" : COLOURS[number % COLOURS.length]);
 
-function svg(tag, attributes, text = "") {
+export function svg(tag, attributes, text = "") {
   const node = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   node.textContent = text;

@@ -4,7 +4,7 @@ import { LatestImage } from "./cameras.js";
 import { drawCurves, drawKey } from "./curves.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
-import { objects, watch } from "./state.js";
+import { labelOf, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
 import { zipped } from "./zip.js";
 
@@ -12,7 +12,6 @@ const PICTURE_MS = 700; // rendering takes time from the estimator
 const form = () => byId("new-estimate");
 const deg = (radians) => (radians * 180) / Math.PI;
 const two = (value) => (value === null ? "any" : Number(value.toPrecision(2)).toString());
-const labelOf = (name) => objects().find((object) => object.name === name)?.label ?? name;
 const picture = new LatestImage(byId("estimate-image"));
 let shown = { id: "", state: "" };
 let wanted = null; // the estimate whose details are to be fetched next

@@ -1,25 +1,25 @@
 // The event stream: reconnects by itself, replays missed job events, says when it is lost and found.
 
 /**
- * handlers: { job, scene, frame, notice, open(again), lost } - `again` is true when the stream had been lost.
+ * `handlers` has one for each kind of event; `open(again)` is told true when the stream had been lost, `lost` when it is.
  */
-export function listen(handlers) {
+export function listen(visitor, { open, lost, ...handlers }) {
   let source = null;
   let wasOpen = false;
   let isLost = false;
 
   function connect() {
-    source = new EventSource("api/events?frames=1");
-    for (const kind of ["job", "scene", "frame", "notice"]) {
-      source.addEventListener(kind, (event) => handlers[kind](JSON.parse(event.data)));
+    source = new EventSource(`api/events?${new URLSearchParams({ frames: 1, visitor })}`);
+    for (const [kind, handle] of Object.entries(handlers)) {
+      source.addEventListener(kind, (event) => handle(JSON.parse(event.data)));
     }
     source.addEventListener("open", () => {
-      handlers.open(wasOpen && isLost);
+      open(wasOpen && isLost);
       wasOpen = true;
       isLost = false;
     });
     source.addEventListener("error", () => {
-      if (!isLost) handlers.lost();
+      if (!isLost) lost();
       isLost = true;
       if (source.readyState === EventSource.CLOSED) setTimeout(connect, 1000);
     });

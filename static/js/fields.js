@@ -1,11 +1,11 @@
 // Fields: what there is and how good it is, training new ones from a mesh or an uploaded image set, watching it.
 import { get, post, remove, upload } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
+import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
-import { objects, watch } from "./state.js";
+import { objects, set, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
 
-const DOUBT_MS = 4000;
 let sets = [];
 let shown = { id: "", state: "", controls: "", preview: "" };
 
@@ -17,20 +17,6 @@ function options(select, entries, empty) {
   select.replaceChildren(...entries.map(([value, text]) => el("option", { value, textContent: text })));
   if (!entries.length) select.append(el("option", { value: "", textContent: empty }));
   if (entries.some(([value]) => value === before)) select.value = before;
-}
-
-/** A button that asks once more before it does what cannot be undone. */
-function doubted(button, text, action) {
-  const sure = button.textContent;
-  button.addEventListener("click", () => {
-    if (button.textContent === sure) {
-      button.textContent = text;
-      setTimeout(() => { button.textContent = sure; }, DOUBT_MS);
-    } else {
-      whileDisabled(button, () => tellFailure(action));
-    }
-  });
-  return button;
 }
 
 function entry(field) {
@@ -61,6 +47,7 @@ function deleteButton(name) {
 export async function refreshFields() {
   const answer = await tellFailure(() => get("fields"));
   if (!answer) return;
+  set("fields", answer.fields);
   byId("field-list").replaceChildren(...answer.fields.map(entry));
   byId("no-fields").hidden = answer.fields.length > 0;
   byId("fields-hint").hidden = answer.fields.length === 0;

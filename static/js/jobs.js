@@ -2,12 +2,13 @@
 import { get, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { refreshObjects } from "./objects.js";
-import { objects, set, watch } from "./state.js";
+import { labelOf, objects, set, watch } from "./state.js";
+import { showTab } from "./tabs.js";
 import { tellFailure } from "./toasts.js";
 
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
-  train_field: "Field", estimate: "Estimate",
+  train_field: "Field", estimate: "Estimate", episode: "Episode",
 };
 export const LIVE = new Set(["queued", "running", "paused"]);
 const number = (name, label, value, min, max) => ({ name, label, value, min, max, type: "number" });
@@ -57,7 +58,7 @@ async function start(event) {
     tellFailure(async () => showJob(await post("jobs", { kind: form.elements.kind.value, params }))));
 }
 
-function timeLeft(seconds) {
+export function timeLeft(seconds) {
   if (seconds === null) return "";
   if (seconds < 90) return `, about ${Math.ceil(seconds)} s left`;
   return seconds < 5400 ? `, about ${Math.round(seconds / 60)} min left` : `, about ${(seconds / 3600).toFixed(1)} h left`;
@@ -90,6 +91,7 @@ function orderText({ kind, params: p }) {
   if (kind === "fetch_assets") return p.names?.length ? p.names.join(", ") : "all from the package index";
   if (kind === "train_field") return `${p.minutes} min from ${p.source.mesh ? `${p.images} images of its mesh` : "an uploaded set"}, seed ${p.seed}`;
   if (kind === "estimate") return `${p.mode} frame of ${p.of.file_name ?? "a scene"}, ${p.names.length} objects, seed ${p.seed}`;
+  if (kind === "episode") return `${p.names.map(labelOf).join(", ")}; ${p.settings.cost} cost, at most ${p.settings.steps} steps`;
   return `${p.images} images of ${p.size} px, seed ${p.seed}`;
 }
 
@@ -105,6 +107,7 @@ function command(text, className, action) {
 }
 
 export function controls(job) {
+  if (job.kind === "episode") return [showEpisode(job)]; // its own tab has the rest
   const buttons = [];
   if (job.state === "running") buttons.push(command("Pause", "plain", () => post(`jobs/${job.id}/pause`)));
   if (job.state === "paused") buttons.push(command("Resume", "plain", () => post(`jobs/${job.id}/resume`)));
@@ -116,6 +119,13 @@ export function controls(job) {
     buttons.push(el("a", { href: `api/jobs/${job.id}/files/${encodeURIComponent(name)}`, textContent: name, download: name }));
   }
   return buttons;
+}
+
+function showEpisode(job) {
+  return el("button", { type: "button", className: "plain", textContent: "Show", on: { click() {
+    showTab("episode");
+    set("opened", { id: job.id });
+  } } });
 }
 
 function controlsKey(job) {
@@ -164,6 +174,7 @@ export function showJob(job) {
   byId("jobs-count").textContent = live;
   byId("jobs-count").hidden = live === 0;
   if (job.kind === "train_field") set("training", latest("train_field"));
+  if (job.kind === "episode") set("episode", latest("episode"));
   if (job.kind === "estimate") set("estimate", latest("estimate"));
   if (job.kind === "fetch_assets" && job.state === "done" && before && before.state !== "done") refreshObjects();
 }

@@ -1,23 +1,33 @@
 // Puts the page together: sets the pieces up, follows the event stream, keeps the status line honest.
 import { get } from "./api.js";
 import { setUpCameras, showFrames } from "./cameras.js";
+import { setUpCompose } from "./compose.js";
 import { byId } from "./dom.js";
+import { VISITOR, setUpDriver } from "./driver.js";
+import { setUpDrop } from "./drop.js";
+import { setUpEpisode } from "./episode.js";
+import { refreshSettings, setUpEpisodeSettings } from "./episode-settings.js";
+import { refreshShown, setUpEpisodeView, shownStep } from "./episode-view.js";
+import { refreshEpisodes, setUpEpisodes } from "./episodes.js";
 import { setUpEstimate } from "./estimate.js";
 import { listen } from "./events.js";
 import { refreshSets, setUpFields } from "./fields.js";
+import { refreshGoals, setUpGoals } from "./goals.js";
 import { refreshJobs, setUpJobs, showJob } from "./jobs.js";
 import { setUpKeyboard } from "./keyboard.js";
 import { setUpLight } from "./light.js";
 import { setUpNeural } from "./neural.js";
 import { setUpNumbers } from "./numbers.js";
 import { refreshObjects, setUpObjects } from "./objects.js";
+import { setUpPresets } from "./presets.js";
 import { setUpPush } from "./push.js";
+import { setUpResults } from "./results.js";
 import { refreshScenes, setUpScenes } from "./scenes.js";
 import { expectOlder, set } from "./state.js";
 import { setUpTabs } from "./tabs.js";
 import { setUpTheme } from "./theme.js";
 import { toast } from "./toasts.js";
-import { isViewerShown, showViewer } from "./viewer.js";
+import { isViewerShown, setUpViewer, showViewer } from "./viewer.js";
 import { setUpWelcome } from "./welcome.js";
 
 const STARTING = { starting: "Simulation starting", restarting: "Simulation restarting" };
@@ -54,6 +64,8 @@ async function followHealth(again) {
 
 setUpTheme(() => { if (isViewerShown()) showViewer(); });
 setUpTabs();
+setUpViewer();
+setUpDriver();
 setUpCameras();
 setUpNeural();
 setUpPush();
@@ -64,26 +76,44 @@ setUpObjects();
 setUpJobs();
 setUpFields();
 setUpEstimate();
+setUpPresets();
+setUpGoals();
+setUpCompose();
+setUpDrop();
+setUpEpisodeView();
+setUpResults(shownStep);
+setUpEpisodeSettings();
+setUpEpisode();
+setUpEpisodes();
 setUpWelcome();
 setUpKeyboard();
 refreshObjects();
 refreshSets();
+refreshGoals();
 
-listen({
+listen(VISITOR, {
   open(again) {
     followHealth(again);
     refreshJobs();
     if (again) {
       expectOlder();
+      set("draft", null); // told again if there still is one
       refreshScenes();
       refreshObjects();
       refreshSets();
+      refreshGoals();
+      refreshSettings();
+      refreshEpisodes();
+      refreshShown();
     }
   },
   lost: () => status("Reconnecting", "lost"),
   scene: (scene) => set("scene", scene),
   frame: showFrames,
   job: showJob,
+  draft: (draft) => set("draft", draft),
+  goals: () => refreshGoals(),
+  driver: (driver) => set("driver", driver),
   notice({ level, text }) {
     toast(text, level);
     followHealth(false); // it may be that the simulation is being restarted

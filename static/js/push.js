@@ -1,9 +1,8 @@
 // Pushing by hand: buttons and arrow keys, one action of 0.2 s at a time, as long as something is held.
 import { post } from "./api.js";
-import { tellMissingScene } from "./cameras.js";
 import { byId, el } from "./dom.js";
 import { current, set } from "./state.js";
-import { toast } from "./toasts.js";
+import { tellMissingScene, toast } from "./toasts.js";
 
 const STEP_MS = 200;
 const PAD = [

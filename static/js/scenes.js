@@ -32,11 +32,11 @@ async function submit(event) {
   return whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(() => make(body)));
 }
 
-/** Another random scene with as many objects as this one. */
-export function anotherScene() {
+/** Another random scene, with as many objects as this one if nothing else is said. */
+export function anotherScene(count = current()?.objects.length ?? Number(form().elements.count.value)) {
   const seed = randomSeed();
   form().elements.seed.value = seed;
-  return tellFailure(() => make({ seed, count: current()?.objects.length ?? Number(form().elements.count.value) }));
+  return tellFailure(() => make({ seed, count }));
 }
 
 export function resetScene() {

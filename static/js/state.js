@@ -1,12 +1,23 @@
 // What the page knows of the service; modules subscribe to what they show.
 
 // The scene is undefined until the service has told, and null when there is none.
-// `training` is the job that trains a field now, or the latest one that did; `estimate` likewise.
-const state = { scene: undefined, objects: [], training: undefined, estimate: undefined };
-const listeners = { scene: [], objects: [], training: [], estimate: [] };
+// `training` is the job that trains a field now, or the latest one that did; `estimate` and `episode` likewise.
+// `goal` is the one that was chosen on this page; `draft` the one that is being composed, null when there is none.
+// `driver` tells which visitor drives; `opened` is an episode that somebody wants to see, `report`
+// the one that was fetched last; `settings` what the form says, null if that cannot be used.
+const state = {
+  scene: undefined, objects: [], fields: undefined, training: undefined, estimate: undefined, episode: undefined,
+  goals: [], goal: null, draft: null, driver: null, opened: null, report: null, settings: null,
+};
+const listeners = Object.fromEntries(Object.keys(state).map((what) => [what, []]));
 
 export const current = () => state.scene;
 export const objects = () => state.objects;
+export const known = (what) => state[what];
+export const labelOf = (name) => state.objects.find((object) => object.name === name)?.label ?? name;
+
+/** A sentence of the service with what people call the objects in place of their names. */
+export const inWords = (text) => state.objects.reduce((told, { name, label }) => told.replaceAll(name, label), text);
 
 /** Calls `listener` now and whenever the value changes. */
 export function watch(what, listener) {
@@ -17,12 +28,19 @@ export function watch(what, listener) {
 /** A service that was started again may count revisions from further back: take whatever it says next. */
 export function expectOlder() {
   if (state.scene) state.scene = { ...state.scene, revision: -1 };
+  if (state.draft) state.draft = { ...state.draft, revision: -1 };
+}
+
+/** Whether a value was overtaken by a newer one that is known already. */
+function isOvertaken(what, value) {
+  const before = state[what];
+  if (!value || !before) return false;
+  if (what === "scene") return value.id === before.id && value.revision < before.revision;
+  return what === "draft" && value.scene === before.scene && value.revision < before.revision;
 }
 
 export function set(what, value) {
-  if (what === "scene" && value && state.scene && value.id === state.scene.id && value.revision < state.scene.revision) {
-    return; // an answer that was overtaken by a newer event
-  }
+  if (isOvertaken(what, value)) return;
   state[what] = value;
   for (const listener of listeners[what]) listener(value);
 }

@@ -27,3 +27,9 @@ export function setUpTabs() {
     });
   }
 }
+
+/** Scrolls the panel so that a card of it begins at its top; the page itself stays where it is. */
+export function scrollTo(card) {
+  const panel = card.closest('[role="tabpanel"]');
+  panel.scrollTop += card.getBoundingClientRect().top - panel.getBoundingClientRect().top;
+}

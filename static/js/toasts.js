@@ -24,3 +24,7 @@ export async function tellFailure(action) {
     return undefined;
   }
 }
+
+export function tellMissingScene() {
+  toast("There is no scene yet; make one under Scenes.", "warning");
+}

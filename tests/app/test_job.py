@@ -1,8 +1,9 @@
 import json
+from typing import get_args
 
 import pytest
 
-from app.job import Job, WrongJobState, check_file_name, check_params, ended, job_fields, job_from_fields
+from app.job import Job, State, WrongJobState, check_file_name, check_params, ended, job_fields, job_from_fields
 from osfcore.errors import InvalidInput, UnknownName
 
 
@@ -11,9 +12,9 @@ def test_a_job_survives_json():
     assert job_from_fields(json.loads(json.dumps(job_fields(job)))) == job
 
 
-@pytest.mark.parametrize(("state", "is_over"), [("queued", False), ("paused", False), ("done", True), ("failed", True)])
-def test_finished_jobs_change_no_more(state, is_over):
-    assert Job("a", "x", {}, state).is_finished == is_over
+@pytest.mark.parametrize("state", get_args(State))
+def test_finished_jobs_change_no_more(state):
+    assert Job("a", "x", {}, state).is_finished == (state not in ("queued", "running", "paused"))
 
 
 def test_an_ended_job_has_neither_place_nor_time_left():

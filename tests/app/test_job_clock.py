@@ -27,3 +27,12 @@ def test_pauses_do_not_count(now):
     clock.switch(is_running=True)
     now[0] += 2
     assert clock.left_s(2, 10) == pytest.approx(16)
+
+
+def test_time_before_the_total_is_known_tells_nothing_of_the_rest(now):
+    clock = JobClock()
+    assert clock.left_s(0, 0) is None
+    now[0] += 600
+    assert clock.left_s(0, 10) is None
+    now[0] += 3
+    assert clock.left_s(1, 10) == pytest.approx(27)

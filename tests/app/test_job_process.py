@@ -1,9 +1,11 @@
+import dataclasses
 from multiprocessing import Pipe
 from pathlib import Path
 from threading import Event
 
 import pytest
 
+import app.job_process as job_process
 from app.job_process import KINDS, Orders, Place, job_main
 from app.messages import (
     AskStage,
@@ -12,6 +14,7 @@ from app.messages import (
     Failure,
     JobCancelled,
     JobDone,
+    JobRests,
     JobStep,
     PauseJob,
     Reply,
@@ -160,6 +163,68 @@ def test_a_job_asks_for_what_it_wants_done_with_its_scene(wired):
     ours.send(Failure(0, "UnknownName", "There is no such scene."))
     with pytest.raises(StageError, match="no such scene"):
         orders.ask(asked)
+
+
+@dataclasses.dataclass(frozen=True)
+class Told:
+    """A step of a job, as many come in no time."""
+
+    done: int
+    must_be_told: bool
+    total: int = 100
+    note: str = "Working"
+    seen: str | None = None
+    ends_round: bool = False
+
+
+def run(monkeypatch, steps, orders=None):
+    """What a job tells that makes these steps faster than they are worth telling."""
+    told = []
+
+    class Connection:
+        send = staticmethod(told.append)
+
+    class Deaf:
+        def rests_now(self):
+            return False
+
+        def must_stop(self):
+            return False
+
+    monkeypatch.setitem(KINDS, "played", lambda *_: (step for step in steps))
+    monkeypatch.setattr(job_process, "STEP_INTERVAL_S", float("inf"))
+    outcome = job_process._run(Connection(), orders or Deaf(), "played", {}, Place(Path("d"), Path("f")))
+    return told, outcome
+
+
+def test_steps_that_must_be_told_are_never_thinned_out(monkeypatch):
+    steps = [Told(number, number % 3 == 0, seen=f"view {number}") for number in range(30)]
+    told, outcome = run(monkeypatch, steps)
+    assert [step.done for step in told] == list(range(0, 30, 3))
+    assert [step.seen for step in told] == [f"view {number}" for number in range(0, 30, 3)]
+    assert isinstance(outcome, JobDone)
+    assert outcome.result == {"must_be_told": False, "ends_round": False}
+
+
+def test_steps_that_come_too_fast_are_not_told_but_the_last_one_is(monkeypatch):
+    told, _ = run(monkeypatch, [Told(number, False) for number in range(101)])
+    assert [step.done for step in told] == [100]
+
+
+def test_a_job_tells_that_it_rests_where_a_round_ends_and_only_then(monkeypatch):
+    class Stepping:
+        left = 1
+
+        def rests_now(self):
+            self.left -= 1
+            return self.left >= 0
+
+        def must_stop(self):
+            return False
+
+    steps = [Told(1, True), Told(2, True, ends_round=True), Told(3, True), Told(4, True, ends_round=True)]
+    told, _ = run(monkeypatch, steps, Stepping())
+    assert [type(message) for message in told] == [JobStep, JobStep, JobRests, JobStep, JobStep]
 
 
 def test_every_kind_that_rest_tells_of_exists():

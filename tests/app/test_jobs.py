@@ -5,12 +5,13 @@ from multiprocessing import Pipe
 
 import pytest
 
+import app.job_ends as job_ends
 import app.jobs as jobs_module
 from app.field_files import workshop
 from app.job import JobSeen
-from app.job_ends import RESUMES_NOTE, STOPPED_NOTE
+from app.job_ends import DIED_NOTE, INTERRUPTED_NOTE, RESUMES_NOTE, STOPPED_NOTE
 from app.jobs import Jobs, QueueFull, WrongJobState
-from app.messages import AskStage, JobDone, JobRests, JobStep, PauseJob, StepJob, TakeImage
+from app.messages import AskStage, CancelJob, JobCancelled, JobDone, JobRests, JobStep, PauseJob, StepJob, TakeImage
 from app.store import CannotStore, Store
 from osfcore.errors import UnknownName
 from tests.app.conftest import until
@@ -312,3 +313,86 @@ def test_what_a_job_asks_for_is_done_with_its_own_scene_only(played, open_jobs):
     played.send(AskStage(TakeImage("s2", "goal", 32)))
     assert "s2" in played.recv().text
     assert [command.id for command in asked] == ["s1", "s1"]
+
+
+def begun(jobs, kind="episode"):
+    """A job of which one step is done."""
+    job = jobs.submit(kind, {"scene": "s1"})
+    until_state(jobs, job, "running")
+    (jobs.folder(job.id) / "report.json").write_text("{}")
+    return job
+
+
+def test_an_episode_that_a_stop_interrupts_keeps_its_steps(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = begun(jobs)
+    played.send(JobStep(1, 3, "Pushing", {"stage": "act", "steps": 1}))
+    until(lambda: jobs.get(job.id).done == 1)
+    jobs.stop()
+    again, _ = open_jobs()
+    kept = again.get(job.id)
+    assert (kept.state, kept.error, kept.files) == ("interrupted", INTERRUPTED_NOTE, ("report.json",))
+    assert (kept.done, kept.result) == (1, {"stage": "act", "steps": 1})
+    assert (again.folder(job.id) / "report.json").is_file()
+    with pytest.raises(WrongJobState, match="interrupted"):
+        again.cancel(job.id)
+
+
+@pytest.mark.parametrize("state", ["running", "paused"])
+@pytest.mark.parametrize(("kind", "over"), [("episode", "interrupted"), ("estimate", "failed")])
+def test_after_a_crash_an_episode_is_interrupted_and_half_of_anything_else_is_removed(
+    played, open_jobs, store, kind, over, state
+):
+    jobs, _ = open_jobs()
+    job = begun(jobs, kind)
+    ((number, fields),) = store.jobs()
+    folder = jobs.folder(job.id)
+    jobs.stop()
+    folder.mkdir(exist_ok=True)
+    (folder / "report.json").write_text("{}")
+    store.save_job(job.id, number, {**fields, "state": state})  # as a killed service leaves it
+    again, events = open_jobs()
+    assert again.get(job.id).state == events[0].job.state == over
+    assert folder.exists() == (kind == "episode")
+    assert again.get(job.id).files == (("report.json",) if kind == "episode" else ())
+
+
+def test_an_episode_whose_process_dies_fails_and_keeps_its_steps(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = begun(jobs)
+    played.close()
+    failed = until_state(jobs, job, "failed", "done")
+    assert (failed.state, failed.error, failed.files) == ("failed", DIED_NOTE, ("report.json",))
+    assert (jobs.folder(job.id) / "report.json").is_file()
+
+
+def test_what_keeps_its_steps_keeps_them_when_its_process_is_killed(open_jobs, monkeypatch):
+    monkeypatch.setattr(job_ends, "_KEEPING", (LONG[0],))
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    (jobs.folder(job.id) / "report.json").write_text("{}")
+    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    failed = until_state(jobs, job, "failed")
+    assert (failed.error, failed.files) == (DIED_NOTE, ("report.json",))
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_cancelled_episode_keeps_its_steps_whether_it_listens_or_not(played, open_jobs, answers):
+    jobs, _ = open_jobs(cancel_grace_s=600 if answers else 0.1)
+    job = begun(jobs)
+    if answers:
+        played.send(JobCancelled())
+    over = jobs.cancel(job.id) if not answers else until_state(jobs, job, "cancelled", "done")
+    assert (over.state, over.error, over.files) == ("cancelled", None, ("report.json",))
+    if not answers:
+        assert isinstance(played.recv(), CancelJob)
+
+
+def test_an_episode_that_was_cancelled_before_it_began_leaves_nothing(played, open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    begun(jobs)
+    (data_dir / "given").mkdir()
+    waiting = jobs.submit("episode", {"scene": "s1"}, data_dir / "given")
+    assert jobs.cancel(waiting.id).state == "cancelled"
+    assert not jobs.folder(waiting.id).exists()

@@ -1,5 +1,7 @@
 import io
+import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from multiprocessing import Pipe
 from threading import Thread
 
@@ -9,6 +11,8 @@ from PIL import Image
 
 from app.messages import (
     Act,
+    ComposedGoal,
+    ComposeGoal,
     CreateScene,
     DropScene,
     EditScene,
@@ -23,12 +27,13 @@ from app.messages import (
     ShowScene,
     TakeImage,
     TakeMask,
+    TakeView,
     WatchFrames,
 )
 from app.stage import MASK_COLOURS, Stage, draw_masks
 from osfcore.observationfile import read_observation
 from osfcore.poses import Pose
-from osfcore.scene import STEP_S, Light
+from osfcore.scene import STEP_S, Light, goal_camera
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 
@@ -202,3 +207,99 @@ def test_a_scene_is_observed_as_the_robot_sees_it_and_nothing_tells_the_truth(di
     assert goal.masks is None
     assert goal.pusher is None
     assert director.call(ObserveScene("b", tmp_path / "none", goal=False, masks=True)).kind == "UnknownName"
+
+
+def pixels(png):
+    return np.array(Image.open(io.BytesIO(png)), int)
+
+
+@pytest.fixture
+def used(director):
+    """A scene in which something was pushed already."""
+    create(director, light=Light(np.array([0.0, 0.6, 0.8])))
+    record = director.call(Act("a", (np.array([0.1, 0.1, 0]),) * 2))
+    director.events.clear()
+    return record
+
+
+def is_as_it_was(director, record):
+    """Whether a scene is where and when it was, to the next command too, and nobody was told of anything."""
+    assert changes(director) == []
+    now = director.call(Act("a", ()))
+    assert now.time_s == pytest.approx(record.time_s)
+    np.testing.assert_allclose(now.state.pusher, record.state.pusher, atol=1e-6)
+    np.testing.assert_allclose(now.state.poses.position, record.state.poses.position, atol=1e-6)
+    np.testing.assert_allclose(now.state.light.position, record.state.light.position)
+    later = director.call(Act("a", (np.zeros(3),)))
+    return later.time_s == pytest.approx(record.time_s + STEP_S)
+
+
+@pytest.mark.parametrize(
+    ("asked", "moved"),
+    [
+        ({}, 0),
+        ({"poses": (BOX,)}, 1),
+        ({"seed": 3, "moved": 2}, 2),
+        ({"light": Light(np.array([1.0, 0, 1]))}, 0),
+    ],
+)
+def test_a_goal_is_composed_and_the_scene_and_its_time_stay(director, used, asked, moved):
+    start = used.state
+    up = {name: Pose(start.pose(name).position + [0, 0.08, 0], start.pose(name).quaternion) for name in (BOX,)}
+    asked = {**asked, "poses": tuple((name, up[name]) for name in asked.get("poses", ()))}
+    made = director.call(ComposeGoal("a", **asked, size=64))
+    assert isinstance(made, ComposedGoal)
+    assert [name for name, _ in made.poses] == list(start.names)
+    assert pixels(made.png).shape == (64, 64, 3)
+    far = [np.linalg.norm(pose.position - start.pose(name).position) > 0.02 for name, pose in made.poses]
+    assert sum(far) == moved
+    assert is_as_it_was(director, used)
+
+
+@pytest.mark.parametrize(
+    ("asked", "kind"),
+    [
+        ({"poses": (("teapot", Pose.identity()),)}, "UnknownName"),
+        ({"poses": ((BOX, Pose(np.array([9.0, 0, 0.1]), np.array([1.0, 0, 0, 0]))),)}, "InvalidInput"),
+        ({"seed": 0, "moved": 3}, "InvalidInput"),
+        ({"size": 4}, "InvalidInput"),
+        ({"poses": BOTTLE}, "OverlappingObjects"),
+    ],
+)
+def test_a_goal_that_cannot_be_leaves_the_scene_and_its_time_too(director, used, asked, kind):
+    if asked.get("poses") == BOTTLE:
+        asked = {"poses": ((BOX, used.state.pose(BOTTLE)),)}
+    failure = director.call(ComposeGoal("a", **asked))
+    assert isinstance(failure, Failure)
+    assert failure.kind == kind
+    assert is_as_it_was(director, used)
+
+
+def test_a_goal_of_a_scene_that_left_memory_or_never_was(director, used):
+    create(director, "b", seed=2)  # only one simulation stays
+    director.events.clear()
+    made = director.call(ComposeGoal("a", size=64))
+    np.testing.assert_allclose(dict(made.poses)[BOX].position, used.state.pose(BOX).position, atol=2e-3)
+    assert is_as_it_was(director, used)
+    assert director.call(ComposeGoal("z")).kind == "UnknownName"
+
+
+def test_a_goal_shows_what_the_goal_camera_would_see_without_the_pusher(director, used):
+    made = director.call(ComposeGoal("a", size=64))
+    plain = pixels(director.call(TakeView("a", goal_camera(64), pusher=False)))
+    assert np.abs(pixels(made.png) - plain).mean() < 1  # what was pushed may settle a little
+    lit = director.call(ComposeGoal("a", light=Light(np.array([1.0, 0, 0.3])), size=64))
+    assert np.abs(pixels(lit.png) - plain).mean() > 2
+
+
+def test_any_camera_may_look(director, used):
+    camera = replace(goal_camera(96), name="mine", height=64)
+    command = pickle.loads(pickle.dumps(TakeView("a", camera)))  # as it comes over
+    seen = pixels(director.call(command))
+    assert seen.shape == (64, 96, 3)
+    square = pixels(director.call(TakeView("a", goal_camera(64))))
+    without = pixels(director.call(TakeView("a", goal_camera(64), pusher=False)))
+    assert (square != without).any()
+    np.testing.assert_array_equal(square, pixels(director.call(TakeImage("a", "goal", 64))))
+    assert director.call(TakeView("z", camera)).kind == "UnknownName"
+    assert is_as_it_was(director, used)

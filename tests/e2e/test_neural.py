@@ -43,7 +43,7 @@ def page(browser, url):
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
-    page.wait_for_selector("#poses tr", timeout=WAIT_MS)
+    page.wait_for_selector("#poses tr", state="attached", timeout=WAIT_MS)
     yield page
     page.close()
 

@@ -57,7 +57,7 @@ def tab(browser, service):
     page.on("request", lambda r: page.hosts.add(urlsplit(r.url).netloc) if r.url.startswith(("http", "ws")) else None)
     page.goto(service.url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
-    page.wait_for_selector("#poses tr", timeout=WAIT_MS)
+    page.wait_for_selector("#poses tr", state="attached", timeout=WAIT_MS)
     yield page
     page.close()
 
@@ -275,7 +275,7 @@ def test_phone_has_no_sideways_scroll_in_either_theme(browser, service, scheme):
     context = browser.new_context(viewport={"width": 390, "height": 844}, color_scheme=scheme)
     phone = context.new_page()
     phone.goto(service.url)
-    phone.wait_for_selector("#poses tr", timeout=WAIT_MS)
+    phone.wait_for_selector("#poses tr", state="attached", timeout=WAIT_MS)
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
     ground = phone.evaluate("getComputedStyle(document.body).backgroundColor")
     brightness = np.mean([int(part) for part in ground.removeprefix("rgb(").removesuffix(")").split(",")])
@@ -290,7 +290,7 @@ def test_theme_is_remembered(page):
     page.click("#theme-button")
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
     page.reload()
-    page.wait_for_selector("#poses tr", timeout=WAIT_MS)
+    page.wait_for_selector("#poses tr", state="attached", timeout=WAIT_MS)
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
     page.click("#theme-button")
 

@@ -102,6 +102,7 @@ def test_a_push_is_chosen_predicted_executed_and_compared(page, url):
     frame.get_by_role("button", name="Play").wait_for()
     page.screenshot(path=ARTIFACTS / "push_executed.png")
 
+    page.click("#tab-drive")
     page.click("#reset")  # the table has changed by other hands
     frame.locator(".push-status:has-text('has changed')").wait_for()
     wait_until(lambda: purple(page) < kept)  # only the way of the pusher is left

@@ -1,0 +1,34 @@
+// Who drives: of several visitors one page changes things; the others watch until they take over.
+import { post } from "./api.js";
+import { byId, whileDisabled } from "./dom.js";
+import { known, set, watch } from "./state.js";
+import { tellFailure, toast } from "./toasts.js";
+
+// Not crypto.randomUUID: browsers keep that for secure pages, and this one may come from another machine.
+export const VISITOR = [...crypto.getRandomValues(new Uint8Array(12))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+
+export function isDriving() {
+  const driver = known("driver")?.driver;
+  return !driver || driver === VISITOR;
+}
+
+/** Whether this page drives; if not, it is said. */
+export function mayDrive() {
+  if (!isDriving()) toast("Someone else is driving; take over first.", "warning");
+  return isDriving();
+}
+
+function draw(driver) {
+  const visitors = driver?.visitors ?? 1;
+  byId("watching").hidden = visitors < 2;
+  byId("watching").textContent = `${visitors} watching`;
+  byId("driver-bar").hidden = isDriving();
+  for (const controls of document.querySelectorAll("fieldset.drives")) controls.disabled = !isDriving();
+}
+
+export function setUpDriver() {
+  const button = byId("take-over");
+  button.addEventListener("click", () => whileDisabled(button, () =>
+    tellFailure(async () => set("driver", await post("driver", { visitor: VISITOR })))));
+  watch("driver", draw);
+}

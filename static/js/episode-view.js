@@ -1,0 +1,169 @@
+// One episode on view, running or over: its pictures and numbers at a step, its charts, and what was noticed.
+import { get } from "./api.js";
+import { byId, el } from "./dom.js";
+import { LIVE } from "./jobs.js";
+import { preload, setUpPictures, showFrame, standIn } from "./pictures.js";
+import { drawProgress, setUpProgress } from "./progress-charts.js";
+import { drawResults } from "./results.js";
+import { current, inWords, known, labelOf, set, watch } from "./state.js";
+import { scrollTo } from "./tabs.js";
+import { Timeline } from "./timeline.js";
+import { tellFailure, toast } from "./toasts.js";
+
+let shown = null; // the episode, as fetched last
+let wanted = null; // {id, step} to be fetched next; no step: stay where one is, at the end if there
+let isFetching = false;
+let timeline = null;
+let followed = ""; // the job that was put on view by itself
+let seen = ""; // how far the job was when it was fetched for
+
+const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
+const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
+const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
+
+/** How an episode ended, or that it has not. */
+export function outcomeOf(episode) {
+  const text = OUTCOMES[episode.outcome] ?? episode.status.replace(/^./, (letter) => letter.toUpperCase());
+  const isBad = episode.status === "failed" || episode.outcome === "refused";
+  const isGood = episode.status === "running" || episode.outcome === "reached";
+  return { text, state: isGood ? "live" : isBad ? "lost" : "wait" };
+}
+
+/** Fetches what the latest event or click was about, one request at a time. */
+async function fetchWanted() {
+  if (isFetching) return;
+  isFetching = true;
+  while (wanted) {
+    const { id, step } = wanted;
+    wanted = null;
+    const found = await tellFailure(() => get(`episodes/${encodeURIComponent(id)}`));
+    if (found) showEpisode(found, step);
+  }
+  isFetching = false;
+}
+
+export function openEpisode(id, step) {
+  wanted = { id, step };
+  return fetchWanted();
+}
+
+/** Puts a fetched episode on view, at a step or where one is. */
+export function showEpisode(episode, step) {
+  const isOther = shown?.id !== episode.id;
+  const wasAtEnd = isOther || timeline.step >= timeline.last;
+  shown = episode;
+  set("report", episode);
+  byId("shown").hidden = false;
+  byId("shown").dataset.episode = episode.id;
+  if (isOther) {
+    timeline.pause();
+    drawStandIn();
+  }
+  drawHead(episode);
+  const last = episode.steps.length - 1;
+  if (Number.isFinite(step) && last >= 0 && step > last) toast(`This episode has steps 0 to ${last}; showing the last one.`, "warning");
+  const at = Number.isFinite(step) ? Math.min(step, last) : wasAtEnd ? last : timeline.step;
+  timeline.set(last, at);
+  drawResults(episode, isOther);
+  if (!isOther) return;
+  if (LIVE.has(episode.status)) scrollTo(byId("shown"));
+  else byId("shown").scrollIntoView({ block: "start" }); // somebody asked for it
+}
+
+/** What there is before the first step: the goal, and what the goal camera sees if the episode's table is on view. */
+function drawStandIn() {
+  const { goal, scene: id, status, steps } = shown;
+  const scene = current();
+  const query = new URLSearchParams({ size: 192, pusher: true, v: scene?.revision });
+  standIn({
+    goal: goal && !steps.length ? `api/goals/${encodeURIComponent(goal)}/image.png` : null,
+    now: scene?.id === id && LIVE.has(status) && !steps.length ? `api/scenes/${id}/images/goal.png?${query}` : null,
+  });
+}
+
+function drawHead(episode) {
+  const { text, state } = outcomeOf(episode);
+  byId("shown-title").title = byId("shown-title").textContent = episode.objects.map(labelOf).join(", ");
+  byId("shown-outcome").textContent = text;
+  byId("shown-outcome").dataset.state = state;
+  byId("shown-text").textContent = inWords(episode.text ?? "");
+  byId("shown-text").hidden = !episode.text;
+  byId("shown-error").textContent = inWords(episode.error ?? "");
+  byId("shown-error").hidden = !episode.error;
+  byId("close-shown").hidden = LIVE.has(episode.status);
+  byId("noticed").hidden = episode.notices.length === 0;
+  byId("notice-list").replaceChildren(...episode.notices.map((notice) => el(
+    "li", {},
+    el("button", { type: "button", className: "plain", textContent: `Step ${notice.step}`, on: { click: () => timeline.go(notice.step) } }),
+    el("span", { textContent: inWords(notice.text) }),
+  )));
+}
+
+function drawStep(at) {
+  if (!shown) return;
+  const step = shown.steps[at];
+  byId("shown-psnr").textContent = step ? `PSNR ${(-10 * Math.log10(Math.max(step.image_cost, 1e-10))).toFixed(1)} dB` : "";
+  byId("shown-psnr").title = step ? `Image cost ${step.image_cost.toPrecision(3)}` : "";
+  const knowsTruth = shown.steps.some((other) => other.estimate_off_mm);
+  byId("estimate-off-head").hidden = !knowsTruth;
+  byId("offset-rows").replaceChildren(...shown.objects.map((name) => {
+    const far = step && (step.truly_to_goal_mm ?? step.to_goal_mm)[name];
+    const cells = [far, step?.to_goal_deg[name], ...(knowsTruth ? [step?.estimate_off_mm?.[name]] : [])];
+    const row = el("tr", {}, el("td", { textContent: labelOf(name) }), ...cells.map((value) => el("td", { textContent: one(value) })));
+    row.dataset.object = name;
+    return row;
+  }));
+  drawProgress(shown, step ? step.step : -1);
+  if (!step) return;
+  showFrame(frameUrl(step.step));
+  if (timeline.timer && at < timeline.last) preload(frameUrl(at + 1));
+}
+
+/** Whether the page's address asks for an episode; then one that runs already does not push in front of it. */
+const isLinked = () => new URLSearchParams(location.search).has("episode");
+
+/** A new episode comes on view by itself; one that is on view is fetched again when it got further. */
+function follow(job) {
+  if (!job) return;
+  if (LIVE.has(job.state) && followed !== job.id) {
+    if (followed || !isLinked()) wanted = { id: job.id };
+    followed = job.id;
+  }
+  const far = `${job.id} ${job.state} ${job.result?.stage} ${job.result?.steps}`;
+  if (far !== seen && shown?.id === job.id && !wanted) wanted = { id: job.id };
+  seen = far;
+  if (wanted) fetchWanted();
+}
+
+function close() {
+  timeline.pause();
+  shown = null;
+  byId("shown").hidden = true;
+  const job = known("episode");
+  if (LIVE.has(job?.state)) openEpisode(job.id);
+}
+
+/** The step that is on view, for links. */
+export const shownStep = () => timeline.step;
+
+/** After the service was lost: what is on view may have gone on. */
+export function refreshShown() {
+  if (shown) openEpisode(shown.id);
+}
+
+export function setUpEpisodeView() {
+  setUpPictures();
+  timeline = new Timeline(drawStep);
+  setUpProgress(() => timeline.last, (step) => timeline.go(step));
+  byId("close-shown").addEventListener("click", close);
+  watch("objects", () => {
+    if (!shown) return;
+    drawHead(shown);
+    drawStep(timeline.step);
+  });
+  watch("episode", follow);
+  watch("opened", (opened) => { if (opened) openEpisode(opened.id, opened.step); });
+  watch("scene", () => {
+    if (shown && !shown.steps.length) drawStandIn();
+  });
+}

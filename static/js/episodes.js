@@ -1,0 +1,79 @@
+// All episodes, newest first, and links to a moment of one: ?episode=ID&step=N.
+import { get } from "./api.js";
+import { byId, el } from "./dom.js";
+import { openEpisode, outcomeOf, showEpisode } from "./episode-view.js";
+import { LIVE } from "./jobs.js";
+import { labelOf, watch } from "./state.js";
+import { tellFailure, toast } from "./toasts.js";
+
+const FEW = 6;
+let all = [];
+let showsAll = false;
+let listed = ""; // the latest job's state when the list was fetched
+
+function tookText({ started_at: started, finished_at: finished, done, status }) {
+  if (LIVE.has(status)) return "";
+  const seconds = started && finished ? (new Date(finished) - new Date(started)) / 1000 : null;
+  const time = seconds === null ? "" : seconds < 90 ? ` in ${seconds.toFixed(0)} s` : ` in ${(seconds / 60).toFixed(1)} min`;
+  return `, ${done} ${done === 1 ? "push" : "pushes"}${time}`;
+}
+
+function entry(episode) {
+  const { text, state } = outcomeOf(episode);
+  const made = new Date(episode.created_at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+  const badge = el("span", { className: "badge", textContent: text });
+  badge.dataset.state = state;
+  const item = el(
+    "li", {},
+    el("div", { className: "row" },
+      el("span", { className: "title", textContent: episode.objects.map(labelOf).join(", ") }), badge),
+    el("div", { className: "row" },
+      el("span", { className: "hint", textContent: `${made}${tookText(episode)}` }),
+      el("button", { type: "button", className: "plain", textContent: "Show", on: { click: () => openEpisode(episode.id) } })),
+  );
+  item.dataset.episode = episode.id;
+  return item;
+}
+
+function draw() {
+  byId("no-episodes").hidden = all.length > 0;
+  byId("episode-list").replaceChildren(...(showsAll ? all : all.slice(0, FEW)).map(entry));
+  const button = byId("all-episodes");
+  button.hidden = all.length <= FEW;
+  button.textContent = showsAll ? "Fewer" : `All ${all.length}`;
+}
+
+export async function refreshEpisodes() {
+  const answer = await tellFailure(() => get("episodes"));
+  if (!answer) return;
+  all = answer.episodes;
+  draw();
+}
+
+/** Opens what the page's address asks for. */
+async function openLink() {
+  const query = new URLSearchParams(location.search);
+  const id = query.get("episode");
+  if (!id) return;
+  const step = query.get("step") === null ? undefined : Number(query.get("step"));
+  try {
+    showEpisode(await get(`episodes/${encodeURIComponent(id)}`), Number.isInteger(step) && step >= 0 ? step : undefined);
+  } catch (error) {
+    toast(error.status === 404 ? "The episode of this link is not here; it may be on another machine." : error.message, "error");
+  }
+}
+
+export function setUpEpisodes() {
+  byId("all-episodes").addEventListener("click", () => {
+    showsAll = !showsAll;
+    draw();
+  });
+  watch("objects", draw);
+  watch("episode", (job) => {
+    const now = job ? `${job.id} ${job.state}` : "";
+    if (now !== listed) refreshEpisodes();
+    listed = now;
+  });
+  refreshEpisodes();
+  openLink();
+}

@@ -1,0 +1,134 @@
+// The goal: an image of how the table should look. Uploaded, drawn at random, composed, or one of the earlier ones.
+import { get, post, remove, upload } from "./api.js";
+import { byId, el, whileDisabled } from "./dom.js";
+import { doubted } from "./doubt.js";
+import { mayDrive } from "./driver.js";
+import { current, known, set, watch } from "./state.js";
+import { tellFailure, tellMissingScene, toast } from "./toasts.js";
+
+const MAX_SEED = 1_000_000;
+const NAME_MAX = 64;
+let pickedFor = null; // the scene for which a goal of another table was chosen by hand
+
+const fits = (goal, scene) => goal.source === "upload" || !goal.scene || goal.scene === scene?.id || pickedFor === scene?.id;
+
+/** Adds a goal that was just made, and chooses it. */
+export function takeGoal(goal) {
+  pickedFor = current()?.id ?? null;
+  set("goals", [goal, ...known("goals").filter((other) => other.id !== goal.id)]);
+  set("goal", goal);
+}
+
+export async function refreshGoals() {
+  const answer = await tellFailure(() => get("goals"));
+  if (answer) set("goals", answer.goals);
+}
+
+/** Keeps the goal that was chosen if it is there still and fits the table; else takes the newest made for it. */
+function settle() {
+  const scene = current();
+  if (scene === undefined) return;
+  const goals = known("goals");
+  const chosen = goals.find((goal) => goal.id === known("goal")?.id);
+  const next = chosen && fits(chosen, scene) ? chosen : goals.find((goal) => scene && goal.scene === scene.id) ?? null;
+  if (next?.id !== known("goal")?.id) set("goal", next);
+}
+
+export function randomGoal() {
+  const scene = current();
+  if (!scene) return tellMissingScene();
+  if (!mayDrive()) return undefined;
+  const seed = Math.floor(Math.random() * MAX_SEED);
+  return whileDisabled(byId("random-goal"), () => tellFailure(async () =>
+    takeGoal(await post("goals", { scene: scene.id, random: { seed, moved: null }, name: `Random goal ${seed}` }))));
+}
+
+/** Sends an image; what is wrong with it is the service's to say. */
+export async function uploadGoal(file) {
+  if (!mayDrive()) return;
+  const bar = byId("goal-bar");
+  byId("goal-card").open = true;
+  bar.hidden = false;
+  bar.value = 0;
+  await tellFailure(async () => {
+    const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
+    const goal = await upload(`goals?${query}`, file, (share) => { bar.value = share; }, file.type || "application/octet-stream");
+    takeGoal(goal);
+    toast(`${goal.name} is the goal now.`);
+  });
+  bar.hidden = true;
+}
+
+// Drawing
+
+const ORIGINS = { drawn: "Drawn at random", composed: "Composed by hand" };
+
+function originText(goal, scene) {
+  const origin = ORIGINS[goal.source] ?? `Uploaded, ${goal.width} × ${goal.height} px; where things go is read from the image`;
+  return goal.scene && goal.scene !== scene?.id ? `${origin}, for another table` : origin;
+}
+
+function draw(goal) {
+  const image = byId("goal-image");
+  image.hidden = !goal;
+  if (goal) image.src = `api/goals/${encodeURIComponent(goal.id)}/image.png`;
+  else image.removeAttribute("src");
+  image.alt = goal ? `Goal: ${goal.name}` : "";
+  byId("goal-drop").classList.toggle("filled", Boolean(goal));
+  byId("goal-name").textContent = goal?.name ?? "none yet";
+  byId("goal-origin").textContent = goal
+    ? originText(goal, current()) : "What should the table look like? The examples above bring a goal with them.";
+  byId("delete-goal").hidden = !goal;
+  drawEarlier();
+}
+
+function drawEarlier() {
+  const scene = current();
+  const goals = known("goals");
+  const option = (goal) => el("option", { value: goal.id, textContent: goal.name, title: ORIGINS[goal.source] ?? "Uploaded" });
+  const here = goals.filter((goal) => !goal.scene || goal.scene === scene?.id);
+  const elsewhere = goals.filter((goal) => !here.includes(goal));
+  const select = byId("goal-select");
+  select.replaceChildren(
+    el("option", { value: "", textContent: "choose one" }),
+    ...here.map(option),
+    elsewhere.length ? el("optgroup", { label: "Made for other tables" }, ...elsewhere.map(option)) : "",
+  );
+  select.value = known("goal")?.id ?? "";
+  byId("earlier").hidden = !goals.length;
+}
+
+export function setUpGoals() {
+  const file = byId("goal-file");
+  const upload = byId("upload-goal");
+  for (const button of [byId("goal-drop"), upload]) button.addEventListener("click", () => file.click());
+  file.addEventListener("change", () => {
+    const [chosen] = file.files;
+    if (chosen) whileDisabled(upload, () => uploadGoal(chosen));
+    file.value = "";
+  });
+  byId("random-goal").addEventListener("click", randomGoal);
+  byId("goal-select").addEventListener("change", (event) => {
+    pickedFor = current()?.id ?? null;
+    set("goal", known("goals").find((goal) => goal.id === event.target.value) ?? null);
+  });
+  doubted(byId("delete-goal"), "Really delete", async () => {
+    await remove(`goals/${encodeURIComponent(known("goal").id)}`);
+    await refreshGoals();
+  });
+  byId("goal-image").addEventListener("error", () => { byId("goal-image").hidden = true; });
+  byId("goal-image").addEventListener("load", () => { byId("goal-image").hidden = false; });
+  let shown;
+  watch("scene", (scene) => {
+    if (scene?.id === shown) return;
+    shown = scene?.id;
+    settle();
+    drawEarlier();
+  });
+  watch("goals", () => {
+    settle();
+    drawEarlier();
+  });
+  watch("goal", draw);
+  watch("draft", (draft) => { if (!draft) draw(known("goal")); });
+}

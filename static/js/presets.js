@@ -1,0 +1,69 @@
+// Examples to begin with: one click lays the table and chooses the goal.
+import { get, post } from "./api.js";
+import { byId, el, whileDisabled } from "./dom.js";
+import { takeGoal } from "./goals.js";
+import { anotherScene, refreshScenes } from "./scenes.js";
+import { current, labelOf, set, watch } from "./state.js";
+import { tellFailure } from "./toasts.js";
+
+let isBusy = false;
+let drawn = ""; // what the tiles show, so that they stay under the pointer while nothing has changed
+
+async function choose(preset, tile) {
+  if (isBusy) return;
+  isBusy = true;
+  tile.setAttribute("aria-busy", "true");
+  byId("preset-list").classList.add("busy");
+  await tellFailure(async () => {
+    const { scene, goal } = await post(`presets/${encodeURIComponent(preset.id)}`);
+    set("scene", { ...scene, is_current: true });
+    takeGoal(goal);
+    await refreshScenes();
+  });
+  byId("preset-list").classList.remove("busy");
+  tile.removeAttribute("aria-busy");
+  isBusy = false;
+}
+
+function tile(preset) {
+  const picture = preset.image
+    ? el("img", { src: preset.image, alt: "", width: 112, height: 84 })
+    : el("span", { className: "no-picture", textContent: preset.objects });
+  const button = el(
+    "button", { type: "button", title: preset.text }, picture,
+    el("span", { className: "title", textContent: preset.title }),
+    preset.missing?.length
+      ? el("span", { className: "missing", textContent: `needs ${preset.missing.map(labelOf).join(", ")}` })
+      : el("span", { className: "hint", textContent: preset.text }),
+  );
+  button.dataset.preset = preset.id;
+  button.addEventListener("click", () => choose(preset, button));
+  return el("li", {}, button);
+}
+
+async function refreshPresets() {
+  const answer = await tellFailure(() => get("presets"));
+  byId("no-presets").hidden = Boolean(answer?.presets.length);
+  const now = JSON.stringify(answer?.presets ?? []);
+  if (answer && now !== drawn) byId("preset-list").replaceChildren(...answer.presets.map(tile));
+  if (answer) drawn = now;
+}
+
+export function setUpPresets() {
+  const count = byId("table-count");
+  const another = byId("another-table");
+  another.addEventListener("click", () => {
+    if (count.reportValidity()) whileDisabled(another, () => anotherScene(count.valueAsNumber));
+  });
+  // What is missing may have been fetched or trained by now.
+  watch("objects", (objects) => { if (objects.length) refreshPresets(); });
+  watch("fields", (fields) => { if (fields) refreshPresets(); });
+  let shown;
+  watch("scene", () => {
+    const scene = current();
+    byId("table-facts").textContent = scene ? scene.objects.map((object) => object.label).join(", ") : "";
+    byId("table-facts").title = byId("table-facts").textContent;
+    if (scene && scene.id !== shown) count.value = scene.objects.length;
+    shown = scene?.id;
+  });
+}

@@ -1,0 +1,48 @@
+// What an episode's steps amount to, as charts: how far things are, how alike the images, where the time goes.
+import { drawBars, drawLegend, drawLines, stepAt } from "./charts.js";
+import { COLOURS } from "./curves.js";
+import { byId } from "./dom.js";
+import { labelOf } from "./state.js";
+
+const STAGES = [["estimate", "look", COLOURS[0]], ["search", "search", COLOURS[4]], ["plan", "plan", COLOURS[1]], ["act", "act", COLOURS[2]]];
+const MILLI = 1000;
+
+const distance = (step, name) => (step.truly_to_goal_mm ?? step.to_goal_mm)[name];
+
+function distances({ objects, steps }) {
+  return objects.map((name, i) => ({
+    label: labelOf(name), colour: COLOURS[i % COLOURS.length],
+    values: steps.filter((step) => Number.isFinite(distance(step, name))).map((step) => [step.step, distance(step, name)]),
+  }));
+}
+
+function times({ steps }) {
+  const rounds = steps.filter(({ step }) => step > 0);
+  return STAGES.filter(([stage]) => stage !== "search" || rounds.some((step) => step.seconds.search)).map(([stage, label, colour]) => ({
+    label, colour, values: rounds.map((step) => [step.step, step.seconds[stage] ?? 0]),
+  }));
+}
+
+/** Draws all charts, with a mark at the step one looks at. */
+export function drawProgress(episode, at) {
+  const { steps } = episode;
+  const far = distances(episode);
+  drawLines(byId("chart-distance"), far, { unit: "mm", at, name: "Distance to the goal" });
+  drawLegend(byId("key-distance"), far);
+  byId("distance-kind").textContent = steps.length ? (steps[0].truly_to_goal_mm ? "true, of each object" : "as estimated, of each object") : "";
+  const cost = steps.map(({ step, image_cost: value }) => [step, MILLI * value]);
+  drawLines(byId("chart-cost"), [{ label: "image cost", colour: COLOURS[0], values: cost }], { unit: "10⁻³", at, name: "Image cost" });
+  const spent = times(episode);
+  drawBars(byId("chart-time"), spent, { unit: "s", at, name: "Time per step" });
+  drawLegend(byId("key-time"), spent);
+  const { first, goal } = steps[0]?.seconds ?? {};
+  const before = [first && `first frame ${first.toFixed(0)} s`, goal && `goal image ${goal.toFixed(0)} s`];
+  byId("first-seconds").textContent = before.filter(Boolean).join(", ");
+}
+
+/** A click on a chart goes to its step; `lastStep` tells how many there are. */
+export function setUpProgress(lastStep, goTo) {
+  for (const id of ["chart-distance", "chart-cost", "chart-time"]) {
+    byId(id).addEventListener("click", (event) => goTo(stepAt(byId(id), event.clientX, lastStep(), id === "chart-time")));
+  }
+}

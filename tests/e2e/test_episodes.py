@@ -1,0 +1,200 @@
+"""From the first visit to a table that looks like the photo: a real browser, the real service, real episodes."""
+
+import json
+import shutil
+import time
+import urllib.request
+
+import pytest
+
+from tests.live import free_port, start_service, stop_service
+
+pytestmark = pytest.mark.e2e
+WAIT_MS = 20_000
+LONG_MS = 300_000  # both looks take half a minute of an idle machine
+NAMES = ["005_tomato_soup_can", "006_mustard_bottle"]
+SHORT = {"steps": 3, "samples": 16, "horizon": 6}
+
+
+class Service:
+    """A service that tests may kill and start again."""
+
+    def __init__(self, data_dir):
+        self.port, self.data_dir = free_port(), data_dir
+        self.start()
+
+    @property
+    def url(self):
+        return f"http://127.0.0.1:{self.port}"
+
+    def start(self):
+        self.process = start_service(self.data_dir, self.port)
+
+    def call(self, method, path, body=None, kind="application/json"):
+        data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
+        request = urllib.request.Request(f"{self.url}/api/{path}", data, {"Content-Type": kind}, method=method)
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            content = answer.read()
+        return json.loads(content) if content and answer.headers["Content-Type"] == "application/json" else content
+
+    def episode(self):
+        return self.call("GET", "episodes")["episodes"][0]
+
+
+@pytest.fixture(scope="module")
+def service(library, tmp_path_factory):
+    data_dir = tmp_path_factory.mktemp("data")
+    shutil.copytree(library.root, data_dir / "objects")
+    service = Service(data_dir)
+    service.call("POST", "scenes", {"objects": NAMES, "seed": 3, "light": {"position": [0.6, -0.5, 0.5]}})
+    yield service
+    stop_service(service.process)
+
+
+@pytest.fixture
+def page(browser, service):
+    page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
+    page.problems = []
+    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    page.goto(service.url)
+    page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
+    yield page
+    assert page.problems == []
+    page.close()
+
+
+def choose(page, settings):
+    """Settings, as typed into the form."""
+    page.evaluate("document.getElementById('settings-card').open = true")
+    for name, value in settings.items():
+        page.fill(f"#setting-{name}", str(value))
+        page.press(f"#setting-{name}", "Tab")
+
+
+def begin(page, settings):
+    choose(page, settings)
+    page.click("#start-episode:not([disabled])", timeout=WAIT_MS)
+    page.wait_for_selector("#run-live:not([hidden])", timeout=WAIT_MS)
+
+
+def until(condition, timeout_s=120.0):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if value := condition():
+            return value
+        time.sleep(0.1)
+    raise AssertionError("it did not happen in time")
+
+
+def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page, service, tmp_path):
+    drawn = service.call("POST", "goals", {"random": {"seed": 5, "moved": 1}})
+    photo = tmp_path / "how it should look.png"
+    photo.write_bytes(service.call("GET", f"goals/{drawn['id']}/image.png"))
+    service.call("DELETE", f"goals/{drawn['id']}")
+    page.wait_for_selector("#start-episode[disabled]")
+    page.set_input_files("#goal-file", photo)
+    page.wait_for_selector('#goal-image[alt^="Goal: how it should look"]', timeout=WAIT_MS)
+    begin(page, SHORT)
+    page.wait_for_selector("#run-idle:not([hidden])", timeout=LONG_MS)
+    episode = service.episode()
+    assert (episode["status"], episode["done"]) == ("done", 3), episode["error"]
+    page.wait_for_selector("#downloads a", timeout=WAIT_MS)
+    assert page.eval_on_selector_all("#downloads a", "links => links.length") == len(episode["files"]) == 5
+    assert page.input_value("#timeline") == "3"
+    whole = "img => img.complete && img.naturalWidth === 768"
+    until(lambda: page.eval_on_selector("#tiles img", whole))
+    for chart in ("distance", "cost", "time"):
+        assert page.locator(f"#chart-{chart} path, #chart-{chart} rect").count() >= 1
+        assert page.get_attribute(f"#chart-{chart}", "aria-label") != "No steps yet"
+    assert page.locator("#offset-rows tr").count() == len(NAMES)
+    page.click("#watch-video")
+    until(lambda: page.eval_on_selector("#shown-video", "video => video.readyState >= 2 && video.videoWidth === 768"))
+    page.goto(f"{service.url}/?episode={episode['id']}&step=1")
+    page.wait_for_selector("#shown:not([hidden])", timeout=WAIT_MS)
+    until(lambda: page.input_value("#timeline") == "1")
+
+
+def test_a_goal_is_composed_on_the_map_and_kept(page, service):
+    page.click("#compose")
+    page.wait_for_selector("#composing:not([hidden])", timeout=WAIT_MS)
+    until(lambda: page.eval_on_selector("#draft-image", "img => img.complete && img.naturalWidth > 0"))
+    scene = service.call("GET", "scenes")
+    now = next(s for s in scene["scenes"] if s["id"] == scene["current"])["objects"][0]
+    disc = f'#goal-map [data-object="{now["name"]}"]'
+    toward = "ArrowLeft" if now["position"][0] > 0 else "ArrowRight"
+    before = page.get_attribute("#draft-image", "src")
+    for _ in range(3):
+        page.press(disc, toward)
+    until(lambda: page.get_attribute("#draft-image", "src") != before)
+    shifted = now["position"][0] + (-0.03 if now["position"][0] > 0 else 0.03)
+    drafted = until(lambda: _near(service.call("GET", "goals/draft")["objects"][0], shifted))
+    assert drafted["name"] == now["name"]
+    page.fill("#draft-name", "three centimetres")
+    page.click("#save-draft:not([disabled])")
+    page.wait_for_selector("#composing", state="hidden", timeout=WAIT_MS)
+    assert page.inner_text("#goal-name") == "three centimetres"
+    kept = service.call("GET", "goals")["goals"][0]
+    assert (kept["name"], kept["source"]) == ("three centimetres", "composed")
+    still = next(s for s in service.call("GET", "scenes")["scenes"] if s["id"] == scene["current"])["objects"][0]
+    assert still["position"] == now["position"]
+
+
+def _near(entry, x):
+    return entry if abs(entry["position"][0] - x) < 0.004 else None
+
+
+def test_an_episode_is_cancelled_and_the_table_put_back(page, service):
+    ensure_goal(service)
+    page.reload()
+    begin(page, {"steps": 30, "samples": 16, "horizon": 6})
+    until(lambda: service.episode()["status"] == "running")
+    page.click("#run-cancel")
+    page.wait_for_selector("#run-idle:not([hidden])", timeout=WAIT_MS)
+    assert service.episode()["status"] == "cancelled"
+
+
+def ensure_goal(service):
+    if not service.call("GET", "goals")["goals"]:
+        service.call("POST", "goals", {"random": {"seed": 5, "moved": 1}})
+
+
+def test_a_reload_a_pause_and_a_killed_service_lose_nothing(page, service):
+    ensure_goal(service)
+    page.reload()
+    begin(page, {"steps": 30, "samples": 8, "horizon": 4})
+    until(lambda: len(service.call("GET", f"episodes/{service.episode()['id']}")["steps"]) >= 2, 300)
+    page.reload()
+    page.wait_for_selector("#run-live:not([hidden])", timeout=WAIT_MS)
+    until(lambda: page.eval_on_selector("#tiles img", "img => img.complete && img.naturalWidth === 768"))
+    page.click("#run-pause")
+    until(lambda: page.inner_text("#run-pause") == "Resume")
+    until(lambda: service.episode()["status"] == "paused")
+    path = f"episodes/{service.episode()['id']}"
+    rounds = len(service.call("GET", path)["steps"])
+    page.click("#run-step:not([disabled])")
+    until(lambda: len(service.call("GET", path)["steps"]) == rounds + 1 and service.episode()["status"] == "paused")
+    episode = service.call("GET", path)
+    service.process.kill()
+    service.process.wait()
+    page.wait_for_selector('#status[data-state="lost"]', timeout=WAIT_MS)
+    service.start()
+    page.wait_for_selector('#status[data-state="live"]', timeout=LONG_MS)
+    page.wait_for_selector("#run-idle:not([hidden])", timeout=WAIT_MS)
+    after = service.call("GET", f"episodes/{episode['id']}")
+    assert after["status"] == "interrupted"
+    assert after["steps"][: len(episode["steps"])] == episode["steps"]
+    shown = f'#episode-list li[data-episode="{episode["id"]}"]'
+    until(lambda: "Interrupted" in page.inner_text(shown))
+
+
+def test_one_of_two_visitors_drives(page, browser, service):
+    other = browser.new_page()
+    other.goto(service.url)
+    other.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
+    take = other.get_by_role("button", name="Take over")
+    take.wait_for(timeout=WAIT_MS)
+    assert service.call("GET", "driver")["visitors"] == 2
+    take.click()
+    page.get_by_role("button", name="Take over").wait_for(timeout=WAIT_MS)
+    other.close()
+    page.get_by_role("button", name="Take over").wait_for(state="hidden", timeout=WAIT_MS)
