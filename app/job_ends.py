@@ -35,6 +35,8 @@ def after(job: Job, outcome: object, folder: Path) -> Job:
     if then.state != "done" and not keeps:
         shutil.rmtree(folder, ignore_errors=True)
         return then
+    for left in folder.glob(".*"):  # half-made when it ended
+        shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
     files = tuple(sorted(path.name for path in folder.glob("[!.]*") if path.is_file()))
     return replace(then, files=files)
 

@@ -17,7 +17,6 @@ from osfcore.evaluate.mpc_runs import knowledge_of
 from osfcore.fields.library import FieldLibrary
 from osfcore.objects.library import AssetLibrary
 
-
 _FOUND = {
     "first": "Knows where everything is",
     "goal": "Comparing the goal image with the table",

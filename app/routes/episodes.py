@@ -29,7 +29,10 @@ _MEDIA_TYPES = {
 }
 _FILE = {
     200: {
-        "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in _MEDIA_TYPES.values()},
+        "content": {
+            **{kind: {"schema": {"type": "string", "format": "binary"}} for kind in _MEDIA_TYPES.values()},
+            "application/json": {"schema": {"type": "object"}},
+        },
         "description": "The file.",
     }
 }

@@ -22,7 +22,7 @@ from app.job import Job, JobChanged, JobSeen
 from app.messages import CurrentScene, SceneChanged
 from app.viewer.drawing import Client, SceneDrawing
 from app.viewer.episode_drawing import EpisodeDrawing, Part
-from app.viewer.push_report import status
+from app.viewer.status_line import status
 from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
 from osfcore.estimate.steps import EstimateStep
 from osfcore.estimated import EstimatedState
@@ -200,7 +200,7 @@ class EpisodeView:
 
     def _add_panel(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Episode", expand_by_default=False):
-            self._status = gui.add_html(status(_IDLE))
+            self._status = gui.add_html(status("episode", _IDLE))
             self._bar = gui.add_progress_bar(0.0, visible=False)
             self._notice = gui.add_html("", visible=False)
             self._pause_button = gui.add_button("Pause", disabled=True)
@@ -313,8 +313,8 @@ class EpisodeView:
         self._pause_button.disabled = not can_pause
         self._step_button.disabled = not is_paused
         self._cancel_button.disabled = not told.is_live
-        self._status.content = status(_says(told))
-        self._notice.content, self._notice.visible = status(told.notice), bool(told.notice)
+        self._status.content = status("episode", _says(told))
+        self._notice.content, self._notice.visible = status("episode", told.notice), bool(told.notice)
 
 
 def _id(job: Job | None) -> str | None:

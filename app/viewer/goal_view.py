@@ -23,7 +23,7 @@ from app.messages import CurrentScene
 from app.viewer.drawing import NO_TURN, Client
 from app.viewer.episode_drawing import GOAL
 from app.viewer.ghosts import mesh_of
-from app.viewer.push_report import status
+from app.viewer.status_line import status
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose, quaternion_multiply
@@ -139,7 +139,7 @@ class GoalView:
     def _add_panel(self, gui: viser.GuiApi) -> None:
         goals = self._goals
         with gui.add_folder("Goal", expand_by_default=False):
-            self._status = gui.add_html(status(_IDLE))
+            self._status = gui.add_html(status("goal", _IDLE))
             self._begin_button = gui.add_button("Compose a goal", hint="Begins with where the objects are now.")
             self._keep_button = gui.add_button("Save as goal image", disabled=True)
             self._drop_button = gui.add_button("Stop composing", disabled=True, hint="Nothing is kept.")
@@ -182,7 +182,7 @@ class GoalView:
                 self._copies[name].colour(WRONG if problem else GOAL)
             self._words.text, self._words.visible = problem, bool(problem)
         self._server.flush()
-        self._status.content = status(_IDLE if draft is None else problem or _COMPOSING)
+        self._status.content = status("goal", _IDLE if draft is None else problem or _COMPOSING)
         self._begin_button.disabled = draft is not None
         self._keep_button.disabled = self._drop_button.disabled = draft is None
 

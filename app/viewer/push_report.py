@@ -8,14 +8,8 @@ from html import escape
 from app.pushes import Outcome
 
 _STYLE = "width:100%;border-collapse:collapse;font-size:0.7em;line-height:1.35"
-_STATUS = "margin:0;padding:0.2em 0.75em 0.5em;font-size:0.8em;line-height:1.35"
 _HEAD = "text-align:right;padding-left:0.5em;font-weight:600;vertical-align:bottom"
 _CELL = "text-align:right;padding-left:0.5em;vertical-align:top;white-space:nowrap"
-
-
-def status(text: str) -> str:
-    """HTML of a sentence."""
-    return f'<p class="push-status" style="{_STATUS}">{escape(text)}</p>'
 
 
 def report(outcomes: Iterable[Outcome], labels: Mapping[str, str]) -> str:

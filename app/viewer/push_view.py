@@ -25,8 +25,9 @@ from app.predictions import Predictions
 from app.pushes import MAX_ACTIONS, along, outcomes, straight, toward_nearest, way
 from app.viewer.drawing import Client
 from app.viewer.push_drawing import PushDrawing
-from app.viewer.push_report import report, status
+from app.viewer.push_report import report
 from app.viewer.push_trial import Trial
+from app.viewer.status_line import status
 from app.viewer.waypoints import FEWEST, MOST, Waypoints
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
@@ -141,7 +142,7 @@ class PushView:
             self._execute_button = gui.add_button(
                 "Execute", disabled=True, hint="Carry out these very actions in the simulator, and compare."
             )
-            self._status = gui.add_html(status(_IDLE))
+            self._status = gui.add_html(status("push", _IDLE))
             self._report = gui.add_html("", visible=False)
             self._time = gui.add_slider("Time, s", 0.0, 1.0, 0.05, 0.0, visible=False)
             self._play = gui.add_button("Play", visible=False)
@@ -317,8 +318,8 @@ class PushView:
             told = self._draw_ready(ready) if ready else self._draw_none(told)
             self._drawn = ready
         self._draw_time(ready)
-        if self._status.content != status(told):
-            self._status.content = status(told)
+        if self._status.content != status("push", told):
+            self._status.content = status("push", told)
         is_idle = ready is None or ready.is_executed or self._executing is not None
         if self._execute_button.disabled != is_idle:
             self._execute_button.disabled = is_idle

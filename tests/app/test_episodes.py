@@ -378,4 +378,4 @@ def test_the_events_of_one_that_is_over_end_at_once(service, done):
     episode, *_ = done
     text = service.get(f"/api/episodes/{episode['id']}/events").text
     (data,) = [json.loads(line[6:]) for line in text.splitlines() if line.startswith("data: ")]
-    assert (data["id"], data["state"], data["result"]["stage"]) == (episode["id"], "done", "next")
+    assert (data["id"], data["state"], data["result"]["outcome"]) == (episode["id"], "done", "out of steps")

@@ -17,6 +17,7 @@ def folder(tmp_path):
     """What a job has left so far: two files, one that is half-written, and inputs."""
     folder = tmp_path / "job"
     (folder / "inputs").mkdir(parents=True)
+    (folder / ".seen").mkdir()
     for name in ("report.json", "steps.csv", ".video.part"):
         (folder / name).write_text("x")
     return folder
@@ -43,6 +44,7 @@ def test_what_was_done_to_its_end_is_kept(folder, kind):
 )
 def test_an_episode_keeps_its_steps_however_it_ends(folder, outcome, state, error):
     over = after(running("episode"), outcome, folder)
+    assert not list(folder.glob(".*"))
     assert (over.state, over.error, over.files) == (state, error, ("report.json", "steps.csv"))
     assert over.is_finished
     assert (over.done, over.result) == (3, {"steps": 3})

@@ -94,6 +94,7 @@ def test_camera_images_stand_beside_what_the_fields_render(page, url):
     assert float(page.inner_text("#compare-dialog-title").split()[-2]) > 20
     page.keyboard.press("Escape")
     before = page.get_attribute(".part.rendered >> nth=0", "src")
+    page.click("#tab-drive")
     page.fill("#elevation", "20")
     wait_until(lambda: page.get_attribute(".part.rendered >> nth=0", "src") != before, DRAW_S)
     page.uncheck("#compare")

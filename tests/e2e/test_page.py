@@ -280,7 +280,7 @@ def test_phone_has_no_sideways_scroll_in_either_theme(browser, service, scheme):
     ground = phone.evaluate("getComputedStyle(document.body).backgroundColor")
     brightness = np.mean([int(part) for part in ground.removeprefix("rgb(").removesuffix(")").split(",")])
     assert (brightness < 60) == (scheme == "dark")
-    for tab_name in ("scenes", "objects", "fields", "jobs"):
+    for tab_name in ("episode", "scenes", "estimate", "objects", "fields", "jobs"):
         phone.click(f"#tab-{tab_name}")
         assert phone.evaluate("document.documentElement.scrollWidth") <= 390
     context.close()

@@ -7,6 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from app.episode import composing
 from app.episode import order as orders
 from app.episode.order import EpisodeOrder, read_goal
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, NoRoom, UnknownName
@@ -142,7 +143,7 @@ def test_an_order_that_cannot_be_met_is_told_in_one_sentence(order, changes, kin
 
 
 def test_where_no_goal_has_room_that_is_told(order, monkeypatch):
-    monkeypatch.setattr(orders, "draw_goal", lambda *_: None)
+    monkeypatch.setattr(composing, "draw_goal", lambda *_: None)
     with pytest.raises(NoRoom, match="after 30 tries"):
         orders.given(order)
 

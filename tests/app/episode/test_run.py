@@ -55,6 +55,7 @@ def told(monkeypatch, worlds):
             looked = EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=estimate)
             yield Observed(0, self.world.observe())
             for look in ("first", "goal", "next", "search"):
+                yield Looking(0, look, EstimateStep(Progress(0, 1, "Trying poses"), "objects", state))
                 yield Looking(0, look, looked)
             yield GoalFound(PoseGoal(NAMES, state.poses), self.goal.image, self.goal.camera, None)
             yield Planning(0, None)
@@ -73,10 +74,13 @@ def test_every_step_tells_what_is_being_done(order, told, worlds):
     assert notes == [
         "Loading fields and setting the table",
         "",
-        "Looking at the first frame: Done",
-        "Looking at the goal image: Done",
-        "Looking at the table: Done",
-        "Looking at the lost objects: Done",
+        "Looking at the first frame: Trying poses",
+        "Knows where everything is",
+        "Looking at the goal image: Trying poses",
+        "Comparing the goal image with the table",
+        "Looking at the table: Trying poses",
+        "Knows where everything is now",
+        "Looking at the lost objects: Trying poses",
         "Knows where everything should be",
         "Planning pushes",
         "Pushing",
@@ -117,7 +121,8 @@ def test_every_part_of_the_loop_has_a_name():
     looked = EstimateStep(Progress(1, 1, "Done"), "done", None)
     for look in ("first", "goal", "next", "search"):
         assert stage_of(Looking(0, look, looked)) == look
-    assert stage_of(Planning(0, None)) == "plan"
+    stepped = Stepped(0, 3, None, np.zeros(0), np.zeros(0), 0.0, np.zeros((4, 4, 3)), {})
+    assert stage_of(stepped) == stage_of(Planning(0, None)) == "plan"  # what comes next is planned
     assert stage_of(Acted(1, np.zeros(3))) == "act"
     for event in (Noticed(1, "lamp", "It was moved."), Finished(1, "reached", "Done.", None), Observed(0, None)):
         assert stage_of(event) is None

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.driver import DriverChanged
+from app.goals import Draft, DraftChanged, GoalsChanged
 from app.messages import CurrentScene, FramesTaken, Notice, SceneChanged
 from app.routes.events import Mailbox
 from tests.app.conftest import until
@@ -109,6 +111,55 @@ def test_notices_reach_the_page(live):
         stream.next("scene")
         live.services.runner.hub.publish(Notice("warning", "Mind the\nstep."))
         assert stream.next("notice")[2] == {"level": "warning", "text": "Mind the\nstep."}
+
+
+def test_a_draft_is_told_to_every_page_and_to_those_that_come_later(live, shown):
+    (thing,) = shown["objects"]
+    with Stream(live) as stream:
+        stream.next("scene")
+        begun = live.request("POST", "/api/goals/draft", {})[1]
+        assert stream.next("draft")[2] == begun
+        aside = {"name": thing["name"], "position": [0.1, 0.1, 0.2], "quaternion": thing["quaternion"]}
+        moved = live.request("PATCH", "/api/goals/draft", {"objects": [aside]})[1]
+        assert stream.next("draft")[2] == moved
+        with Stream(live) as later:
+            assert later.next("draft")[2] == moved
+        live.request("DELETE", "/api/goals/draft")
+        assert stream.next("draft")[2] is None
+    with Stream(live) as later:
+        live.services.runner.hub.publish(Notice("info", "Hello."))
+        assert later.next("draft", "notice")[0] == "notice"
+
+
+def test_pages_are_told_that_the_list_of_goals_has_changed(live, shown):
+    with Stream(live) as stream:
+        stream.next("scene")
+        goal = live.request("POST", "/api/goals", {"random": {"seed": 1}})[1]
+        assert stream.next("goals") == ("goals", None, None)
+        live.request("DELETE", f"/api/goals/{goal['id']}")
+        assert stream.next("goals") == ("goals", None, None)
+
+
+def test_pages_that_say_who_they_are_are_told_who_drives(live):
+    with Stream(live, "?visitor=first") as first:
+        assert first.next("driver")[2] == {"driver": "first", "visitors": 1}
+        live.request("POST", "/api/driver", {"visitor": "other"})
+        assert first.next("driver")[2]["driver"] == "other"
+    until(lambda: live.services.driver.now().visitors == 0)
+
+
+def test_a_mailbox_keeps_only_the_latest_draft_but_every_letter_about_goals_and_drivers():
+    async def fill():
+        mailbox = Mailbox(None)
+        drafts = [DraftChanged(Draft("s", (), revision=number)) for number in (1, 2)]
+        for event in (drafts[0], GoalsChanged(), DriverChanged("a", 1), drafts[1], DriverChanged("b", 2)):
+            mailbox.put(event)
+        await asyncio.sleep(0)
+        assert mailbox.draft is drafts[1]
+        assert list(mailbox.letters) == [GoalsChanged(), DriverChanged("a", 1), DriverChanged("b", 2)]
+        assert mailbox.arrived.is_set()
+
+    asyncio.run(fill())
 
 
 def test_a_mailbox_keeps_only_the_latest_scene_and_images():
