@@ -54,8 +54,9 @@ Commands = Annotated[
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; 0 on success, 1 if it could not be done, 2 for a wrong call, 130 when interrupted."""
-    # Threads that spin while they wait for each other cost a machine that has anything else to do a factor of 30.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # Threads spin while they wait for each other; for long, that stalls a machine that has anything else to do.
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     try:
         command: Command = tyro.cli(
             Commands, prog="osf", args=arguments, description="Rearrange real objects from a photo."

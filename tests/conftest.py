@@ -14,7 +14,7 @@ from osfcore.objects.fetch import fetch
 from osfcore.objects.library import AssetLibrary
 from osfcore.objects.sources import FolderSource, WheelSource
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does, before torch comes in
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
 # Timing lives in benchmarks: a busy machine is no failure.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")

@@ -56,22 +56,44 @@ def test_rest_examples_run(data_dir, tmp_path):
     with live_service(data_dir) as url:  # each block goes on where the one before ended
         program = "".join(blocks("python")).replace("http://127.0.0.1:8000", url)
         done = subprocess.run(
-            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=900
         )
-    assert done.returncode == 0, done.stderr[-500:]
+        assert done.returncode == 0, done.stderr[-500:]
+        drive_with_curl(url, tmp_path)
     assert "pusher went from" in done.stdout
     assert "trusted: " in done.stdout
     assert "'light_deg': " in done.stdout
     assert "last poses of both sequences: [[[" in done.stdout
-    for image in ("goal.png", "compared.png"):
+    assert "episode: done" in done.stdout
+    for image in ("goal.png", "compared.png", "photo.png"):
         assert (tmp_path / image).read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "video.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def drive_with_curl(url, place):
+    """The commands that drive an episode, each with what the ones before have answered; photo and table are there."""
+    if shutil.which("curl") is None:
+        return
+    (place / "video.mp4").unlink()
+    (commands,) = (block.splitlines() for block in blocks("sh") if "/api/episodes" in block)
+    ids = {}
+    for command in commands:
+        text = command.replace("http://127.0.0.1:8000", url)
+        for name, found in ids.items():
+            text = text.replace(name, found)
+        done = subprocess.run(shlex.split(text), cwd=place, capture_output=True, text=True, check=False, timeout=600)
+        assert done.returncode == 0, f"{command}: {done.stderr[-500:]}"
+        if done.stdout.startswith("{"):
+            ids["EPISODE" if "settings" in command else "GOAL"] = json.loads(done.stdout)["id"]
+    assert set(ids) == {"GOAL", "EPISODE"}
 
 
 def test_an_observation_is_sent_as_written(data_dir, tmp_path, seen):
     if shutil.which("curl") is None:
         pytest.skip("curl is not on this machine")
     shutil.copytree(seen, tmp_path / "seen")
-    commands = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(("curl ", "python3 "))]
+    lines = (line for block in blocks("sh") if "/api/episodes" not in block for line in block.splitlines())
+    commands = [line for line in lines if line.startswith(("curl ", "python3 "))]
     assert len(commands) >= 3
     told = []
     with live_service(data_dir) as url:

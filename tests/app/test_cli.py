@@ -24,15 +24,21 @@ def test_every_command_explains_itself(command, capsys):
     assert "usage: osf" in capsys.readouterr().out
 
 
-def test_threads_do_not_spin_while_they_wait_unless_told_to(monkeypatch, capsys):
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+def test_threads_do_not_spin_for_long_while_they_wait_unless_told_to(monkeypatch, capsys):
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     with pytest.raises(SystemExit):
         main(["--help"])
-    assert os.environ["OMP_WAIT_POLICY"] == "active"
+    assert "GOMP_SPINCOUNT" not in os.environ
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert os.environ["GOMP_SPINCOUNT"] == "1000"
+    monkeypatch.setenv("GOMP_SPINCOUNT", "5")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert os.environ["GOMP_SPINCOUNT"] == "5"
     assert "usage" in capsys.readouterr().out
 
 
