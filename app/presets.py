@@ -64,7 +64,7 @@ PRESETS = (
            ("021_bleach_cleanser", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15, 4, 2),
     Preset("other-light", "Another light", "The photo was taken under a lamp from the other side.",
            ("004_sugar_box", "025_mug", "006_mustard_bottle"), 15, 40, 30, 5, 2, (220, 30)),
-    Preset("four", "Four at once", "Four objects close together, all three kinds of trouble.",
+    Preset("four", "Four at once", "Four objects close together, two in the wrong place.",
            ("003_cracker_box", "005_tomato_soup_can", "010_potted_meat_can", "006_mustard_bottle"), 16, 280, 35, 6, 2),
 )  # fmt: skip
 

@@ -31,7 +31,7 @@ from osfcore.plan.goals import PoseGoal
 DRAW_INTERVAL_S = 0.1
 _IDLE = "No episode yet"
 _SHOWN: tuple[tuple[Part, str, str], ...] = (
-    ("goal", "Show goal", "Amber: where everything should be."),
+    ("goal", "Show goal", "Golden: where everything should be."),
     ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
     ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
 )

@@ -1,4 +1,4 @@
-"""Composing a goal in the 3D view: amber copies of the objects with handles, and the folder in the panel.
+"""Composing a goal in the 3D view: golden copies of the objects with handles, and the folder in the panel.
 
 Drafts come from whoever changes them and are only noted; drawing happens in the thread. Hands are answered by the
 simulation, so what they moved is on its way for a moment: until then it stays where it was let go.
@@ -37,7 +37,7 @@ _WORDS_AT = (0.0, 0.0, 0.3)
 _STILL = 1e-6  # poses that differ by less are not sent again
 _NO_PICTURE = np.full((64, 64, 3), 235, np.uint8)
 _IDLE = "Lay the objects out as they should be, then save."
-_COMPOSING = "Drag the amber copies, or turn them by their rings."
+_COMPOSING = "Drag the golden copies, or turn them by their rings."
 _log = logging.getLogger(__name__)
 Obey = Callable[[Callable[[], object], Client], None]
 
@@ -212,7 +212,7 @@ class GoalView:
 
 
 class _Copy:
-    """An amber copy of an object, with handles to move it over the table and to turn it about the vertical.
+    """A golden copy of an object, with handles to move it over the table and to turn it about the vertical.
 
     Args:
         scene: to draw in.

@@ -147,7 +147,7 @@ def same(a, b):
     return np.allclose(a.position, b.position, atol=1e-6) and rotation_angle(a.quaternion, b.quaternion) < 1e-6
 
 
-def test_a_draft_is_shown_as_amber_copies_with_handles_for_the_table_plane(composing):
+def test_a_draft_is_shown_as_golden_copies_with_handles_for_the_table_plane(composing):
     assert all(same(composing.at(name), pose) for name, pose in composing.draft.poses)
     assert composing.colours() == {GOAL}
     for copy in composing.view._copies.values():
