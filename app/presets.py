@@ -53,17 +53,18 @@ class Preset:
         return None if self.goal_angles_deg is None else _light(*self.goal_angles_deg)
 
 
+# Of the ten objects that are fetched by default.
 PRESETS = (
     Preset("first", "First push", "Two objects, one of them in the wrong place.",
-           ("006_mustard_bottle", "025_mug"), 11, 60, 55, 1, 1),
+           ("006_mustard_bottle", "007_tuna_fish_can"), 11, 60, 55, 1, 1),
     Preset("pair", "Both of them", "Two objects that both have to move.",
            ("003_cracker_box", "005_tomato_soup_can"), 12, 200, 50, 2, 2),
     Preset("three", "Three things", "Three objects, two in the wrong place.",
-           ("006_mustard_bottle", "010_potted_meat_can", "024_bowl"), 13, 320, 45, 3, 2),
+           ("006_mustard_bottle", "010_potted_meat_can", "008_pudding_box"), 13, 320, 45, 3, 2),
     Preset("low-sun", "Low sun", "Light from 15° above the table: shadows longer than the objects.",
-           ("021_bleach_cleanser", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15, 4, 2),
+           ("009_gelatin_box", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15, 4, 2),
     Preset("other-light", "Another light", "The photo was taken under a lamp from the other side.",
-           ("004_sugar_box", "025_mug", "006_mustard_bottle"), 15, 40, 30, 5, 2, (220, 30)),
+           ("004_sugar_box", "009_gelatin_box", "006_mustard_bottle"), 15, 40, 30, 5, 2, (220, 30)),
     Preset("four", "Four at once", "Four objects close together, two in the wrong place.",
            ("003_cracker_box", "005_tomato_soup_can", "010_potted_meat_can", "006_mustard_bottle"), 16, 280, 35, 6, 2),
 )  # fmt: skip

@@ -9,6 +9,7 @@ from app.runner import TooManyScenes
 from app.store import CannotStore
 from osfcore.errors import UnknownName
 from osfcore.fields.library import FieldLibrary
+from osfcore.objects.catalogue import DEFAULT_NAMES
 from osfcore.poses import rotation_angle
 from osfcore.world.tabletop import SceneRequest, Tabletop
 from tests.app.test_store import record
@@ -16,6 +17,11 @@ from tests.app.test_store import record
 STAYS_M, STAYS_RAD = 0.003, 0.05  # putting everything back to rest may shift it this much
 
 each = pytest.mark.parametrize("one", PRESETS, ids=lambda one: one.id)
+
+
+@each
+def test_a_first_visit_can_choose_any_of_them(one):
+    assert set(one.objects) <= set(DEFAULT_NAMES)
 
 
 def test_there_are_six_of_different_names():
