@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import threading
-import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +29,6 @@ from osfcore.scenefile import camera_to_json, scene_from_json
 
 KIND = "episode"
 FILES = (REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, RECORDING_FILE)
-_TEMPORARY_PREFIX = ".new-"
 _PLAN = ("samples", "horizon", "temperature")
 
 
@@ -68,14 +65,12 @@ class Episodes:
         runner: holds scenes and jobs.
         fields: what can be recognised.
         goals: goal images.
-        data_dir: of the service.
     """
 
-    def __init__(self, runner: Runner, fields: FieldShelf, goals: Goals, data_dir: Path) -> None:
+    def __init__(self, runner: Runner, fields: FieldShelf, goals: Goals) -> None:
         self._runner = runner
         self._fields = fields
         self._goals = goals
-        self._root = data_dir / "collections"
         self._making = threading.Lock()  # of files on demand
 
     # Asking for one
@@ -99,7 +94,7 @@ class Episodes:
             raise MissingFields(missing)
         settings = nested(asked.settings)
         settings_of(settings)
-        with self._new_folder() as folder:
+        with self._runner.jobs.new_inputs() as folder:
             params = {
                 "scene": scene,
                 "names": list(names),
@@ -138,15 +133,6 @@ class Episodes:
         is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
         truth = poses_to_json(goal.poses) if is_known and goal.poses is not None else None
         return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": None, "truth": truth}
-
-    @contextlib.contextmanager
-    def _new_folder(self) -> Iterator[Path]:
-        """A place for a job's inputs until the job takes it."""
-        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
 
     # Telling of one
 

@@ -6,10 +6,8 @@ truth of a scene stays beside that folder, where only this module reads it, afte
 
 from __future__ import annotations
 
-import contextlib
-import shutil
 import uuid
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +29,6 @@ from osfcore.scenefile import Scene, camera_from_json, read_scene, scene_to_json
 from osfcore.statefile import estimated_to_json, read_estimated, write_estimated
 
 KIND = "estimate"
-_TEMPORARY_PREFIX = ".new-"
 _ARCHIVE = "observation.zip"
 
 
@@ -96,19 +93,12 @@ class Estimates:
     Args:
         runner: holds scenes and jobs.
         fields: what can be recognised.
-        data_dir: of the service.
     """
 
-    def __init__(self, runner: Runner, fields: FieldShelf, data_dir: Path) -> None:
+    def __init__(self, runner: Runner, fields: FieldShelf) -> None:
         self._runner = runner
         self._fields = fields
-        self._root = data_dir / "collections"
         self._examiner: Examiner[Uploaded] = Examiner(examine, "observation", _names)
-
-    def start(self) -> None:
-        """Remove what an earlier service left half done."""
-        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
-            shutil.rmtree(folder, ignore_errors=True)
 
     def stop(self) -> None:
         """End the process that looks at an upload, if there is one. Calling it again does nothing."""
@@ -133,7 +123,7 @@ class Estimates:
         if missing := sorted(set(names) - set(self._fields.names())):
             raise MissingFields(missing)
         prior = None if asked.mode == "first" else self._prior(asked, names, scene)
-        with self._new_folder() as folder:
+        with self._runner.jobs.new_inputs() as folder:
             is_goal = asked.mode == "goal"
             seen = self._runner.observe(scene, folder / OBSERVATION, goal=is_goal, masks=asked.mode == "first")
             write_json(folder / TRUTH, scene_to_json(Scene(seen.state, ())))
@@ -154,7 +144,7 @@ class Estimates:
             QueueFull: if too many jobs wait.
         """
         check_seed(asked.seed)
-        with self._new_folder() as folder:
+        with self._runner.jobs.new_inputs() as folder:
             await save(chunks, folder / _ARCHIVE)
             found = await self._examiner.examine(folder)
             return await run_in_threadpool(self._of_examined, asked, found, folder, file_name)
@@ -193,15 +183,6 @@ class Estimates:
         if prior.state.names != names:
             raise InvalidInput(f"objects of estimate {job.id}", ", ".join(prior.state.names), ", ".join(names))
         return prior
-
-    @contextlib.contextmanager
-    def _new_folder(self) -> Iterator[Path]:
-        """A place for a job's inputs until the job takes it."""
-        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
 
     # Telling of one
 

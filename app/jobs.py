@@ -6,12 +6,13 @@ the next start.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -42,6 +43,7 @@ from app.processes import end, launch
 from app.store import CannotStore, Store, now_utc
 from osfcore.errors import OsfError, UnknownName
 
+_TEMPORARY_PREFIX = ".new-"
 _ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
 _LOOK_INTERVAL_S = 0.2
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
@@ -89,6 +91,7 @@ class Jobs:
     ) -> None:
         self._store = store
         self._data_dir = data_dir
+        self._root = data_dir / "collections"
         self._publish = publish
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
@@ -103,7 +106,9 @@ class Jobs:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Take over what the store holds and begin to work."""
+        """Take over what the store holds, remove what was left half done, and begin to work."""
+        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
+            shutil.rmtree(folder, ignore_errors=True)
         for number, fields in self._store.jobs():
             job = job_from_fields(fields)
             self._jobs[job.id], self._numbers[job.id] = job, number
@@ -146,7 +151,7 @@ class Jobs:
 
     def folder(self, job: str) -> Path:
         """Where a job's outputs are."""
-        return self._data_dir / "collections" / job
+        return self._root / job
 
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
@@ -158,13 +163,22 @@ class Jobs:
         """Where a job's inputs are, if it was given any."""
         return self.folder(job) / INPUTS
 
+    @contextlib.contextmanager
+    def new_inputs(self) -> Iterator[Path]:
+        """Where a folder of inputs may be made for `submit`; what no job has taken is removed."""
+        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
     def submit(self, kind: str, params: dict[str, Any], inputs: Path | None = None) -> Job:
         """Put a job into the queue.
 
         Args:
             kind: what to do.
             params: with what.
-            inputs: a folder in the data directory; becomes the job's and goes with it.
+            inputs: a folder from `new_inputs`; becomes the job's and goes with it.
 
         Raises:
             QueueFull: if too many wait already.

@@ -75,7 +75,7 @@ def goals(tmp_path):
 
 @pytest.fixture
 def episodes(runner, goals, tmp_path):
-    return Episodes(runner, FieldShelf(tmp_path, lambda: ()), goals, tmp_path)
+    return Episodes(runner, FieldShelf(tmp_path, lambda: ()), goals)
 
 
 def left_over(tmp_path):

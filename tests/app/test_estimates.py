@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import app.jobs as jobs_module
 from app.estimate_job import STATE
 from app.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, examine
 from app.field_shelf import FieldShelf, MissingFields
@@ -46,6 +47,8 @@ class Jobs:
     def __init__(self, root):
         self._root = root
         self._all = []
+
+    new_inputs = jobs_module.Jobs.new_inputs
 
     def submit(self, kind, params, inputs):
         job = Job(f"job{len(self._all)}", kind, params)
@@ -101,8 +104,7 @@ def runner(tmp_path, library):
 
 @pytest.fixture
 def estimates(runner, tmp_path):
-    estimates = Estimates(runner, FieldShelf(tmp_path, lambda: ()), tmp_path)
-    estimates.start()
+    estimates = Estimates(runner, FieldShelf(tmp_path, lambda: ()))
     yield estimates
     estimates.stop()
 
@@ -259,13 +261,6 @@ def test_what_was_found_in_an_upload_is_told(tmp_path):
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "observation.zip").write_bytes(archive(tmp_path, empty_mask()))
     assert examine(tmp_path / "new") == Uploaded((BOX, MUSTARD), ("0", "1", "2", "3"), True, (MUSTARD,), False)
-
-
-def test_what_a_killed_service_left_goes_at_the_next_start(estimates, tmp_path):
-    (tmp_path / "collections" / ".new-abc").mkdir(parents=True)
-    (tmp_path / "collections" / "kept").mkdir()
-    estimates.start()
-    assert [path.name for path in (tmp_path / "collections").iterdir()] == ["kept"]
 
 
 # Telling

@@ -227,6 +227,17 @@ def test_inputs_become_the_jobs_own_and_go_with_it(open_jobs, data_dir):
     assert len(jobs.all()) == 2
 
 
+def test_inputs_that_no_job_takes_go_at_once_and_those_of_a_killed_service_at_the_next_start(open_jobs, data_dir):
+    left = data_dir / "collections" / ".new-abc"
+    left.mkdir(parents=True)
+    jobs, _ = open_jobs()
+    assert not left.exists()
+    with jobs.new_inputs() as folder, jobs.new_inputs() as other:
+        (folder / "deep").mkdir(parents=True)
+        assert folder.parent == left.parent != other
+    assert list(left.parent.iterdir()) == []
+
+
 def test_what_a_job_lets_the_live_view_draw_is_told_but_not_kept(open_jobs, monkeypatch):
     jobs, events = open_jobs()
     job = jobs.submit(*LONG)
