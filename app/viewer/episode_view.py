@@ -5,9 +5,6 @@ Events come from the jobs' thread and are only noted there; drawing, at most som
 
 from __future__ import annotations
 
-import logging
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -21,6 +18,7 @@ from app.goals import DraftChanged
 from app.job import Job, JobChanged, JobSeen
 from app.messages import CurrentScene, SceneChanged
 from app.viewer.drawing import Client, SceneDrawing
+from app.viewer.drawing_thread import DrawingThread
 from app.viewer.episode_drawing import EpisodeDrawing, Part
 from app.viewer.status_line import status
 from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
@@ -35,7 +33,6 @@ _SHOWN: tuple[tuple[Part, str, str], ...] = (
     ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
     ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
 )
-_log = logging.getLogger(__name__)
 Obey = Callable[[Callable[[], object], Client], None]
 
 
@@ -138,14 +135,11 @@ class EpisodeView:
         self._orders = orders
         self._obey = obey
         self._make_room = make_room
-        self._changed = threading.Condition()  # guards what was noted
+        self._thread = DrawingThread("episode-view", self._draw, DRAW_INTERVAL_S)
         self._told = _Told()
         self._current: str | None = None
-        self._is_due = False
-        self._is_stopped = False
         self._drawn = _Told()
         self._add_panel(server.gui)
-        self._thread = threading.Thread(target=self._run, name="episode-view", daemon=True)
 
     def start(self, current: str | None) -> None:
         """Begin to draw; `current` is the scene on view."""
@@ -154,15 +148,11 @@ class EpisodeView:
 
     def stop(self) -> None:
         """End the thread. Calling it again does nothing."""
-        with self._changed:
-            self._is_stopped = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.stop()
 
     def note(self, event: object) -> None:
         """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._changed:
+        with self._thread.changed:
             told = self._told
             match event:
                 case JobSeen(job, seen) if job.kind == KIND:
@@ -181,7 +171,7 @@ class EpisodeView:
                     self._told = replace(told, sight=None)
                 case _:
                     return
-            self._wake()
+            self._thread.wake()
 
     def _is_here(self, told: _Told) -> bool:
         """Whether it is about what is on view."""
@@ -245,37 +235,16 @@ class EpisodeView:
             self._orders.cancel(job.id)
 
     def _forget(self) -> None:
-        with self._changed:
+        with self._thread.changed:
             if not self._told.is_live:
                 self._told = _Told()
-                self._wake()
+                self._thread.wake()
 
     # The thread
 
-    def _wake(self) -> None:
-        with self._changed:
-            self._is_due = True
-            self._changed.notify()
-
-    def _run(self) -> None:
-        drawn_at = 0.0
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._is_due or self._is_stopped)
-                wait_s = drawn_at + DRAW_INTERVAL_S - time.monotonic()
-                if not self._is_stopped and wait_s > 0:
-                    self._changed.wait_for(lambda: self._is_stopped, wait_s)
-                if self._is_stopped:
-                    return
-                told = self._told if self._is_here(self._told) else _Told()
-                self._is_due = False
-            drawn_at = time.monotonic()
-            try:
-                self._draw(told)
-            except Exception:  # a defect; the next step may fare better
-                _log.exception("a step of an episode could not be drawn")
-
-    def _draw(self, told: _Told) -> None:
+    def _draw(self) -> None:
+        with self._thread.changed:
+            told = self._told if self._is_here(self._told) else _Told()
         drawn = self._drawn
         if _id(told.job) != _id(drawn.job):
             self._drawing.clear()

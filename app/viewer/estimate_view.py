@@ -6,8 +6,6 @@ Steps come from the jobs' thread and are only noted there; drawing, at most some
 from __future__ import annotations
 
 import io
-import logging
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -24,6 +22,7 @@ from app.messages import CurrentScene
 from app.neural.link import Answer, NeuralLink
 from app.neural.messages import Comparison
 from app.viewer.drawing import Client, SceneDrawing
+from app.viewer.drawing_thread import DrawingThread
 from app.viewer.estimate_drawing import EstimateDrawing
 from app.viewer.loss_curves import LossCurves
 from osfcore.errors import OsfError
@@ -34,7 +33,6 @@ PICTURE_INTERVAL_S = 0.7  # rendering takes time from the estimator
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
 _NO_PICTURE = np.full((32, 64, 3), 235, np.uint8)
 _IDLE = "Not asked yet"
-_log = logging.getLogger(__name__)
 Obey = Callable[[Callable[[], object], Client], None]
 
 
@@ -65,22 +63,18 @@ class EstimateView:
         self._neural = neural
         self._obey = obey
         self._cancel = cancel
-        self._changed = threading.Condition()  # guards what was noted
+        self._thread = DrawingThread("estimate-view", self._draw, DRAW_INTERVAL_S)
         self._job: Job | None = None
         self._steps: list[EstimateStep] = []  # not drawn yet
-        self._is_due = False
-        self._is_stopped = False
         self._current: str | None = None
         self._curves = LossCurves(())
         self._drawn_job: str | None = None
         self._plot: viser.GuiUplotHandle | None = None
         self._plot_names: list[str] = []
         self._picture_at = 0.0
-        self._look_at: float | None = None  # when a picture may be asked for again
         self._picture: Future[Answer] | None = None
         self._picture_of: object = None
         self._add_panel(server.gui)
-        self._thread = threading.Thread(target=self._run, name="estimate-view", daemon=True)
 
     def start(self, current: str | None) -> None:
         """Begin to draw; `current` is the scene on view."""
@@ -89,26 +83,22 @@ class EstimateView:
 
     def visited(self) -> None:
         """Somebody has come, for whom there may be a picture to make."""
-        self._wake()
+        self._thread.wake()
 
     def stop(self) -> None:
         """End the thread. Calling it again does nothing."""
-        with self._changed:
-            self._is_stopped = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.stop()
 
     def forget(self) -> None:
         """Remove what a finished estimate has drawn. Any thread may call."""
-        with self._changed:
+        with self._thread.changed:
             if self._job is None or self._job.is_finished:
-                self._job, self._steps, self._is_due = None, [], True
-                self._changed.notify()
+                self._job, self._steps = None, []
+                self._thread.wake()
 
     def note(self, event: object) -> None:
         """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._changed:
+        with self._thread.changed:
             match event:
                 case JobSeen(job, EstimateStep() as step) if job.kind == KIND and self._is_here(job):
                     self._job = job
@@ -121,8 +111,7 @@ class EstimateView:
                         self._job, self._steps = None, []
                 case _:
                     return
-            self._is_due = True
-            self._changed.notify()
+            self._thread.wake()
 
     def _is_here(self, job: Job) -> bool:
         """Whether it is about what is on view; uploads are shown on any table."""
@@ -161,32 +150,15 @@ class EstimateView:
             self._cancel(job.id)
 
     def _look_again(self) -> None:
-        with self._changed:
-            self._picture_of, self._is_due = None, True
-            self._changed.notify()
+        with self._thread.changed:
+            self._picture_of = None
+            self._thread.wake()
 
     # The thread
 
-    def _run(self) -> None:
-        drawn_at = 0.0
-        while True:
-            with self._changed:
-                look_s = None if self._look_at is None else max(self._look_at - time.monotonic(), 0.0)
-                self._changed.wait_for(lambda: self._is_due or self._is_stopped, look_s)
-                wait_s = drawn_at + DRAW_INTERVAL_S - time.monotonic()
-                if not self._is_stopped and wait_s > 0:
-                    self._changed.wait_for(lambda: self._is_stopped, wait_s)
-                if self._is_stopped:
-                    return
-                job, steps = self._job, self._steps
-                self._steps, self._is_due, self._look_at = [], False, None
-            drawn_at = time.monotonic()
-            try:
-                self._draw(job, steps)
-            except Exception:  # a defect; the next step may fare better
-                _log.exception("a step of an estimate could not be drawn")
-
-    def _draw(self, job: Job | None, steps: list[EstimateStep]) -> None:
+    def _draw(self) -> None:
+        with self._thread.changed:
+            job, steps, self._steps = self._job, self._steps, []
         if job is None or job.state in ("cancelled", "failed") or job.id != self._drawn_job:
             self._clear(job)
         if steps:
@@ -260,7 +232,7 @@ class EstimateView:
             return
         wait_s = self._picture_at + PICTURE_INTERVAL_S - time.monotonic()
         if wait_s > 0:
-            self._look_at = time.monotonic() + wait_s
+            self._thread.wake(wait_s)
             return
         try:
             order = self._estimates.comparison(job, job.params["cameras"].index(self._camera.value))
@@ -277,9 +249,4 @@ class EstimateView:
                 pixels = np.asarray(picture.convert("RGB"))
             self._image.image = pixels[:, : 2 * pixels.shape[1] // 3]
             self._image.visible = True
-        self._wake()
-
-    def _wake(self) -> None:
-        with self._changed:
-            self._is_due = True
-            self._changed.notify()
+        self._thread.wake()

@@ -7,8 +7,6 @@ simulation, so what they moved is on its way for a moment: until then it stays w
 from __future__ import annotations
 
 import io
-import logging
-import threading
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Protocol
@@ -21,6 +19,7 @@ from PIL import Image
 from app.goals import Draft, DraftChanged
 from app.messages import CurrentScene
 from app.viewer.drawing import NO_TURN, Client
+from app.viewer.drawing_thread import DrawingThread
 from app.viewer.episode_drawing import GOAL
 from app.viewer.ghosts import mesh_of
 from app.viewer.status_line import status
@@ -38,7 +37,6 @@ _STILL = 1e-6  # poses that differ by less are not sent again
 _NO_PICTURE = np.full((64, 64, 3), 235, np.uint8)
 _IDLE = "Lay the objects out as they should be, then save."
 _COMPOSING = "Drag the golden copies, or turn them by their rings."
-_log = logging.getLogger(__name__)
 Obey = Callable[[Callable[[], object], Client], None]
 
 
@@ -90,35 +88,29 @@ class GoalView:
         self._goals = goals
         self._commands = commands
         self._obey = obey
-        self._changed = threading.Condition()  # guards what was noted
+        self._thread = DrawingThread("goal-view", self._draw)
         self._draft: Draft | None = None
         self._current: str | None = None
-        self._is_due = False
-        self._is_stopped = False
         self._copies: dict[str, _Copy] = {}
         self._pictured: Draft | None = None
         self._words = server.scene.add_label(
             "/goal/problem", "", position=_WORDS_AT, visible=False, font_screen_scale=1.0, anchor="bottom-center"
         )
         self._add_panel(server.gui)
-        self._thread = threading.Thread(target=self._run, name="goal-view", daemon=True)
 
     def start(self, current: str | None) -> None:
         """Begin to draw; `current` is the scene on view."""
-        self._current, self._draft, self._is_due = current, self._goals.draft, True
+        self._current, self._draft = current, self._goals.draft
+        self._thread.wake()
         self._thread.start()
 
     def stop(self) -> None:
         """End the thread. Calling it again does nothing."""
-        with self._changed:
-            self._is_stopped = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.stop()
 
     def note(self, event: object) -> None:
         """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._changed:
+        with self._thread.changed:
             match event:
                 case DraftChanged(draft):
                     self._draft = draft
@@ -126,12 +118,12 @@ class GoalView:
                     self._current = None if record is None else record.id
                 case _:
                     return
-            self._wake()
+            self._thread.wake()
 
     @property
     def is_composing(self) -> bool:
         """Whether handles of a goal are on view."""
-        with self._changed:
+        with self._thread.changed:
             return self._draft is not None and self._draft.scene == self._current
 
     # The panel
@@ -150,26 +142,13 @@ class GoalView:
 
     # The thread
 
-    def _wake(self) -> None:
-        with self._changed:
-            self._is_due = True
-            self._changed.notify()
+    def _draw(self) -> None:
+        with self._thread.changed:
+            draft = self._draft if self.is_composing else None
+        self._draw_draft(draft)
+        self._draw_picture(draft)
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._is_due or self._is_stopped)
-                if self._is_stopped:
-                    return
-                draft = self._draft if self.is_composing else None
-                self._is_due = False
-            try:
-                self._draw(draft)
-                self._draw_picture(draft)
-            except Exception:  # a defect; the next draft may fare better
-                _log.exception("a draft could not be drawn")
-
-    def _draw(self, draft: Draft | None) -> None:
+    def _draw_draft(self, draft: Draft | None) -> None:
         poses = {} if draft is None else dict(draft.poses)
         problem = "" if draft is None else draft.problem
         with self._server.atomic():
@@ -206,7 +185,7 @@ class GoalView:
                 self._goals.move_draft(((copy.name, pose),))
             finally:
                 copy.release(grip)
-                self._wake()
+                self._thread.wake()
 
         self._commands.submit(self._obey, move, client)
 

@@ -5,9 +5,7 @@ Whatever comes from browsers, the simulation and the process that predicts is on
 
 from __future__ import annotations
 
-import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -24,6 +22,7 @@ from app.neural.messages import Predicted
 from app.predictions import Predictions
 from app.pushes import MAX_ACTIONS, along, outcomes, straight, toward_nearest, way
 from app.viewer.drawing import Client
+from app.viewer.drawing_thread import DrawingThread
 from app.viewer.push_drawing import PushDrawing
 from app.viewer.push_report import report
 from app.viewer.push_trial import Trial
@@ -35,7 +34,7 @@ from osfcore.scene import MAX_SPEED_M_S, STEP_S, SceneState
 
 STRAIGHT, PATH = "Straight", "Waypoints"
 COMPASS = {"→": 0, "↗": 45, "↑": 90, "↖": 135, "←": 180, "↙": 225, "↓": 270, "↘": 315}
-TICK_S, REST_S = 0.03, 0.02  # between two pictures of a moving ghost, and the least between any two
+TICK_S = 0.03  # between two pictures of a moving ghost
 _KEY = "viewer"
 _INTRO = "Starts from the **true poses** in the simulator."
 _IDLE = "Choose a push, then Predict"
@@ -44,7 +43,6 @@ _CHANGED = "The table has changed; predict again"
 _SPEED = (0.05, MAX_SPEED_M_S)
 _DEFAULT_STEPS = 6
 _FURTHER_M = 0.05
-_log = logging.getLogger(__name__)
 Obey = Callable[[Callable[[], object], Client], None]
 Act = Callable[[str, list[np.ndarray]], SceneRecord]
 
@@ -81,9 +79,9 @@ class PushView:
         self._predictions = predictions
         self._act = act
         self._obey = obey
+        self._thread = DrawingThread("push-view", self._draw_newest, TICK_S)
         self._drawing = PushDrawing(server, library)
         self._waypoints = Waypoints(server, self._replan)
-        self._changed = threading.Condition()  # guards what was noted
         self._record: SceneRecord | None = None
         self._ready: Trial | None = None
         self._drawn: Trial | None = None
@@ -91,13 +89,10 @@ class PushView:
         self._told = _IDLE
         self._executing: Trial | None = None
         self._has_plan = False  # whether anybody has begun to choose a push
-        self._is_due = False
-        self._is_stopped = False
         self._laid: tuple[str, tuple[float, ...]] | None = None  # the scene and the pusher, as handles were laid for
         self._playing_since: float | None = None
         self._shown_s = 0.0
         self._add_panel(server.gui)
-        self._thread = threading.Thread(target=self._run, name="push-view", daemon=True)
 
     def start(self, record: SceneRecord | None) -> None:
         """Begin to draw; `record` is the scene on view."""
@@ -106,15 +101,11 @@ class PushView:
 
     def stop(self) -> None:
         """End the thread. Calling it again does nothing."""
-        with self._changed:
-            self._is_stopped = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.stop()
 
     def note(self, event: object) -> None:
         """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._changed:
+        with self._thread.changed:
             match event:
                 case CurrentScene(record):
                     self._record, self._ready, self._told = record, None, _IDLE
@@ -125,7 +116,7 @@ class PushView:
                         self._told = _CHANGED if self._ready is None else self._told
                 case _:
                     return
-            self._wake()
+            self._thread.wake()
 
     # The panel
 
@@ -175,21 +166,21 @@ class PushView:
 
     def _replan(self) -> None:
         """Another push is chosen: what was predicted, or executed, is about a former one."""
-        with self._changed:
+        with self._thread.changed:
             self._has_plan = True
             if self._executing is None:
                 self._ready, self._told = None, _IDLE
-            self._wake()
+            self._thread.wake()
 
     def _seek(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
         if event.client is None:  # the player's own
             return
-        with self._changed:
+        with self._thread.changed:
             self._shown_s, self._playing_since = _number(event.target.value, 0.0, MAX_ACTIONS * STEP_S), None
-            self._wake()
+            self._thread.wake()
 
     def _toggle_play(self) -> None:
-        with self._changed:
+        with self._thread.changed:
             if self._ready is None:
                 return
             if self._playing_since is not None:
@@ -198,12 +189,12 @@ class PushView:
                 end_s = len(self._ready.actions) * STEP_S
                 begin_s = 0.0 if self._shown_s >= end_s - 1e-6 else self._shown_s
                 self._playing_since = time.monotonic() - begin_s
-            self._wake()
+            self._thread.wake()
 
     def _forget(self) -> None:
-        with self._changed:
+        with self._thread.changed:
             self._ready, self._told, self._has_plan = None, _IDLE, False
-            self._wake()
+            self._thread.wake()
 
     # Predicting and executing; called in viser's pool
 
@@ -230,28 +221,28 @@ class PushView:
             self._tell(str(error))
             raise
         self._tell("Predicting" if is_warm else "Loading the network, some seconds the first time")
-        with self._changed:
+        with self._thread.changed:
             self._has_plan = True
         asked = _Asked(record, actions, client, answer)
         answer.add_done_callback(lambda _: self._note_answer(asked))
 
     def _note_answer(self, asked: _Asked) -> None:
-        with self._changed:
+        with self._thread.changed:
             self._come = asked
-            self._wake()
+            self._thread.wake()
 
     def _tell(self, text: str) -> None:
-        with self._changed:
+        with self._thread.changed:
             self._told = text
-            self._wake()
+            self._thread.wake()
 
     def _execute(self) -> None:
-        with self._changed:
+        with self._thread.changed:
             ready = self._ready
             if ready is None or ready.is_executed or self._executing is not None:
                 raise CannotExecute("There is no new prediction to execute; press Predict first.")
             self._executing, self._told = ready, "Executing"
-            self._wake()
+            self._thread.wake()
         told = ""
         try:
             done = self._act(ready.record.id, list(ready.actions))
@@ -260,36 +251,21 @@ class PushView:
             told = str(error)
             raise
         finally:
-            with self._changed:
+            with self._thread.changed:
                 self._executing = None
                 self._told = told or "Not executed; the log tells more"
                 if told == _CHANGED:
                     self._ready = None
-                self._wake()
+                self._thread.wake()
 
     # The thread
 
-    def _wake(self) -> None:
-        with self._changed:
-            self._is_due = True
-            self._changed.notify()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                wait_s = None if self._playing_since is None else TICK_S
-                self._changed.wait_for(lambda: self._is_due or self._is_stopped, wait_s)
-                if self._is_stopped:
-                    return
-                self._is_due = False
-                come, self._come = self._come, None
-            try:
-                if come is not None:
-                    self._take(come)
-                self._draw()
-            except Exception:  # a defect; the next push may fare better
-                _log.exception("a push could not be drawn")
-            time.sleep(REST_S)
+    def _draw_newest(self) -> None:
+        with self._thread.changed:
+            come, self._come = self._come, None
+        if come is not None:
+            self._take(come)
+        self._draw()
 
     def _take(self, asked: _Asked) -> None:
         """Make an answer what is on view, unless the table has changed meanwhile."""
@@ -301,7 +277,7 @@ class PushView:
         elif error is not None:
             self._tell("The prediction failed; the log tells more")
             raise error
-        with self._changed:
+        with self._thread.changed:
             now = self._record
             if not isinstance(answer, Predicted):  # overtaken by a newer question
                 return
@@ -311,7 +287,7 @@ class PushView:
             self._ready = Trial(asked.record, asked.actions, answer.rollouts, answer.took_s)
 
     def _draw(self) -> None:
-        with self._changed:
+        with self._thread.changed:
             record, ready, told = self._record, self._ready, self._told
         self._draw_plan(record)
         if ready is not self._drawn:
@@ -382,7 +358,7 @@ class PushView:
         told = f"{said}; predicted in {1000 * ready.took_s:.0f} ms"
         if ready.truth:
             told = _EXECUTED if ready.is_executed else "Executing"
-        with self._changed:
+        with self._thread.changed:
             if self._ready is ready:  # else there is something newer to tell
                 self._told = told
             return self._told
@@ -399,13 +375,15 @@ class PushView:
     def _draw_time(self, ready: Trial | None) -> None:
         if ready is None:
             return
-        with self._changed:
+        with self._thread.changed:
             if self._playing_since is not None:
                 end_s = len(ready.actions) * STEP_S
                 self._shown_s = min(time.monotonic() - self._playing_since, end_s)
                 if self._shown_s >= end_s:
                     self._playing_since = None
             shown_s, is_playing = self._shown_s, self._playing_since is not None
+            if is_playing:
+                self._thread.wake(TICK_S)
         label = "Pause" if is_playing else "Play"
         if self._play.label != label:
             self._play.label = label

@@ -76,7 +76,7 @@ class Room:
 
     def drawn(self):
         """Wait until the thread has drawn what it was told, if it is of this scene."""
-        until(lambda: not self.view._is_due)
+        until(lambda: self.view._thread.is_idle)
         seen = self.view._told
         until(lambda: self.view._drawn is seen or not self.view._is_here(seen))
 
@@ -305,7 +305,7 @@ def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
     show = room.drawing.show_goal
     monkeypatch.setattr(room.drawing, "show_goal", lambda _: 1 / 0)
     room.view.note(JobSeen(job(), found()))
-    until(lambda: not room.view._is_due)
+    until(lambda: room.view._thread.is_idle)
     monkeypatch.setattr(room.drawing, "show_goal", show)
     room.see(stepped())
     assert room.drawing._goal

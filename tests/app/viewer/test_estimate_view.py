@@ -67,7 +67,7 @@ class Room:
 
     def see(self, of, what):
         self.view.note(JobSeen(of, what))
-        until(lambda: self.view._steps == [] and not self.view._is_due)
+        until(lambda: self.view._steps == [] and self.view._thread.is_idle)
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
     room.view.note(JobSeen(other, step()))
     room.view.note(JobChanged(1, other))
     assert room.view._job is None
-    assert not room.view._is_due
+    assert room.view._thread.is_idle
 
 
 def test_why_it_failed_is_told(room):

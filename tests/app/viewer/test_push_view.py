@@ -278,6 +278,6 @@ def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
     monkeypatch.setattr(room.view._drawing, "show", lambda _: 1 / 0)
     room.press("Predict")
     room.answer()
-    until(lambda: not room.view._is_due)
+    until(lambda: room.view._thread.is_idle)
     monkeypatch.setattr(room.view._drawing, "show", show)
     room.predict()

@@ -70,7 +70,7 @@ def test_an_episode_on_the_table_is_drawn_in_place_of_an_estimate(live, drawing,
     until(lambda: not drawing._cube.visible)
     assert viewer._estimate_view._job is None
     viewer._estimate_view.visited()  # another view that draws guesses has its say, and nothing against it
-    until(lambda: not viewer._estimate_view._is_due)
+    until(lambda: viewer._estimate_view._thread.is_idle)
     assert not drawing._cube.visible
     hub.publish(JobChanged(1, job("done", scene=shown["id"])))
     live.request("POST", f"/api/scenes/{shown['id']}/reset")
