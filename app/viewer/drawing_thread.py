@@ -37,9 +37,9 @@ class DrawingThread:
 
     @property
     def is_idle(self) -> bool:
-        """Whether everything that was noted is drawn."""
+        """Whether everything that is due is drawn."""
         with self.changed:
-            return math.isinf(self._due_at) and not self._is_drawing
+            return self._due_at > time.monotonic() and not self._is_drawing
 
     def start(self) -> None:
         """Begin to draw, what was noted before included."""

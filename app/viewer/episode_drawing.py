@@ -13,25 +13,23 @@ from jaxtyping import Float, UInt8
 
 from app.episode.sketch import PlanSketch
 from app.viewer.estimate_drawing import Colour, EstimateDrawing
-from app.viewer.ghosts import mesh_of, moves
+from app.viewer.future_drawing import FutureDrawing
+from app.viewer.ghosts import mesh_of
 from app.viewer.push_drawing import PREDICTED
 from osfcore.control.events import Looking
 from osfcore.estimated import EstimatedState
 from osfcore.objects.library import AssetLibrary
 from osfcore.plan.goals import PoseGoal
-from osfcore.poses import Pose, rotation_angle
-from osfcore.rollouts import Rollouts
 
 Part = Literal["goal", "plan", "estimate"]
 PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")
 GOAL = (245, 140, 0)
 CHEAP, DEAR = (45, 215, 90), (150, 62, 58)
-ON_THE_WAY = 3  # pale ghosts between now and the end of the best future
+PLAY_S, REST_S = 2.0, 0.7  # how long the best future is played, and stands at its end
 _GAMMA = 2.2
-_ARM_M = 0.05  # what turning by 1 rad counts on the way
 _CELLS = 28
-_GOAL_OPACITY, _END_OPACITY, _PALE = 0.5, 0.45, 0.3  # the last one is a share of the end's
-_GOAL_SCALE, _END_SCALE = 1.015, 1.008  # or ghosts and the surfaces below them would flicker
+_GOAL_OPACITY = 0.5
+_GOAL_SCALE = 1.015  # or ghosts and the surfaces below them would flicker
 _WAY_M, _BEST_M = 0.0025, 0.007  # thickness
 _DEAREST_Z_M, _CHEAPEST_Z_M, _BEST_Z_M = 0.003, 0.006, 0.008  # cheap ways lie above dear ones
 _NOWHERE = np.zeros((1, 2, 3), np.float32)
@@ -60,7 +58,7 @@ class EpisodeDrawing:
             server, library, is_named, root="/episode/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
-        self._future: dict[str, viser.BatchedMeshHandle] = {}
+        self._future = FutureDrawing(server.scene, library, "/episode/plan/future", _linear(PREDICTED))
         add = self._scene.add_line_segments
         # Lines that begin in one colour for all would stay white once each has its own.
         each = np.array([[_linear(CHEAP)] * 2], np.uint8)
@@ -104,15 +102,17 @@ class EpisodeDrawing:
     def show_plan(self, sketch: PlanSketch | None) -> None:
         """Show a round of planning in place of the one before: ways of the pusher, and the best future."""
         with self._lock, self._changes():
-            for node in (self._ways, self._best, *self._future.values()):
-                node.visible = False
-            if sketch is None:
-                return
-            if set(sketch.best.names) != set(self._future):
-                _remove(self._future)
-                self._future = {name: self._future_copies(name) for name in sketch.best.names}
-            self._draw_ways(sketch)
-            self._draw_future(sketch.best)
+            self._future.show(None if sketch is None else sketch.best)
+            self._ways.visible = self._best.visible = sketch is not None
+            if sketch is not None:
+                self._draw_ways(sketch)
+
+    def play(self, seconds: float) -> None:
+        """Let the best future be as it is some time after it began; over and over, faster than it would be."""
+        with self._lock:
+            if self._future.steps and self._roots["plan"].visible:
+                with self._changes():
+                    self._future.at(self._future.steps * min(seconds % (PLAY_S + REST_S) / PLAY_S, 1.0))
 
     def clear(self) -> None:
         """Remove everything."""
@@ -138,15 +138,6 @@ class EpisodeDrawing:
         best = sketch.best.pusher[:1].copy()
         best[..., 2] = _BEST_Z_M
         self._best.points = _segments(best)
-        self._ways.visible = self._best.visible = True
-
-    def _draw_future(self, best: Rollouts) -> None:
-        for n, name in enumerate(best.names):
-            poses = Pose(best.positions[0, :, n], best.quaternions[0, :, n])
-            node = self._future[name]
-            node.visible = moves(poses)
-            if node.visible:
-                _put(node, poses[[*on_the_way(poses, ON_THE_WAY), -1]])
 
     def _goal_copy(self, name: str) -> viser.MeshHandle:
         return self._scene.add_mesh_simple(
@@ -155,25 +146,6 @@ class EpisodeDrawing:
             color=GOAL,
             opacity=_GOAL_OPACITY,
             scale=_GOAL_SCALE,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-
-    def _future_copies(self, name: str) -> viser.BatchedMeshHandle:
-        """Ghosts of one object, the last one stronger than the others."""
-        vertices, faces = mesh_of(self._library, name, _CELLS)
-        count = ON_THE_WAY + 1
-        return self._scene.add_batched_meshes_simple(
-            f"/episode/plan/future/{name}",
-            vertices,
-            faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            np.tile([0.0, 0.0, -1.0], (count, 1)),
-            batched_scales=np.full(count, _END_SCALE),
-            batched_colors=_linear(PREDICTED),
-            batched_opacities=np.array([*[_PALE] * ON_THE_WAY, 1.0]),
-            opacity=_END_OPACITY,
-            lod="off",
             cast_shadow=False,
             receive_shadow=False,
         )
@@ -189,15 +161,6 @@ def cost_colours(costs: Float[np.ndarray, "W"]) -> UInt8[np.ndarray, "W 3"]:
     return np.round((1 - share) * np.array(_linear(CHEAP)) + share * np.array(_linear(DEAR))).astype(np.uint8)
 
 
-def on_the_way(poses: Pose, count: int) -> list[int]:
-    """Rows that lie about evenly along a way, not in time: most futures begin with a gap."""
-    shifts = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
-    turns = rotation_angle(poses.quaternion[:-1], poses.quaternion[1:])
-    gone = np.cumsum(shifts + _ARM_M * turns)
-    rows = np.searchsorted(gone, gone[-1] * np.arange(1, count + 1) / (count + 1))
-    return [min(int(row) + 1, len(gone)) for row in rows]
-
-
 def _linear(colour: Colour) -> Colour:
     """A colour for batches and for single points of lines: viser's client takes those for linear light."""
     red, green, blue = (round(255 * (channel / 255) ** _GAMMA) for channel in colour)
@@ -206,11 +169,6 @@ def _linear(colour: Colour) -> Colour:
 
 def _segments(ways: Float[np.ndarray, "W T1 3"]) -> Float[np.ndarray, "S 2 3"]:
     return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
-
-
-def _put(node: viser.BatchedMeshHandle, poses: Pose) -> None:
-    node.batched_positions = poses.position.astype(np.float32)
-    node.batched_wxyzs = poses.quaternion.astype(np.float32)
 
 
 def _remove(nodes: Mapping[str, viser.SceneNodeHandle]) -> None:

@@ -5,6 +5,7 @@ Events come from the jobs' thread and are only noted there; drawing, at most som
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -139,6 +140,7 @@ class EpisodeView:
         self._told = _Told()
         self._current: str | None = None
         self._drawn = _Told()
+        self._plan_at = 0.0
         self._add_panel(server.gui)
 
     def start(self, current: str | None) -> None:
@@ -245,6 +247,13 @@ class EpisodeView:
     def _draw(self) -> None:
         with self._thread.changed:
             told = self._told if self._is_here(self._told) else _Told()
+        if told is not self._drawn:
+            self._draw_news(told)
+        if told.plan is not None:
+            self._drawing.play(time.monotonic() - self._plan_at)
+            self._thread.wake(DRAW_INTERVAL_S)
+
+    def _draw_news(self, told: _Told) -> None:
         drawn = self._drawn
         if _id(told.job) != _id(drawn.job):
             self._drawing.clear()
@@ -260,6 +269,7 @@ class EpisodeView:
             self._drawing.show_goal(told.goal)
         if told.plan is not drawn.plan:
             self._drawing.show_plan(told.plan)
+            self._plan_at = time.monotonic()
         self._draw_truth()
         self._draw_state(told)
         self._drawn = told

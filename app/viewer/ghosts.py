@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from osfcore.errors import OsfError
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose, rotate
+from osfcore.rollouts import Rollouts
 
 CELLS = 14  # along the longest side of an object; a ghost has some hundred triangles
 _ARC_STEPS = 24
@@ -93,6 +94,27 @@ def moves(poses: Pose) -> bool:
     shift = np.abs(poses.position - poses.position[0]).max()
     turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
     return bool(shift > _MOVED_M or turn > _TURNED**2)
+
+
+def way_of(rollouts: Rollouts, number: int) -> Pose:
+    """The poses of an object in the first of some rollouts, one after each action."""
+    return Pose(rollouts.positions[0, :, number], rollouts.quaternions[0, :, number])
+
+
+def between(rows: Float[np.ndarray, "T C"], step: float) -> Float[np.ndarray, "C"]:
+    """A row, or what lies between two; the first and the last one reach beyond the ends."""
+    step = min(max(step, 0.0), len(rows) - 1.0)
+    before = int(step)
+    after = min(before + 1, len(rows) - 1)
+    return rows[before] + (step - before) * (rows[after] - rows[before])
+
+
+def pose_at(poses: Pose, step: float) -> Pose:
+    """Where something is on its way after some steps, which turn it by less than half a turn each."""
+    signs = np.where(np.sum(poses.quaternion[1:] * poses.quaternion[:-1], axis=1) < 0, -1.0, 1.0)
+    aligned = poses.quaternion * np.cumprod(np.concatenate([[1.0], signs]))[:, None]
+    turn = between(aligned, step)
+    return Pose(between(poses.position, step), turn / np.linalg.norm(turn))
 
 
 def top_m(vertices: Float[np.ndarray, "P 3"], quaternion: Float[np.ndarray, "4"]) -> float:

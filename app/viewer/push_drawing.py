@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.ghosts import Mesh, mesh_of, moves, top_m
+from app.viewer.ghosts import Mesh, between, mesh_of, moves, pose_at, top_m, way_of
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose
 from osfcore.rollouts import Rollouts
@@ -19,7 +19,8 @@ from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, SceneState
 PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimates
 TRAIL = 5  # pale ghosts between start and end
 _CELLS = 28
-_GHOST_OPACITY, _TRAIL_OPACITY, _PUSHER_OPACITY = 0.5, 0.13, 0.35
+PUSHER_OPACITY = 0.35
+_GHOST_OPACITY, _TRAIL_OPACITY = 0.5, 0.13
 _GHOST_SCALE, _TRAIL_SCALE = 1.01, 1.005  # or ghosts and the surface below them would flicker
 _ABOVE_M = 0.012  # ways of objects are drawn above them, that of the pusher above the table
 _FLOOR_M = 0.004
@@ -56,7 +57,7 @@ class PushDrawing:
             radius=PUSHER_RADIUS_M * _GHOST_SCALE,
             height=PUSHER_HEIGHT_M,
             color=PREDICTED,
-            opacity=_PUSHER_OPACITY,
+            opacity=PUSHER_OPACITY,
             cast_shadow=False,
             receive_shadow=False,
             visible=False,
@@ -80,7 +81,7 @@ class PushDrawing:
             self._rollouts = rollouts
             lines = []
             for n, name in enumerate(rollouts.names):
-                poses = Pose(rollouts.positions[0, :, n], rollouts.quaternions[0, :, n])
+                poses = way_of(rollouts, n)
                 if moves(poses):
                     lines.append(self._add_object(name, poses))
             _draw(self._ways, lines)
@@ -155,12 +156,11 @@ class PushDrawing:
         if self._rollouts is None:
             return
         self._step = step
-        row, part = divmod(float(np.clip(step, 0, len(self._rollouts.pusher[0]) - 1)), 1.0)
         for name, node in self._ghosts.items():
-            n = self._rollouts.names.index(name)
-            node.batched_positions = _between(self._rollouts.positions[0, :, n], int(row), part)[None]
-            node.batched_wxyzs = _turn_between(self._rollouts.quaternions[0, :, n], int(row), part)[None]
-        self._pusher.position = _between(self._rollouts.pusher[0], int(row), part)
+            pose = pose_at(way_of(self._rollouts, self._rollouts.names.index(name)), step)
+            node.batched_positions = pose.position[None].astype(np.float32)
+            node.batched_wxyzs = pose.quaternion[None].astype(np.float32)
+        self._pusher.position = between(self._rollouts.pusher[0], step)
 
     def _way(self, name: str, poses: Pose) -> np.ndarray:
         """The way of an object's centre, as high as the object was at the start, so that it stays in view."""
@@ -192,15 +192,3 @@ def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:
             node.points = points
     if node.visible != bool(parts):
         node.visible = bool(parts)
-
-
-def _between(rows: np.ndarray, row: int, part: float) -> np.ndarray:
-    after = min(row + 1, len(rows) - 1)
-    return ((1 - part) * rows[row] + part * rows[after]).astype(np.float32)
-
-
-def _turn_between(rows: np.ndarray, row: int, part: float) -> np.ndarray:
-    """Between two orientations that are less than half a turn apart."""
-    after = rows[min(row + 1, len(rows) - 1)]
-    mixed = (1 - part) * rows[row] + part * (after if after @ rows[row] >= 0 else -after)
-    return (mixed / np.linalg.norm(mixed)).astype(np.float32)

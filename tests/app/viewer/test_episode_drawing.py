@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from app.episode.sketch import PlanSketch
-from app.viewer.episode_drawing import GOAL, ON_THE_WAY, PARTS, EpisodeDrawing, cost_colours, on_the_way
+from app.viewer.episode_drawing import GOAL, PARTS, PLAY_S, REST_S, EpisodeDrawing, cost_colours
 from app.viewer.viewer import LoopbackViser
 from osfcore.control.events import Look, Looking
 from osfcore.estimate.steps import EstimateStep
 from osfcore.estimated import EstimatedState
 from osfcore.plan.goals import PoseGoal
-from osfcore.poses import Pose, quaternion_exp
+from osfcore.poses import Pose
 from osfcore.progress import Progress
 from osfcore.rollouts import Rollouts
 from osfcore.scene import Light, SceneState
@@ -74,7 +74,7 @@ def is_red(colour):
 def all_nodes(drawing):
     estimates = (drawing._now, drawing._goal_look)
     guesses = [node for estimate in estimates for node in estimate._guesses.values()]
-    return [*drawing._goal.values(), *drawing._future.values(), drawing._ways, drawing._best, *guesses]
+    return [*drawing._goal.values(), *drawing._future.nodes, drawing._ways, drawing._best, *guesses]
 
 
 def test_the_goal_is_drawn_in_one_colour_and_stays_the_same_nodes(drawing):
@@ -134,22 +134,21 @@ def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(dr
     assert drawing._ways.points.shape == drawing._ways.colors.shape == (9, 2, 3)
 
 
-def test_the_best_future_is_drawn_at_its_end_and_paler_on_the_way_there(drawing):
-    drawing.show_plan(sketch())
-    box, can = drawing._future[BOX], drawing._future[CAN]
-    assert box.visible
-    assert not can.visible  # it stays
-    x = box.batched_positions[:, 0]
-    assert len(x) == ON_THE_WAY + 1
-    assert np.all(np.diff(x) > 0)
-    assert x[-1] == pytest.approx(0.1)
-    assert x[0] > 0.01
-    assert np.all(box.batched_opacities[:-1] < box.batched_opacities[-1])
-    drawing.show_plan(sketch(goes_m=0.0))
-    assert drawing._future[BOX] is box
-    assert not box.visible
+def test_the_best_future_is_played_again_and_again_and_stands_at_its_end(drawing):
+    drawing.play(1.0)  # nothing to play yet
+    drawing.show_plan(sketch(moments=11))
+    box = drawing._future.ghosts[BOX]
+    places = []
+    for seconds in (0.0, 0.25 * PLAY_S, 0.5 * PLAY_S, PLAY_S, PLAY_S + 0.9 * REST_S, 1.5 * PLAY_S + REST_S):
+        drawing.play(seconds)
+        places.append(box.batched_positions[-1, 0])
+    np.testing.assert_allclose(places, [0, 0.025, 0.05, 0.1, 0.1, 0.05], atol=1e-6)
+    drawing.show_part("plan", False)
+    drawing.play(0.0)
+    assert box.batched_positions[-1, 0] == pytest.approx(0.05)  # nobody sees it
     drawing.show_plan(None)
-    assert not any(node.visible for node in (drawing._ways, drawing._best, box, can))
+    drawing.play(0.0)
+    assert not any(node.visible for node in (drawing._ways, drawing._best, *drawing._future.nodes))
 
 
 def test_parts_can_be_hidden_also_before_they_are_drawn(drawing):
@@ -187,15 +186,3 @@ def test_one_way_that_goes_badly_wrong_does_not_paint_the_others_green():
     assert len(np.unique(colours, axis=0)) == 5
     assert np.all(np.diff(colours[:, 1].astype(int)) <= 0)
     assert all(is_green(colour) for colour in cost_colours(np.ones(4)))
-
-
-def test_ghosts_on_the_way_are_spread_over_the_way_and_not_over_the_wait():
-    x = 0.02 * np.maximum(np.arange(11) - 6, 0)
-    waits = Pose(np.stack([x, 0 * x, 0 * x], axis=1), np.tile(TURNS[0], (11, 1)))
-    rows = on_the_way(waits, 3)
-    assert rows == sorted(rows)
-    assert x[rows].min() > 0.01
-    angles = np.linspace(0, 1, 11)
-    turns = Pose(np.zeros((11, 3)), quaternion_exp(angles[:, None] * np.array([0, 0, 1.0])))
-    np.testing.assert_allclose(angles[on_the_way(turns, 3)], [0.25, 0.5, 0.75], atol=0.1)
-    assert on_the_way(waits[:2], 3) == [1, 1, 1]

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from app.job import Job, JobChanged, JobSeen, State
 from app.messages import CurrentScene, SceneChanged
 from app.viewer.drawing import SceneDrawing
 from app.viewer.episode_drawing import EpisodeDrawing
-from app.viewer.episode_view import EpisodeView
+from app.viewer.episode_view import DRAW_INTERVAL_S, EpisodeView
 from app.viewer.viewer import LoopbackViser
 from osfcore.control.events import Acted, Finished, GoalFound, Noticed, Stepped
 from osfcore.plan.goals import PoseGoal
@@ -156,6 +157,21 @@ def test_glances_between_two_actions_are_drawn_only_while_something_is_looked_fo
     np.testing.assert_allclose(room.drawing._now._guesses[BOX].batched_positions, [[0.1, 0, 0.1]], atol=1e-6)
     room.see(look("next", x=0.3, candidates=poses()[None]))
     np.testing.assert_allclose(room.drawing._now._guesses[BOX].batched_positions, [[0.3, 0, 0.1]], atol=1e-6)
+
+
+def test_while_a_plan_is_on_view_its_future_is_played(room, monkeypatch):
+    played = []
+    monkeypatch.setattr(room.drawing, "play", played.append)
+    room.see(stepped())
+    assert played == []
+    room.see(sketch())
+    until(lambda: len(played) >= 5)
+    assert np.diff(played).min() > 0.5 * DRAW_INTERVAL_S
+    room.hear(JobChanged(1, job("done")))
+    until(lambda: room.view._drawn.plan is None)
+    count = len(played)
+    time.sleep(2.5 * DRAW_INTERVAL_S)
+    assert len(played) == count
 
 
 def test_buttons_tell_the_job(room):

@@ -3,12 +3,14 @@ import pytest
 
 from app.viewer.ghosts import (
     CELLS,
+    between,
     box,
     coarse,
     footprint_m,
     heading_rad,
     mesh_of,
     moves,
+    pose_at,
     sector,
     spread,
     top_m,
@@ -106,3 +108,28 @@ def test_only_what_can_be_seen_to_move_moves(shift_m, turn_rad, is_seen):
     turns = quaternion_exp(ends * [0, 0, turn_rad])
     turns[1::2] *= -1  # the same rotations
     assert moves(Pose(ends * [shift_m, 0, 0], turns)) == is_seen
+
+
+def test_between_two_rows_it_is_halfway_and_beyond_the_ends_it_stays():
+    rows = np.array([[0.0, 1.0], [2.0, 3.0], [10.0, 11.0]])
+    for step, expected in (
+        (-1, [0, 1]),
+        (0, [0, 1]),
+        (0.5, [1, 2]),
+        (1, [2, 3]),
+        (1.25, [4, 5]),
+        (2, [10, 11]),
+        (9, [10, 11]),
+    ):
+        np.testing.assert_allclose(between(rows, step), expected)
+    np.testing.assert_allclose(between(rows[:1], 0.7), [0, 1])
+
+
+def test_a_pose_between_two_is_one_whatever_the_signs_of_their_quaternions():
+    angles = np.linspace(0, 2.4, 7)
+    turns = quaternion_exp(angles[:, None] * np.array([0, 0, 1.0]))
+    signs = np.array([1, -1, -1, 1, -1, 1, 1])[:, None]
+    poses = Pose(np.zeros((7, 3)), signs * turns)
+    for step in np.linspace(0, 6, 25):
+        expected = quaternion_exp(np.array([0, 0, np.interp(step, np.arange(7), angles)]))
+        assert abs(pose_at(poses, step).quaternion @ expected) == pytest.approx(1, abs=1e-4)
