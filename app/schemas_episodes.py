@@ -122,6 +122,9 @@ class EpisodeStepOut(BaseModel):
     step: int = Field(description="Actions executed so far.")
     seconds: dict[str, float] = Field(description='Spent on "first", "goal", "estimate", "plan" and "act" [s].')
     image_cost: float = Field(description="Mean squared difference of goal image and rendered estimate.")
+    ssim: float | None = Field(
+        None, description="Their structural similarity, 1 for equal images; null in episodes of earlier versions."
+    )
     to_goal_mm: dict[str, float] = Field(description="Of each object, as estimated [mm].")
     to_goal_deg: dict[str, float] = Field(description="Likewise [deg].")
     estimate_off_mm: dict[str, float] = Field(description="Simulation only: errors of the estimate [mm].")

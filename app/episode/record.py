@@ -17,7 +17,7 @@ from app.episode.frames import TILE_PX, frame, read_frames, write_video
 from app.episode.names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
 from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.control.settings import EpisodeSettings
-from osfcore.evaluate.images import as_bytes, write_png
+from osfcore.evaluate.images import as_bytes, ssim, write_png
 from osfcore.evaluate.mpc_scores import score_of
 from osfcore.evaluate.mpc_tasks import MpcTask
 from osfcore.files import write_atomically, write_json
@@ -132,12 +132,14 @@ class EpisodeRecord:
 
     def _told(self, event: Stepped) -> dict[str, Any]:
         """A step as the report has it; lengths in mm, angles in degrees."""
+        assert self._goal is not None
         truth, estimate = self._table.truth(), event.estimate
         off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
         told = {
             "step": event.number,
             "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
             "image_cost": event.image_cost,
+            "ssim": round(ssim(self._goal.image, event.rendered), 4),
             "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m),
             "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)),
             "estimate_off_mm": _by_name(truth.names, 1000 * off),
@@ -165,12 +167,12 @@ class EpisodeRecord:
         stages = ("first", "goal", "estimate", "plan", "act")
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
-        table.writerow(["step", "image_cost", *(f"{stage}_s" for stage in stages),
+        table.writerow(["step", "image_cost", "ssim", *(f"{stage}_s" for stage in stages),
                         *(f"{name} {key}" for key in present for name in names)])  # fmt: skip
         for step in self._steps:
             seconds = [step["seconds"].get(stage, "") for stage in stages]
             values = [step[key][name] for key in present for name in names]
-            table.writerow([step["step"], step["image_cost"], *seconds, *values])
+            table.writerow([step["step"], step["image_cost"], step["ssim"], *seconds, *values])
         write_atomically(self._folder / CSV_FILE, text.getvalue().encode())
 
     def _report(self) -> dict[str, Any]:

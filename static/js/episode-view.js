@@ -21,6 +21,12 @@ const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: 
 const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
 const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
 
+/** How alike goal image and rendered estimate are. */
+function likeness({ image_cost: cost, ssim }) {
+  const psnr = `PSNR ${(-10 * Math.log10(Math.max(cost, 1e-10))).toFixed(1)} dB`;
+  return Number.isFinite(ssim) ? `${psnr}, SSIM ${ssim.toFixed(3)}` : psnr;
+}
+
 /** How an episode ended, or that it has not. */
 export function outcomeOf(episode) {
   const text = OUTCOMES[episode.outcome] ?? episode.status.replace(/^./, (letter) => letter.toUpperCase());
@@ -102,8 +108,8 @@ function drawHead(episode) {
 function drawStep(at) {
   if (!shown) return;
   const step = shown.steps[at];
-  byId("shown-psnr").textContent = step ? `PSNR ${(-10 * Math.log10(Math.max(step.image_cost, 1e-10))).toFixed(1)} dB` : "";
-  byId("shown-psnr").title = step ? `Image cost ${step.image_cost.toPrecision(3)}` : "";
+  byId("shown-likeness").textContent = step ? likeness(step) : "";
+  byId("shown-likeness").title = step ? `Goal image against the rendered estimate; image cost ${step.image_cost.toPrecision(3)}` : "";
   const knowsTruth = shown.steps.some((other) => other.estimate_off_mm);
   byId("estimate-off-head").hidden = !knowsTruth;
   byId("offset-rows").replaceChildren(...shown.objects.map((name) => {

@@ -6,6 +6,7 @@ import { labelOf } from "./state.js";
 
 const STAGES = [["estimate", "look", COLOURS[0]], ["search", "search", COLOURS[4]], ["plan", "plan", COLOURS[1]], ["act", "act", COLOURS[2]]];
 const MILLI = 1000;
+const ACTION_S = 0.2;
 
 const distance = (step, name) => (step.truly_to_goal_mm ?? step.to_goal_mm)[name];
 
@@ -23,6 +24,12 @@ function times({ steps }) {
   }));
 }
 
+/** How fast the rounds are against what they show: an action takes 0.2 s on the table. */
+function realTime(spent) {
+  const seconds = spent.flatMap(({ values }) => values).reduce((sum, [, value]) => sum + value, 0);
+  return seconds ? `${((ACTION_S * spent[0].values.length) / seconds).toPrecision(2)} × real time` : "";
+}
+
 /** Draws all charts, with a mark at the step one looks at. */
 export function drawProgress(episode, at) {
   const { steps } = episode;
@@ -37,7 +44,7 @@ export function drawProgress(episode, at) {
   drawLegend(byId("key-time"), spent);
   const { first, goal } = steps[0]?.seconds ?? {};
   const before = [first && `first frame ${first.toFixed(0)} s`, goal && `goal image ${goal.toFixed(0)} s`];
-  byId("first-seconds").textContent = before.filter(Boolean).join(", ");
+  byId("first-seconds").textContent = [...before, realTime(spent)].filter(Boolean).join(", ");
 }
 
 /** A click on a chart goes to its step; `lastStep` tells how many there are. */

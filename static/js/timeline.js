@@ -1,7 +1,7 @@
 // A slider over the steps of an episode, and a player that moves it.
 import { byId } from "./dom.js";
 
-const FRAME_MS = 250; // an action takes 200; a little slower is easier to follow
+const ACTION_MS = 200;
 
 export class Timeline {
   /** `onStep` is told the step that shall be seen. */
@@ -15,6 +15,8 @@ export class Timeline {
       this.#tell();
     });
     this.button.addEventListener("click", () => (this.timer ? this.pause() : this.play()));
+    this.speed = byId("timeline-speed");
+    this.speed.addEventListener("change", () => { if (this.timer) this.#run(); });
   }
 
   get step() {
@@ -41,13 +43,18 @@ export class Timeline {
 
   play() {
     if (this.step >= this.last) this.slider.value = 0;
-    this.#draw(setInterval(() => this.#next(), FRAME_MS));
+    this.#run();
     this.#tell();
   }
 
   pause() {
     clearInterval(this.timer);
     this.#draw(0);
+  }
+
+  #run() {
+    clearInterval(this.timer);
+    this.#draw(setInterval(() => this.#next(), ACTION_MS / Number(this.speed.value)));
   }
 
   #next() {

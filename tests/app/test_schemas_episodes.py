@@ -14,6 +14,7 @@ STEP = {
     "step": 0,
     "seconds": {"first": 9.5},
     "image_cost": 0.25,
+    "ssim": 0.9,
     "to_goal_mm": {"box": 60.0},
     "to_goal_deg": {"box": 3.0},
     "estimate_off_mm": {"box": 1.0},

@@ -107,6 +107,12 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
         assert page.locator(f"#chart-{chart} path, #chart-{chart} rect").count() >= 1
         assert page.get_attribute(f"#chart-{chart}", "aria-label") != "No steps yet"
     assert page.locator("#offset-rows tr").count() == len(NAMES)
+    assert "SSIM 0." in page.inner_text("#shown-likeness")
+    assert "× real time" in page.inner_text("#first-seconds")
+    page.select_option("#timeline-speed", "4")
+    page.click("#timeline-play")
+    until(lambda: page.get_attribute("#timeline-play", "aria-label") == "Play the pictures")
+    assert page.input_value("#timeline") == "3"
     page.click("#watch-video")
     until(lambda: page.eval_on_selector("#shown-video", "video => video.readyState >= 2 && video.videoWidth === 768"))
     page.goto(f"{service.url}/?episode={episode['id']}&step=1")

@@ -115,6 +115,7 @@ def test_lengths_are_in_mm_and_angles_in_degrees(whole):
     assert [step["step"] for step in report["steps"]] == [0, 1, 2]
     assert first["seconds"] == {"first": 1.0, "goal": 2.0}
     assert last["seconds"] == {"estimate": 0.5, "plan": 0.25, "act": 0.125}
+    assert first["ssim"] == 1.0  # what is rendered here is the goal image
     assert first["to_goal_mm"] == {CAN: 0.0, BOX: 63.0}
     assert first["to_goal_deg"] == {CAN: 90.0, BOX: 0.0}
     assert first["estimate_off_mm"] == pytest.approx({CAN: 0, BOX: 3})
@@ -129,6 +130,7 @@ def test_the_table_has_a_row_for_every_step(told, whole):
     assert len(table) == len(report["steps"])
     for row, step in zip(table, report["steps"], strict=True):
         assert (int(row["step"]), float(row["image_cost"])) == (step["step"], step["image_cost"])
+        assert float(row["ssim"]) == step["ssim"]
         for stage in ("first", "goal", "estimate", "plan", "act"):
             assert row[f"{stage}_s"] == str(step["seconds"].get(stage, ""))
         for key in ("to_goal_mm", "to_goal_deg", "estimate_off_mm", "truly_to_goal_mm"):
