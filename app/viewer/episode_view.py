@@ -27,7 +27,7 @@ from osfcore.estimate.steps import EstimateStep
 from osfcore.estimated import EstimatedState
 from osfcore.plan.goals import PoseGoal
 
-DRAW_INTERVAL_S = 0.1
+DRAW_INTERVAL_S = 0.08
 _IDLE = "No episode yet"
 _SHOWN: tuple[tuple[Part, str, str], ...] = (
     ("goal", "Show goal", "Golden: where everything should be."),
