@@ -23,8 +23,8 @@ const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
 
 /** How alike goal image and rendered estimate are. */
 function likeness({ image_cost: cost, ssim }) {
-  const psnr = `PSNR ${(-10 * Math.log10(Math.max(cost, 1e-10))).toFixed(1)} dB`;
-  return Number.isFinite(ssim) ? `${psnr}, SSIM ${ssim.toFixed(3)}` : psnr;
+  const psnr = `${(-10 * Math.log10(Math.max(cost, 1e-10))).toFixed(1)} dB`;
+  return Number.isFinite(ssim) ? `${psnr} · SSIM ${ssim.toFixed(2)}` : `PSNR ${psnr}`;
 }
 
 /** How an episode ended, or that it has not. */
@@ -109,7 +109,7 @@ function drawStep(at) {
   if (!shown) return;
   const step = shown.steps[at];
   byId("shown-likeness").textContent = step ? likeness(step) : "";
-  byId("shown-likeness").title = step ? `Goal image against the rendered estimate; image cost ${step.image_cost.toPrecision(3)}` : "";
+  byId("shown-likeness").title = step ? `PSNR and SSIM of goal image and rendered estimate; image cost ${step.image_cost.toPrecision(3)}` : "";
   const knowsTruth = shown.steps.some((other) => other.estimate_off_mm);
   byId("estimate-off-head").hidden = !knowsTruth;
   byId("offset-rows").replaceChildren(...shown.objects.map((name) => {
