@@ -6,11 +6,10 @@ import numpy as np
 import viser
 
 from app.viewer.ghosts import between, mesh_of, moves, pose_at, way_of
-from app.viewer.push_drawing import PREDICTED, PUSHER_OPACITY
+from app.viewer.push_drawing import pusher_ghost
 from osfcore.objects.library import AssetLibrary
 from osfcore.poses import Pose, rotation_angle
 from osfcore.rollouts import Rollouts
-from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 
 ON_THE_WAY = 3  # pale ghosts between now and the end
 _ARM_M = 0.05  # what turning by 1 rad counts on the way
@@ -36,16 +35,7 @@ class FutureDrawing:
         self._colour = colour
         self._future: Rollouts | None = None
         self.ghosts: dict[str, viser.BatchedMeshHandle] = {}
-        self._pusher = scene.add_cylinder(
-            f"{root}/pusher",
-            radius=PUSHER_RADIUS_M * _SCALE,
-            height=PUSHER_HEIGHT_M,
-            color=PREDICTED,
-            opacity=PUSHER_OPACITY,
-            cast_shadow=False,
-            receive_shadow=False,
-            visible=False,
-        )
+        self._pusher = pusher_ghost(scene, f"{root}/pusher")
 
     @property
     def steps(self) -> int:

@@ -19,8 +19,7 @@ from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, SceneState
 PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimates
 TRAIL = 5  # pale ghosts between start and end
 _CELLS = 28
-PUSHER_OPACITY = 0.35
-_GHOST_OPACITY, _TRAIL_OPACITY = 0.5, 0.13
+_GHOST_OPACITY, _TRAIL_OPACITY, _PUSHER_OPACITY = 0.5, 0.13, 0.35
 _GHOST_SCALE, _TRAIL_SCALE = 1.01, 1.005  # or ghosts and the surface below them would flicker
 _ABOVE_M = 0.012  # ways of objects are drawn above them, that of the pusher above the table
 _FLOOR_M = 0.004
@@ -52,16 +51,7 @@ class PushDrawing:
         self._plan = add("/push/plan", _NOWHERE, PREDICTED, thickness=0.006, visible=False)
         self._ways = add("/push/ways", _NOWHERE, PREDICTED, thickness=_LINE_M, visible=False)
         self._true_ways = add("/push/true_ways", _NOWHERE, TRUE, thickness=_LINE_M, visible=False)
-        self._pusher = self._scene.add_cylinder(
-            "/push/pusher",
-            radius=PUSHER_RADIUS_M * _GHOST_SCALE,
-            height=PUSHER_HEIGHT_M,
-            color=PREDICTED,
-            opacity=PUSHER_OPACITY,
-            cast_shadow=False,
-            receive_shadow=False,
-            visible=False,
-        )
+        self._pusher = pusher_ghost(self._scene, "/push/pusher")
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -174,6 +164,20 @@ class PushDrawing:
         if name not in self._meshes:
             self._meshes[name] = mesh_of(self._library, name, _CELLS)
         return self._meshes[name]
+
+
+def pusher_ghost(scene: viser.SceneApi, path: str) -> viser.CylinderHandle:
+    """A ghost of the pusher, hidden until it has somewhere to be."""
+    return scene.add_cylinder(
+        path,
+        radius=PUSHER_RADIUS_M * _GHOST_SCALE,
+        height=PUSHER_HEIGHT_M,
+        color=PREDICTED,
+        opacity=_PUSHER_OPACITY,
+        cast_shadow=False,
+        receive_shadow=False,
+        visible=False,
+    )
 
 
 def _spaced(poses: Pose, count: int) -> np.ndarray:
