@@ -7,6 +7,10 @@ the facts and write the sentence. Nothing here knows of exit codes or HTTP.
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
+MAX_SEED = 2**63 - 1
 _MOST_CHARACTERS = 2000  # of a sentence, however long the names in it are
 _VALUE_CHARACTERS = 300  # of a value that was given, which may be a path or a list
 _SHOWN_CHARACTERS = 100
@@ -120,3 +124,29 @@ class FetchFailed(OsfError):
 
     def __init__(self, what: str, reason: str) -> None:
         super().__init__(f"{what} could not be fetched: {reason}. Nothing was changed.")
+
+
+def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "size"]:
+    """A float64 copy of `size` finite numbers.
+
+    Raises:
+        InvalidInput: if there are not exactly `size` numbers, or one is NaN or infinite.
+    """
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidInput(what, repr(value)[:80], f"{size} finite numbers") from None
+    if vector.shape != (size,) or not np.all(np.isfinite(vector)):
+        raise InvalidInput(what, repr(vector.tolist())[:80], f"{size} finite numbers")
+    return vector
+
+
+def check_seed(value: int) -> int:
+    """A seed that every random generator takes.
+
+    Raises:
+        InvalidInput: if it is negative or has more than 63 bits.
+    """
+    if not 0 <= value <= MAX_SEED:
+        raise InvalidInput("seed", value, f"between 0 and {MAX_SEED}")
+    return int(value)

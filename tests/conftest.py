@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-import osfcore.convex
+import osfcore.geometry.convex_parts
 import osfcore.objects
+from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.fetch import fetch
-from osfcore.objects.library import AssetLibrary
 from osfcore.objects.sources import FolderSource, WheelSource
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
@@ -31,7 +31,7 @@ TEST_OBJECTS = (
 
 def _objects_key() -> str:
     """Changes when the conversion changes, so that stale objects are not used."""
-    sources = [Path(osfcore.convex.__file__), *sorted(Path(osfcore.objects.__path__[0]).glob("*.py"))]
+    sources = [Path(osfcore.geometry.convex_parts.__file__), *sorted(Path(osfcore.objects.__path__[0]).glob("*.py"))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
 
 

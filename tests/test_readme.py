@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from osfcore.world.collect_observation import CollectObservation, collect_observation
+from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
 from tests.live import live_service
 
 README = (Path(__file__).parents[1] / "README.md").read_text()

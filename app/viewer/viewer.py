@@ -14,25 +14,25 @@ from pathlib import Path
 
 import viser
 
-from app.estimates import Estimates
-from app.goals import DraftChanged, Goals
-from app.job import JobChanged
-from app.messages import CurrentScene, SceneRecord
-from app.neural.link import NeuralLink
-from app.playback import Playback
-from app.predictions import Predictions
-from app.runner import Runner
-from app.viewer.drawing import Client, SceneDrawing
-from app.viewer.episode_drawing import EpisodeDrawing
-from app.viewer.episode_view import EpisodeView
-from app.viewer.estimate_drawing import EstimateDrawing
-from app.viewer.estimate_view import EstimateView
-from app.viewer.goal_view import GoalView
-from app.viewer.neural_view import NeuralViews
-from app.viewer.push_view import PushView
+from app.jobs.job import JobChanged
+from app.processes.messages import CurrentScene, SceneRecord
+from app.processes.neural_client import NeuralLink
+from app.services.estimates import Estimates
+from app.services.goals import DraftChanged, Goals
+from app.services.predictions import Predictions
+from app.services.runner import Runner
+from app.viewer.nodes.episode_nodes import EpisodeDrawing
+from app.viewer.nodes.estimate_nodes import EstimateDrawing
+from app.viewer.nodes.scene_nodes import Client, SceneDrawing
+from app.viewer.panels.episode_panel import EpisodeView
+from app.viewer.panels.estimate_panel import EstimateView
+from app.viewer.panels.goal_panel import GoalView
+from app.viewer.panels.neural_panel import NeuralViews
+from app.viewer.panels.push_panel import PushView
+from app.viewer.playback import Playback
 from osfcore.errors import OsfError
-from osfcore.poses import Pose
-from osfcore.scene import Light
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
 
 PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
 PUSH_STEPS = 2

@@ -9,11 +9,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.estimate.steps import EstimateStep
-from osfcore.estimated import EstimatedState
-from osfcore.plan.goals import PoseGoal
-from osfcore.plan.mppi import PlanRound
-from osfcore.scene import Camera, Observation, SceneState
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.planning.mppi import PlanRound
+from osfcore.planning.pose_cost import PoseGoal
 
 Look = Literal["first", "goal", "next", "search"]
 Matter = Literal["goal", "lamp", "object", "lost", "found", "stalled"]

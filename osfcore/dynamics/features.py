@@ -15,12 +15,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from osfcore.dynamics import turns
-from osfcore.dynamics.graph import Graph
-from osfcore.dynamics.outline import Gap, dot
-from osfcore.dynamics.shapes import ShapeTable
-from osfcore.dynamics.sliding import lever, slide
-from osfcore.scene import PUSHER_RADIUS_M
+from osfcore.dynamics.contact_graph import Graph
+from osfcore.dynamics.limit_surface import lever, slide
+from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry.polygons import Gap, dot
+from osfcore.geometry.workspace import PUSHER_RADIUS_M
 
 _AROUND = 16  # horizontal directions in which an object's extent is told
 _SLANTED = 8  # directions 45 deg below and above the horizon

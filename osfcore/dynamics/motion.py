@@ -9,11 +9,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from osfcore.dynamics import turns
-from osfcore.dynamics.episodes import SLEEP_M, SLEEP_RAD
-from osfcore.dynamics.outline import circle
-from osfcore.dynamics.pusher import SUBSTEPS
-from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.pusher_path import SUBSTEPS
+from osfcore.dynamics.recorded_states import SLEEP_M, SLEEP_RAD
+from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry.polygons import circle
 
 _MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
 _ASIDE = 0.035  # about a cell of the map of directions [rad]

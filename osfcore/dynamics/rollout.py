@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from osfcore.dynamics import turns
 from osfcore.dynamics.motion import Motion, going_on, lowest_point
-from osfcore.dynamics.network import PropagationNetwork
-from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
-from osfcore.dynamics.shapes import ObjectShape, ShapeTable
+from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.poses import rotate
-from osfcore.rollouts import Rollouts, check_actions
-from osfcore.scene import SceneState
+from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry.poses import rotate
+from osfcore.geometry.rollouts import Rollouts, check_actions
+from osfcore.geometry.states import SceneState
 
 _CHUNK = 4096  # sequences rolled out at once: more would not be faster
 

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from osfcore.dynamics.motion import Motion, Sweep, headings
-from osfcore.dynamics.network import PropagationNetwork
-from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
-from osfcore.dynamics.shapes import ShapeTable
-from osfcore.dynamics.step import advance
+from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.substep import advance
 
 
 def unroll(

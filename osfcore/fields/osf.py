@@ -7,13 +7,13 @@ half its width, which also reads the light and the view, gives the light that is
     sigma = DENSITY_GAIN * softplus(s) / half of the box's longest side         [1 / unit of length]
     rho   = albedo * (ambient + softplus(gain))
 
-It is a teacher (osfcore.fields.distill) and a yardstick; what is shipped is a KiloOSF. Deviations from the paper: rho
+It is a teacher (`training.distillation`) and a yardstick; what is shipped is a KiloOSF. Deviations from the paper: rho
 keeps an ambient part that neither light nor view changes, because our lamp comes with ambient light that no shadow
 removes and because every image shows one light only, from which a free split could not be learned; the sigmoid of the
 published code is on the albedo alone, so that a well-lit point may send out more than it; eq. 2's integral over light
 directions is one term, since the light is distant; lights and views have unit length, in training as in use (the
 published code mixes unit lights and such of length 15); positions are divided by the object's box, not by a constant
-of each scene; and samples are proposed by a voxel grid (osfcore.fields.teacher) in place of NeRF's coarse network.
+of each scene; and samples are proposed by a voxel grid (`training.osf_training`) in place of NeRF's coarse network.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from osfcore.errors import InvalidInput
-from osfcore.fields.query import Scatter
-from osfcore.fields.shell import FIRST_AMBIENT
+from osfcore.fields.kiloosf_query import Scatter
+from osfcore.fields.voxel_shell import FIRST_AMBIENT
 
 DENSITY_GAIN = 50.0
 POSITION_OCTAVES = 10
@@ -82,7 +82,7 @@ def outgoing_radiance(
 
 
 class OSF(nn.Module):
-    """The large network of one object; called like osfcore.fields.query.KiloQuery."""
+    """The large network of one object; called like osfcore.fields.kiloosf_query.KiloQuery."""
 
     def __init__(
         self,

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName, WorkerDied
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, Symmetry, TexturedMesh
+from osfcore.objects.asset_library import AssetLibrary, check_name
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.download import temporary_folder, told_as_fetch_failed
-from osfcore.objects.library import AssetLibrary, check_name
 from osfcore.progress import Progress
 
 if TYPE_CHECKING:
@@ -126,8 +126,8 @@ def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
     Raises:
         InvalidInput: if the mesh encloses no volume.
     """
-    from osfcore.convex import convex_parts
-    from osfcore.objects.resting import resting_poses
+    from osfcore.geometry.convex_parts import convex_parts
+    from osfcore.objects.stable_poses import resting_poses
 
     parts = convex_parts(mesh.vertices, mesh.faces)
     return ObjectAsset(info, mesh, parts, resting_poses(parts))
@@ -187,8 +187,8 @@ def add_object(
 
 def _read(files: MeshFiles) -> TexturedMesh:
     from osfcore.objects.mesh import read_mesh, textured_mesh
+    from osfcore.objects.mesh_colours import PLAIN_SIDE
     from osfcore.objects.msh import read_msh
-    from osfcore.objects.surface import PLAIN_SIDE
 
     if files.mesh.suffix != ".msh":
         mesh = read_mesh(files.mesh)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.objects.asset import TexturedMesh
-from osfcore.objects.surface import joined, piece_of
+from osfcore.objects.mesh_colours import joined, piece_of
 from osfcore.objects.texture import clean_texture
 
 MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0

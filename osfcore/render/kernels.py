@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, MOST_HIDDEN, NETWORK_INPUTS
-from osfcore.fields.marching import interpolate, inverted, leave_blocks, optical_density, within
+from osfcore.fields.ray_marching import interpolate, inverted, leave_blocks, optical_density, within
 from osfcore.render.table_kernels import FAR, HELPER, KERNEL, TINY, meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24

@@ -8,21 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from osfcore.fields.marching import ONE_AT_A_TIME
-from osfcore.fields.table import TableField
-from osfcore.poses import quaternion_to_matrix
+from osfcore.fields.ray_marching import ONE_AT_A_TIME
+from osfcore.fields.table_field import TableField
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import quaternion_to_matrix
 from osfcore.render.kernels import NO_OUTLINE, render_batch
 from osfcore.render.packing import Packed
-from osfcore.render.scene_renderer import (
-    MASK_OPACITY,
-    Quality,
-    Rendered,
-    SceneBatch,
-    camera_numbers,
-    poses_of,
-)
 from osfcore.render.table_kernels import render_base
-from osfcore.scene import Camera
+from osfcore.render.types import MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, poses_of
 
 _LAST_CORNER = 1.001  # interpolation needs the corner after
 _TINY = 1e-9

@@ -16,20 +16,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.query import KiloQuery
-from osfcore.fields.table import TableField
-from osfcore.poses import quaternion_to_matrix
-from osfcore.render.scene_renderer import (
-    EXACT,
-    MASK_OPACITY,
-    Quality,
-    Rendered,
-    SceneBatch,
-    camera_numbers,
-    check_request,
-)
+from osfcore.fields.kiloosf_query import KiloQuery
+from osfcore.fields.table_field import TableField
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import quaternion_to_matrix
+from osfcore.geometry.states import SceneState
 from osfcore.render.solids import pusher_field
-from osfcore.scene import Camera, SceneState
+from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
 
 _RAYS_AT_ONCE = 4096
 _FAR = 1e9

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.fields.kiloosf import EMPTY_G, FEATURES, KiloOSF, network_size
-from osfcore.fields.shell import shell_field
-from osfcore.scene import AMBIENT, DIFFUSE, PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.fields.voxel_shell import shell_field
+from osfcore.geometry.light import AMBIENT, DIFFUSE
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 
 _PUSHER_VOXEL_M = 0.0025
 _EDGE_G = 8.0  # g per voxel across a surface

@@ -19,9 +19,9 @@ import pybullet
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from osfcore.geometry.poses import Pose, quaternion_from_matrix, rotate
+from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset
-from osfcore.poses import Pose, quaternion_from_matrix, rotate
-from osfcore.scene import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
 
 TIME_STEP_S = 1 / 240
 SUBSTEPS = round(STEP_S / TIME_STEP_S)

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import NoRoom
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, WORKSPACE_HALF_M
 from osfcore.objects.asset import ObjectAsset
-from osfcore.poses import Pose, quaternion_exp, quaternion_multiply
-from osfcore.scene import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, WORKSPACE_HALF_M
 from osfcore.world.physics import Physics, lowest_point
 
 GAP_M = 0.01  # between objects when placed

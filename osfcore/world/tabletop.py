@@ -1,6 +1,6 @@
 """The simulated tabletop: PyBullet moves the objects, ray tracing (or TinyRenderer) takes the pictures.
 
-One implementation of `osfcore.world.protocol.World`, with what only a simulator can do besides: tell the truth, take
+One implementation of `control.world_protocol.World`, with what only a simulator can do besides: tell the truth, take
 any view, move things by hand. Several may live in one process. Deterministic: the same seed gives the same bits.
 """
 
@@ -14,28 +14,19 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, MissingAssets, OsfError, OverlappingObjects, UnknownName
+from osfcore.errors import InvalidInput, MissingAssets, OsfError, OverlappingObjects, UnknownName, finite_vector
+from osfcore.geometry.cameras import Camera, default_cameras
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, unit_quaternion
+from osfcore.geometry.states import MAX_OBJECTS, Observation, SceneState
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M, TABLE_SIDE_M, check_action
 from osfcore.objects.asset import ObjectAsset
-from osfcore.objects.library import AssetLibrary
-from osfcore.poses import Pose, unit_quaternion
-from osfcore.scene import (
-    MAX_OBJECTS,
-    PUSHER_CENTRE_Z_M,
-    PUSHER_REACH_M,
-    TABLE_SIDE_M,
-    Camera,
-    Light,
-    Observation,
-    SceneState,
-    check_action,
-    default_cameras,
-    finite_vector,
-)
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.imaging.ray_tracer import Picture, RayTracer, masks_of
+from osfcore.world.imaging.tiny_renderer import TinyScene
+from osfcore.world.imaging.traced_mesh import TracedMesh
 from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, body_model
 from osfcore.world.placing import is_calm, place_randomly
-from osfcore.world.raytrace import Picture, RayTracer, masks_of
-from osfcore.world.tiny import TinyScene
-from osfcore.world.traced import TracedMesh
 
 Renderer = Literal["embree", "tiny"]
 OVERLAP_TOLERANCE_M = 0.002

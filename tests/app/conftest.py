@@ -12,8 +12,8 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
-from app.main import create_app
-from app.settings import Settings
+from app.api.app_factory import create_app
+from app.services.service_settings import Settings
 
 LOCALHOST = "http://localhost"
 

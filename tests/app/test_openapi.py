@@ -16,17 +16,17 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from app.episode.frames import HEIGHT, WIDTH
-from app.episode.names import FRAMES_FOLDER, REPORT_FILE
-from app.episodes import FILES
-from app.job_ends import STOPPED, after
-from app.main import create_app
-from app.settings import Settings
-from osfcore.evaluate.images import write_png
-from osfcore.files import write_json
+from app.api.app_factory import create_app
+from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
+from app.episodes.frames import HEIGHT, WIDTH
+from app.jobs.outcomes import STOPPED, after
+from app.services.episodes import FILES
+from app.services.service_settings import Settings
+from osfcore.io.files import write_json
+from osfcore.io.image_file import write_png
+from tests.app.api.routes.test_jobs import LONG
 from tests.app.conftest import running, until
-from tests.app.routes.test_jobs import LONG
-from tests.app.test_goals import photo
+from tests.app.services.test_goals import photo
 
 CHECKS = (
     not_a_server_error,

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from app.paths import default_data_dir
+from app.storage.paths import default_data_dir
 from tests.bench.bench_service import call, viewer_updates
 from tests.bench.machine import machine
 from tests.live import live_service

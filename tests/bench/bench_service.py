@@ -17,7 +17,7 @@ import tyro
 import viser
 from websockets.asyncio.client import connect
 
-from app.paths import default_data_dir
+from app.storage.paths import default_data_dir
 from tests.bench.machine import machine
 from tests.live import live_service
 

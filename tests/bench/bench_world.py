@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from app.paths import default_data_dir
-from osfcore.objects.library import AssetLibrary
-from osfcore.scene import default_cameras
-from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+from app.storage.paths import default_data_dir
+from osfcore.geometry.cameras import default_cameras
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from osfcore.world.imaging.tiny_renderer import TinyScene
 from osfcore.world.tabletop import SceneRequest, Tabletop
-from osfcore.world.tiny import TinyScene
 from tests.bench.machine import machine
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.commands.collect import CollectObservationCommand
-from osfcore.observationfile import read_observation, write_observation
-from tests.app.test_image_sets import zipped
+from app.cli.commands.collect import CollectObservationCommand
+from osfcore.io.observation_file import read_observation, write_observation
+from tests.app.services.test_image_sets import zipped
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 

@@ -6,7 +6,7 @@ import urllib.request
 
 import pytest
 
-from tests.app.test_image_sets import zipped
+from tests.app.services.test_image_sets import zipped
 from tests.core.fields.sets import write_set
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service

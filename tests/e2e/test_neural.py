@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.viewer.drawing import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
-from osfcore.scene import Camera
-from tests.app.neural.fields import write_box, write_exact_table
+from app.viewer.nodes.scene_nodes import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
+from osfcore.geometry.cameras import Camera
+from tests.app.processes.fields import write_box, write_exact_table
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 

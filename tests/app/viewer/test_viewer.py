@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from app.job import JobChanged, JobSeen
-from app.viewer.drawing import VIEW_FROM
+from app.jobs.job import JobChanged, JobSeen
+from app.viewer.nodes.scene_nodes import VIEW_FROM
 from app.viewer.viewer import LoopbackViser
-from osfcore.poses import Pose
-from osfcore.scene import PUSHER_HEIGHT_M
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.workspace import PUSHER_HEIGHT_M
 from tests.app.conftest import until
 from tests.app.viewer.conftest import BOTTLE, BOX, agrees
-from tests.app.viewer.test_episode_view import found, job, sketch, stepped
+from tests.app.viewer.panels.test_episode_panel import found, job, sketch, stepped
 
 
 def test_a_dropped_object_falls_and_one_in_another_goes_back(live, drawing, shown):

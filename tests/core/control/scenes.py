@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from osfcore.control.episode import Knowledge
-from osfcore.dynamics.library import load_push_model, load_shapes
-from osfcore.estimate.models import Models
-from osfcore.estimated import EstimatedState
-from osfcore.fields.library import FieldLibrary
+from osfcore.control.knowledge import Knowledge
+from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.light import Light
+from osfcore.geometry.states import SceneState
 from osfcore.objects.asset import Symmetry
-from osfcore.scene import Light, SceneState
 from osfcore.world.tabletop import SceneRequest, Tabletop
 
 GELATIN, CAN = NAMES = ("009_gelatin_box", "005_tomato_soup_can")
@@ -18,7 +19,7 @@ LIGHT = Light.from_angles(0.8, 0.7)
 def knowledge() -> Knowledge:
     """Of both objects."""
     fields = FieldLibrary(None)
-    models = Models({name: fields.load(name) for name in NAMES}, fields.load_table())
+    models = ObjectModels({name: fields.load(name) for name in NAMES}, fields.load_table())
     dynamics, shapes = load_push_model(None, fields, NAMES), load_shapes(None, fields, NAMES)
     return Knowledge(models, dynamics, shapes, {name: Symmetry("none") for name in NAMES})
 

@@ -6,13 +6,15 @@ import numpy as np
 import torch
 
 from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
-from osfcore.dynamics.network import PropagationNetwork
-from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
-from osfcore.dynamics.shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
+from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.shapes.object_shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
 from osfcore.dynamics.unroll import unroll
-from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate
-from osfcore.pushfile import PushEpisode
-from osfcore.scene import PUSHER_CENTRE_Z_M, STEP_S, Light, SceneState
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
+from osfcore.io.push_file import PushEpisode
 
 BOX, CAN, GELATIN, APPLE = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box", "013_apple")
 

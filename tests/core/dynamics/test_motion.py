@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics import turns
 from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, going_on, headings, lowest_point, sleeping
-from osfcore.poses import quaternion_exp, rotate
+from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry.poses import quaternion_exp, rotate
 from tests.core.dynamics.scenes import NAMES, crowd, hull, start
 
 

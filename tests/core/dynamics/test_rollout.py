@@ -5,11 +5,11 @@ import pytest
 import torch
 
 import osfcore.dynamics.rollout as module
-from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
+from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
 from osfcore.dynamics.rollout import PushModel
 from osfcore.errors import InvalidInput, OsfError, UnknownName
-from osfcore.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle
-from osfcore.scene import SceneState
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle
+from osfcore.geometry.states import SceneState
 from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, crowd, hull, moved_state, network, picked, scene
 
 PUSH = np.array([[0.3, 0.0, 0], [0.2, 0.05, 0], [0.1, -0.1, 0]])

@@ -1,8 +1,8 @@
 import numpy as np
 import torch
 
-from osfcore.dynamics.pusher import SUBSTEPS, pusher_path
-from osfcore.dynamics.step import advance
+from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.substep import advance
 from osfcore.dynamics.unroll import unroll
 from tests.core.dynamics.scenes import crowd, network, start, sweep_of
 

@@ -8,10 +8,11 @@ import numpy as np
 from PIL import Image
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.table import TableField
-from osfcore.fields.training import Recipe
-from osfcore.render.scene_renderer import Quality, SceneBatch, SceneRenderer
-from osfcore.scene import Camera
+from osfcore.fields.table_field import TableField
+from osfcore.fields.training.kiloosf_training import Recipe
+from osfcore.geometry.cameras import Camera
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import Quality, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, coloured
 
 QUICK = Recipe(coarse_across=16, fine_across=24, cells=2, hidden=8, rays=512)

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from osfcore.scene import Camera
+from osfcore.geometry.cameras import Camera
 
 CENTRE = np.array([0.2, -0.1, 0.1])
 HALF = np.array([0.5, 0.3, 0.2])

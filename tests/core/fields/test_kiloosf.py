@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G, MACRO, KiloOSF, block_distances, network_size
-from osfcore.fields.query import KiloQuery
+from osfcore.fields.kiloosf_query import KiloQuery
 from tests.core.render.scenes import ball, block
 
 

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from osfcore.errors import InvalidInput
+from osfcore.fields.kiloosf_query import Scatter
 from osfcore.fields.osf import DENSITY_GAIN, OSF, OSFSize, encoding, outgoing_radiance
-from osfcore.fields.query import Scatter
 
 BOX = np.array([[-0.1, -0.2, 0.0], [0.1, 0.2, 0.6]])
 

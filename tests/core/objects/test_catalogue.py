@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from osfcore.geometry.poses import quaternion_multiply, rotate, rotation_angle
 from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
 from osfcore.objects.mesh import read_mesh
-from osfcore.poses import quaternion_multiply, rotate, rotation_angle
 
 
 def test_twenty_objects_with_sane_masses():

@@ -7,8 +7,8 @@ import trimesh
 from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.fetch import add_object, convert, fetch
-from osfcore.objects.library import AssetLibrary
 from osfcore.objects.sources import FolderSource, MeshFiles
 
 NAMES = ("003_cracker_box", "006_mustard_bottle", "009_gelatin_box")

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from osfcore.render.kernels import MOST_OBJECTS as ROOM
-from osfcore.render.scene_renderer import MOST_OBJECTS, OUTPUTS, PLANNING, SceneBatch, SceneRenderer
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import MOST_OBJECTS, OUTPUTS, PLANNING, SceneBatch
 from tests.core.render.scenes import random_scene, view, wooden_table
 
 

@@ -3,12 +3,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.poses import Pose, quaternion_exp
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.kernels import render_batch
 from osfcore.render.launch import screen_boxes
-from osfcore.render.scene_renderer import EXACT, OUTPUTS, PLANNING, SceneBatch, SceneRenderer
+from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.table_kernels import render_base
-from osfcore.scene import PUSHER_CENTRE_Z_M, Camera
+from osfcore.render.types import EXACT, OUTPUTS, PLANNING, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, state, view
 
 CORNERS = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1

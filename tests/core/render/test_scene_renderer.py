@@ -4,19 +4,13 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.poses import quaternion_exp
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import quaternion_exp
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.reference import render_reference
-from osfcore.render.scene_renderer import (
-    EXACT,
-    MASK_OPACITY,
-    MOST_OBJECTS,
-    OUTPUTS,
-    PLANNING,
-    Quality,
-    SceneBatch,
-    SceneRenderer,
-)
-from osfcore.scene import PUSHER_CENTRE_Z_M, Camera, Light
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import EXACT, MASK_OPACITY, MOST_OBJECTS, OUTPUTS, PLANNING, Quality, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, fog, plain_table, random_scene, state, view, wooden_table
 
 CAMERAS = {

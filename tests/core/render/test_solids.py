@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from osfcore.fields.kiloosf import FLOOR_G
-from osfcore.render.scene_renderer import OUTPUTS, SceneBatch, SceneRenderer
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.solids import pusher_field, solid_field
-from osfcore.scene import PUSHER_ALBEDO, PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.render.types import OUTPUTS, SceneBatch
 from tests.core.render.scenes import corners_of, state, view
 
 

@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from osfcore.render.scene_renderer import EXACT, Quality, SceneBatch, SceneRenderer
-from osfcore.scene import Light, goal_camera
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.light import Light
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import EXACT, Quality, SceneBatch
 from tests.core.render.scenes import plain_table
 
 NOTHING = np.zeros((1, 0, 3)), np.zeros((1, 0, 4))

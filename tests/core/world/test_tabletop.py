@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 
+from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput, MissingAssets, OsfError, OverlappingObjects, UnknownName
-from osfcore.poses import Pose
-from osfcore.scene import Light, SceneState, default_cameras, goal_camera
-from osfcore.world.protocol import World
+from osfcore.geometry.cameras import default_cameras, goal_camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
 from osfcore.world.tabletop import SceneRequest, Tabletop
 
 ACTIONS = np.column_stack([np.random.default_rng(0).uniform(-0.3, 0.3, (15, 2)), np.zeros(15)])

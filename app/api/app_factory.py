@@ -1,0 +1,192 @@
+"""The app factory: REST under /api, events, the viewer's relay at /viewer, documentation, and the page at /."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import HTMLResponse
+from fastapi.routing import APIRoute
+from fastapi.staticfiles import StaticFiles
+from starlette.concurrency import run_in_threadpool
+
+from app.api import problems, relay
+from app.api.dependencies import Services, Shelf
+from app.api.http_metrics import Metrics, MetricsMiddleware
+from app.api.routes import (
+    comparisons as neural,
+)
+from app.api.routes import (
+    driver,
+    episodes,
+    estimates,
+    events,
+    fields,
+    goals,
+    health,
+    jobs,
+    metrics,
+    objects,
+    predictions,
+    presets,
+    scenes,
+)
+from app.api.routes import settings as settings_routes
+from app.api.schemas.common import FrameEvent, NoticeEvent, Problem
+from app.api.schemas.estimates import EstimateIn
+from app.api.schemas.goals import GoalIn
+from app.api.security import BodyLimitMiddleware, SecurityMiddleware
+from app.api.token_gate import TokenMiddleware
+from app.processes.neural_client import NeuralLink
+from app.processes.predict_process import WHO, predictor_main
+from app.services.driver import Driver
+from app.services.episodes import Episodes
+from app.services.estimates import Estimates
+from app.services.fields import FieldCatalogue
+from app.services.goals import Goals
+from app.services.predictions import Predictions
+from app.services.runner import Runner
+from app.services.service_settings import Settings
+from app.storage.database import Store
+from app.storage.paths import static_folder
+from app.viewer import Viewer
+from osfcore.objects.asset_library import AssetLibrary
+
+_DESCRIPTION = (
+    "Scenes of real objects on a lit table, a pusher to move them, cameras to look at them, estimates of what they "
+    "see, predictions of what pushes do, and jobs for long work. "
+    "Metres, seconds, quaternions (w, x, y, z); world z up, table top at z = 0. "
+    "Errors are application/problem+json with one sentence in `detail`."
+)
+
+_ROUTES = (
+    health, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs, settings_routes,
+    driver, metrics, events,
+)  # fmt: skip
+_UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
+_STREAM = "text/event-stream"
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The service as an ASGI app; everything starts and stops with its lifespan."""
+    settings = settings or Settings()
+    app = FastAPI(
+        title="OSF manipulation",
+        version=health.VERSION,
+        description=_DESCRIPTION,
+        openapi_url="/api/openapi.json",
+        docs_url=None,  # the default pages load scripts from elsewhere
+        redoc_url=None,
+        lifespan=_lifespan,
+        generate_unique_id_function=_operation_id,
+    )
+    app.state.settings, app.state.metrics = settings, Metrics()
+    limit_of = partial(_body_limit, settings)
+    app.add_middleware(BodyLimitMiddleware, limit_of=limit_of)
+    if settings.token is not None:
+        app.add_middleware(TokenMiddleware, token=settings.token.get_secret_value())
+    app.add_middleware(  # outermost: also the limit's answer gets its headers and becomes a problem
+        SecurityMiddleware,
+        allowed_hosts=settings.allowed_hosts,
+        allowed_origins=settings.allowed_origins,
+        limit_of=limit_of,
+    )
+    app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
+    problems.install(app)
+    for module in _ROUTES:
+        app.include_router(module.router)
+    app.include_router(relay.router)
+    _add_docs(app)
+    app.openapi = lambda: _openapi(app)  # pyright: ignore[reportAttributeAccessIssue]
+    app.mount("/", StaticFiles(directory=static_folder(), html=True), name="static")
+    return app
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    settings: Settings = app.state.settings
+    async with AsyncExitStack() as stack:
+        store = await run_in_threadpool(Store, settings.data_dir, settings.max_stored_events)
+        stack.push_async_callback(run_in_threadpool, store.close)
+        runner = Runner(settings, store, AssetLibrary(settings.data_dir / "objects"))
+        stack.push_async_callback(run_in_threadpool, runner.stop)
+        await run_in_threadpool(runner.start)
+        neural = NeuralLink(settings.data_dir)
+        stack.push_async_callback(run_in_threadpool, neural.stop)
+        shelf = Shelf(runner.library)
+        fields = FieldCatalogue(settings.data_dir, shelf.names)
+        found = Estimates(runner, fields)
+        stack.push_async_callback(run_in_threadpool, found.stop)
+        predictor = NeuralLink(settings.data_dir, predictor_main, WHO)
+        stack.push_async_callback(run_in_threadpool, predictor.stop)
+        predicted = Predictions(runner, fields.names, predictor)
+        wanted = Goals(runner, settings.data_dir, settings.max_goals)
+        await run_in_threadpool(wanted.start)
+        acted = Episodes(runner, fields, wanted)
+        viewer = Viewer(runner, neural, fields.names, found, predicted, wanted)
+        stack.push_async_callback(run_in_threadpool, viewer.stop)
+        await run_in_threadpool(viewer.start)
+        driving = Driver(runner.hub.publish)
+        services = Services(
+            settings, store, runner, viewer, shelf, fields, neural, found, predicted, wanted, acted, driving
+        )
+        app.state.services = services
+        app.state.metrics.watch(runner)
+        stack.callback(services.closing.set)
+        yield
+
+
+def _body_limit(settings: Settings, path: str) -> int:
+    """How large a request to a path may be [bytes]: only uploads are large."""
+    path = path.rstrip("/")
+    if path == goals.UPLOAD_PATH:
+        return max(settings.max_photo_bytes, settings.max_body_bytes)
+    return settings.max_upload_bytes if path in _UPLOAD_PATHS else settings.max_body_bytes
+
+
+def _operation_id(route: APIRoute) -> str:
+    return f"{route.tags[0]}-{route.name}" if route.tags else route.name
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The schema with those models that no route returns as such: problems and the events' data."""
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schemas = schema.setdefault("components", {}).setdefault("schemas", {})
+        for model in (Problem, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
+            own = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= own.pop("$defs", {})
+            schemas[model.__name__] = own
+        for path in (operations["get"] for operations in schema["paths"].values() if "get" in operations):
+            content = path["responses"]["200"].get("content", {})
+            if _STREAM in content:  # FastAPI describes it in terms of OpenAPI 3.2, which readers of 3.1 refuse
+                content[_STREAM] = {"schema": {"type": "string"}}
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _add_docs(app: FastAPI) -> None:
+    """Swagger UI with scripts from a package on this machine."""
+    package = importlib.util.find_spec("fastapi_offline")
+    assert package is not None
+    assert package.origin is not None
+    app.mount("/docs-assets", StaticFiles(directory=Path(package.origin).parent / "static"), name="docs-assets")
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs(request: Request) -> HTMLResponse:
+        """The interactive documentation."""
+        base = request.scope.get("root_path", "")
+        return get_swagger_ui_html(
+            openapi_url=f"{base}/api/openapi.json",
+            title="OSF manipulation: REST interface",
+            swagger_js_url=f"{base}/docs-assets/swagger-ui-bundle.js",
+            swagger_css_url=f"{base}/docs-assets/swagger-ui.css",
+            swagger_favicon_url=f"{base}/docs-assets/favicon.png",
+        )

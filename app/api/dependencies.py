@@ -1,0 +1,94 @@
+"""What request handlers reach for, in one object on the app."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends
+from starlette.requests import HTTPConnection
+
+from app.api.schemas.common import SceneOut
+from app.processes.messages import SceneRecord
+from app.processes.neural_client import NeuralLink
+from app.services.driver import Driver
+from app.services.episodes import Episodes
+from app.services.estimates import Estimates
+from app.services.fields import FieldCatalogue
+from app.services.goals import Goals
+from app.services.predictions import Predictions
+from app.services.runner import Runner
+from app.services.service_settings import Settings
+from app.storage.database import Store
+from app.viewer import Viewer
+from osfcore.errors import OsfError
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.objects.catalogue import CATALOGUE
+
+_FRESH_S = 1.0
+
+
+class Shelf:
+    """The object library, looked through at most once a second."""
+
+    def __init__(self, library: AssetLibrary) -> None:
+        self._library = library
+        self._lock = threading.Lock()
+        self._seen_at = -_FRESH_S
+        self._names: tuple[str, ...] = ()
+        self._labels: dict[str, str] = {name: info.label for name, info in CATALOGUE.items()}
+
+    def names(self) -> tuple[str, ...]:
+        """Objects on this machine."""
+        with self._lock:
+            if time.monotonic() - self._seen_at > _FRESH_S:
+                self._names, self._seen_at = self._library.names(), time.monotonic()
+                for name in self._names:
+                    if name not in self._labels:
+                        self._labels[name] = _label(self._library, name)
+            return self._names
+
+    def labels(self) -> dict[str, str]:
+        """Names for people, by name."""
+        self.names()
+        return self._labels
+
+
+def _label(library: AssetLibrary, name: str) -> str:
+    try:
+        return library.info(name).label
+    except OsfError:  # a damaged user's object still has its name
+        return name
+
+
+@dataclass(frozen=True)
+class Services:
+    """The running parts of one app."""
+
+    settings: Settings
+    store: Store
+    runner: Runner
+    viewer: Viewer
+    shelf: Shelf
+    fields: FieldCatalogue
+    neural: NeuralLink
+    estimates: Estimates
+    predictions: Predictions
+    goals: Goals
+    episodes: Episodes
+    driver: Driver
+    closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
+
+    def scene_out(self, record: SceneRecord) -> SceneOut:
+        """A scene as JSON."""
+        return SceneOut.of(record, self.shelf.labels(), is_current=record.id == self.runner.current)
+
+
+def get_services(connection: HTTPConnection) -> Services:
+    """The services of the app that handles a request or websocket."""
+    return connection.app.state.services
+
+
+ServicesDep = Annotated[Services, Depends(get_services)]

@@ -1,0 +1,138 @@
+"""Errors as RFC 9457 problem+json: one sentence for a person, a status for a program, never a traceback."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from app.api.schemas.common import Problem, ProblemPointer
+from osfcore.errors import OsfError
+
+_log = logging.getLogger(__name__)
+
+STATUS_OF_KIND = {
+    "WrongJobState": 409,
+    "SceneHeld": 409,
+    "TooManyScenes": 409,
+    "TooManySets": 409,
+    "SetInUse": 409,
+    "TrainingAlready": 409,
+    "ShippedField": 409,
+    "MissingFields": 409,
+    "NoScene": 409,
+    "NoTable": 409,
+    "NoDraft": 404,
+    "DraftUnsound": 409,
+    "TooManyGoals": 409,
+    "NothingToPush": 409,
+    "NoPrior": 409,
+    "NoImages": 404,
+    "QueueFull": 429,
+    "StageUnavailable": 503,
+    "StageBusy": 503,
+    "NeuralUnavailable": 503,
+    "NeuralBusy": 503,
+    "CannotStore": 507,
+    "CannotWrite": 507,
+    "CorruptFile": 409,
+    "Internal": 500,
+    "NotFound": 404,
+}
+_TITLES = {
+    400: "Bad request",
+    401: "Token needed",
+    403: "Forbidden",
+    404: "Not found",
+    405: "Method not allowed",
+    409: "Conflict",
+    413: "Request too large",
+    415: "Unsupported media type",
+    421: "Misdirected request",
+    422: "Invalid input",
+    429: "Too many requests",
+    500: "Internal error",
+    503: "Not available now",
+    507: "Out of space",
+}
+
+
+class NotFound(OsfError):
+    """What the path names does not exist."""
+
+
+class ProblemResponse(JSONResponse):
+    """A JSON response of the problem media type."""
+
+    media_type = "application/problem+json"
+
+
+def problem(
+    status: int,
+    detail: str,
+    pointers: list[ProblemPointer] | None = None,
+    headers: dict[str, str] | None = None,
+) -> ProblemResponse:
+    """A problem response."""
+    # Lone surrogates come in through JSON escapes, but no UTF-8 goes out with them.
+    clean = detail.encode("utf-8", "replace").decode("utf-8")
+    body = Problem(title=_TITLES.get(status, "Error"), status=status, detail=clean, errors=pointers)
+    return ProblemResponse(body.model_dump(exclude_none=True), status, headers)
+
+
+def status_of(error: OsfError) -> int:
+    """The HTTP status that says what an error says."""
+    return STATUS_OF_KIND.get(getattr(error, "kind", type(error).__name__), 422)
+
+
+def install(app: FastAPI) -> None:
+    """Make the app answer every error as a problem."""
+    app.add_exception_handler(OsfError, _on_osf_error)
+    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(Exception, _on_defect)
+
+
+async def _on_osf_error(_: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, OsfError)
+    status = status_of(error)
+    return problem(status, str(error), headers={"Retry-After": "2"} if status in (429, 503) else None)
+
+
+async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, HTTPException)
+    detail = str(error.detail)
+    if error.status_code == 404 and detail == "Not Found":
+        detail = f"There is nothing at {request.url.path}."
+    if error.status_code == 405:
+        detail = f"{request.url.path} does not offer {request.method}."
+    return problem(error.status_code, detail, headers=dict(error.headers or {}))
+
+
+async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
+    assert isinstance(error, RequestValidationError)
+    pointers = [_pointer(entry, error.body) for entry in error.errors()]
+    first = pointers[0] if pointers else ProblemPointer(pointer="#", detail="unreadable")
+    more = f" (and {len(pointers) - 1} more)" if len(pointers) > 1 else ""
+    return problem(422, f"{first.pointer or first.parameter}: {first.detail}{more}", pointers)
+
+
+async def _on_defect(request: Request, error: Exception) -> ProblemResponse:
+    _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return problem(500, f"The service failed on this request ({type(error).__name__}); its log tells more.")
+
+
+def _pointer(entry: dict[str, Any], body: object) -> ProblemPointer:
+    """Where and what; the input itself is left out, for it may be NaN, huge or secret."""
+    where, *path = [str(part) for part in entry["loc"]] or ["body"]
+    detail = str(entry["msg"]).encode("utf-8", "replace").decode("utf-8")
+    if where == "body":
+        if path and isinstance(body, dict) and path[0] not in body and path[0] == body.get("kind"):
+            path = path[1:]  # the name of the chosen variant, which is no place in the body
+        escaped = (part.replace("~", "~0").replace("/", "~1") for part in path)
+        return ProblemPointer(pointer="#" + "".join(f"/{part}" for part in escaped), detail=detail)
+    return ProblemPointer(parameter="/".join(path), detail=detail)

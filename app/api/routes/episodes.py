@@ -1,0 +1,150 @@
+"""Episodes: start one, follow it, pause and step it, change how it goes, look at what came of it."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path, Query, Response, status
+from fastapi.responses import FileResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import ValidationError
+
+from app.api.dependencies import Services, ServicesDep
+from app.api.problems import NotFound
+from app.api.routes import PNG, problems
+from app.api.routes.events import followed
+from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
+from app.episodes.file_names import REPORT_FILE
+from app.episodes.frames import Part
+from app.jobs.job import Job
+from osfcore.errors import CorruptFile, UnknownName
+
+router = APIRouter(prefix="/api/episodes", tags=["episodes"], responses=problems())
+_MEDIA_TYPES = {
+    ".json": "application/json",
+    ".csv": "text/csv",
+    ".png": "image/png",
+    ".mp4": "video/mp4",
+    ".viser": "application/octet-stream",
+}
+_FILE = {
+    200: {
+        "content": {
+            **{kind: {"schema": {"type": "string", "format": "binary"}} for kind in _MEDIA_TYPES.values()},
+            "application/json": {"schema": {"type": "object"}},
+        },
+        "description": "The file.",
+    }
+}
+
+
+def _found(services: ServicesDep, episode: Annotated[str, Path(description="Identifier of an episode.")]) -> Job:
+    try:
+        return services.episodes.get(episode)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+
+
+FoundDep = Annotated[Job, Depends(_found)]
+
+
+@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429, 507))
+def create(services: ServicesDep, body: EpisodeIn, response: Response) -> EpisodeOut:
+    """Queue an episode: look, predict, plan, push and look again until the scene is as the goal shows it."""
+    job = services.episodes.start(body.asked())
+    response.headers["Location"] = f"{router.prefix}/{job.id}"
+    return _out(services, job)
+
+
+@router.get("")
+def list_all(services: ServicesDep) -> EpisodeList:
+    """List all episodes, newest first, without their steps."""
+    episodes = services.episodes
+    return EpisodeList(
+        episodes=[EpisodeOut.of_job(job, episodes.settings(job), None, episodes.files(job)) for job in episodes.all()]
+    )
+
+
+@router.get("/{episode}", responses=problems(404, 409))
+def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+    """Tell how an episode is: its steps so far with distances, costs and times, and how it ended."""
+    return _out(services, job)
+
+
+@router.delete("/{episode}", responses=problems(404, 409))
+def cancel(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+    """End an episode, within a second. The steps that it has done are kept."""
+    return _out(services, services.runner.jobs.cancel(job.id))
+
+
+@router.post("/{episode}/pause", responses=problems(404, 409))
+def pause(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+    """Let a running episode rest. Lamp and objects may be moved by hand meanwhile."""
+    return _out(services, services.runner.jobs.pause(job.id))
+
+
+@router.post("/{episode}/resume", responses=problems(404, 409))
+def resume(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+    """Let a paused episode go on."""
+    return _out(services, services.runner.jobs.resume(job.id))
+
+
+@router.post("/{episode}/step", responses=problems(404, 409))
+def step(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+    """Let a paused episode go on to the end of the round, and rest again."""
+    return _out(services, services.runner.jobs.step(job.id))
+
+
+@router.patch("/{episode}/settings", responses=problems(404, 409))
+def change(services: ServicesDep, job: FoundDep, body: SettingsIn) -> EpisodeOut:
+    """Let an episode that runs or pauses go on with other settings; what is left out stays."""
+    return _out(services, services.episodes.change(job, body.given()))
+
+
+@router.get("/{episode}/events", response_class=EventSourceResponse, responses=problems(404))
+async def follow(services: ServicesDep, job: FoundDep) -> AsyncIterator[ServerSentEvent]:
+    """Follow one episode: "job" events as at /api/events, from how it is now to its end."""
+    async for event in followed(services, job):
+        yield event
+
+
+@router.get("/{episode}/frames/{step}.png", response_class=Response, responses={**problems(404, 409), **PNG})
+async def frame(
+    services: ServicesDep,
+    job: FoundDep,
+    step: Annotated[int, Path(ge=0, le=100_000, description="Number of the step, from 0.")],
+    part: Annotated[
+        Part,
+        Query(description="The goal image, the table then, the estimate as the goal camera would see it, how much "
+              "that differs from the goal image, or all of them with the cameras' images."),
+    ] = "all",
+) -> Response:  # fmt: skip
+    """Show one step."""
+    try:
+        png = await asyncio.to_thread(services.episodes.frame, job, step, part)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+    return Response(png, media_type="image/png", headers={"Cache-Control": "max-age=3600"})
+
+
+@router.get("/{episode}/files/{name}", response_class=FileResponse, responses={**problems(404, 409, 507), **_FILE})
+def file(
+    services: ServicesDep, job: FoundDep, name: Annotated[str, Path(description="One of the episode's files.")]
+) -> FileResponse:
+    """Download what an episode has left: report, table of steps, goal image, video, and a recording for the viewer."""
+    try:
+        path = services.episodes.file(job, name)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+    return FileResponse(path, media_type=_MEDIA_TYPES[path.suffix], content_disposition_type="inline", filename=name)
+
+
+def _out(services: Services, job: Job) -> EpisodeOut:
+    episodes = services.episodes
+    settings, files, report = episodes.settings(job), episodes.files(job), episodes.report(job)
+    try:
+        return EpisodeOut.of_job(job, settings, report, files)
+    except (ValidationError, TypeError) as error:
+        if report is None:
+            raise
+        raise CorruptFile(services.runner.jobs.folder(job.id) / REPORT_FILE, "it does not describe steps") from error

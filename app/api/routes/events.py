@@ -1,0 +1,196 @@
+"""The event stream: jobs with replay after a reconnect, the current scene, live images, notices."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import time
+from collections import deque
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from starlette.concurrency import run_in_threadpool
+
+from app.api.dependencies import Services, ServicesDep
+from app.api.routes import problems
+from app.api.routes.driver import DriverOut
+from app.api.schemas.common import FrameEvent, NoticeEvent
+from app.api.schemas.goals import DraftOut
+from app.api.schemas.jobs import JobOut
+from app.jobs.job import Job, JobChanged, job_from_fields
+from app.processes.messages import CurrentScene, FramesTaken, Notice, SceneChanged
+from app.services.driver import DriverChanged
+from app.services.goals import DraftChanged, GoalsChanged
+
+router = APIRouter(prefix="/api", tags=["events"], responses=problems())
+SCENE_INTERVAL_S = 0.1
+FRAME_INTERVAL_S = 0.2
+_MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
+_LOOK_INTERVAL_S = 0.5
+_MAX_EVENT = 2**63 - 1
+
+
+class Mailbox:
+    """What one page has not been told yet: all jobs and notices, but only the latest scene and images."""
+
+    def __init__(self, current: str | None) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._current = current
+        self.letters: deque[JobChanged | Notice | GoalsChanged | DriverChanged] = deque(maxlen=_MAX_WAITING)
+        self.draft: DraftChanged | None = None
+        self.is_scene_new = True
+        self.frames: FramesTaken | None = None
+        self.arrived = asyncio.Event()
+
+    def put(self, event: object) -> None:
+        """Take note of an event, in whatever thread."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._put, event)
+
+    async def next_job(self, job: str) -> JobChanged | None:
+        """The next letter about a job; None if there is none for a while."""
+        while self.letters:
+            letter = self.letters.popleft()
+            if isinstance(letter, JobChanged) and letter.job.id == job:
+                return letter
+        self.arrived.clear()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.arrived.wait(), _LOOK_INTERVAL_S)
+        return None
+
+    def _put(self, event: object) -> None:
+        match event:
+            case JobChanged() | Notice() | GoalsChanged() | DriverChanged():
+                self.letters.append(event)
+            case DraftChanged():
+                self.draft = event
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+                self.is_scene_new, self.frames = True, None
+            case SceneChanged(record):
+                self.is_scene_new = self.is_scene_new or record.id == self._current
+            case FramesTaken():
+                self.frames = event if event.scene == self._current else self.frames
+        self.arrived.set()
+
+
+@router.get("/events", response_class=EventSourceResponse)
+async def stream(
+    services: ServicesDep,
+    frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
+    visitor: Annotated[
+        str | None,
+        Query(min_length=1, max_length=64, pattern="^[A-Za-z0-9_-]+$", description="What the page calls itself."),
+    ] = None,
+    last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow what happens: "job", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
+    mailbox = Mailbox(services.runner.current)
+    leave = services.runner.hub.subscribe(mailbox.put)
+    is_watching = has_arrived = False
+    try:
+        if frames:
+            is_watching = True  # before the call: a page that leaves during it must be counted out again
+            await run_in_threadpool(services.runner.watch_frames, 1)
+        if visitor is not None:
+            has_arrived = True
+            services.driver.arrive(visitor)
+        yield ServerSentEvent(comment="connected", retry=1000)
+        if services.goals.draft is not None:
+            yield _draft_event(services, DraftChanged(services.goals.draft))
+        last = 0
+        if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
+            last = min(int(last_event_id[:19]), _MAX_EVENT)
+            for number, fields in await run_in_threadpool(services.store.events_after, last):
+                last = number
+                yield job_event(number, job_from_fields(fields))
+        async for event in _follow(services, mailbox, last, wants_frames=frames):
+            yield event
+    finally:
+        leave()
+        if visitor is not None and has_arrived:
+            services.driver.leave(visitor)
+        if is_watching:
+            services.runner.watch_frames(-1)
+
+
+async def _follow(
+    services: Services, mailbox: Mailbox, last: int, *, wants_frames: bool
+) -> AsyncIterator[ServerSentEvent]:
+    scene_at = frame_at = 0.0
+    while not services.closing.is_set():
+        while mailbox.letters:
+            letter = mailbox.letters.popleft()
+            match letter:
+                case Notice():
+                    yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
+                case GoalsChanged():
+                    yield ServerSentEvent(event="goals", raw_data="null")
+                case DriverChanged():
+                    yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
+                case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
+                    yield job_event(letter.event, letter.job)
+        if mailbox.draft is not None:
+            changed, mailbox.draft = mailbox.draft, None
+            yield _draft_event(services, changed)
+        now = time.monotonic()
+        if mailbox.is_scene_new and now >= scene_at:
+            mailbox.is_scene_new, scene_at = False, now + SCENE_INTERVAL_S
+            yield _scene_event(services)
+        if mailbox.frames is not None and now >= frame_at:
+            taken, mailbox.frames, frame_at = mailbox.frames, None, now + FRAME_INTERVAL_S
+            if wants_frames:
+                yield ServerSentEvent(event="frame", data=_frame(taken))
+        mailbox.arrived.clear()
+        due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)
+        timeout = min([_LOOK_INTERVAL_S, *(max(at - time.monotonic(), 0.001) for at in due)])
+        if due:
+            await asyncio.sleep(timeout)
+        elif not mailbox.letters:
+            try:
+                await asyncio.wait_for(mailbox.arrived.wait(), timeout)
+            except TimeoutError:
+                continue
+
+
+async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEvent]:
+    """Events of one job, from how it is now to its end."""
+    mailbox = Mailbox(None)
+    leave = services.runner.hub.subscribe(mailbox.put)
+    try:
+        now = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        yield job_event(0, now)
+        while not now.is_finished and not services.closing.is_set():
+            letter = await mailbox.next_job(job.id)
+            if letter is not None:
+                now = letter.job
+                yield job_event(letter.event, now)
+    finally:
+        leave()
+
+
+def job_event(number: int, job: Job) -> ServerSentEvent:
+    """A job as an event; the number is 0 where nothing came after it that could be asked for."""
+    return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
+
+
+def _scene_event(services: Services) -> ServerSentEvent:
+    current = services.runner.current
+    record = next((r for r in services.runner.scenes() if r.id == current), None)
+    if record is None:
+        return ServerSentEvent(event="scene", raw_data="null")
+    return ServerSentEvent(event="scene", data=services.scene_out(record))
+
+
+def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
+    if changed.draft is None:
+        return ServerSentEvent(event="draft", raw_data="null")
+    return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.shelf.labels()))
+
+
+def _frame(taken: FramesTaken) -> FrameEvent:
+    urls = ("data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii") for jpeg in taken.jpegs)
+    return FrameEvent(scene=taken.scene, revision=taken.revision, cameras=dict(zip(taken.names, urls, strict=True)))

@@ -1,0 +1,118 @@
+"""Fields, and the image sets that people upload to train them from."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Path, Query, Request, Response, status
+from fastapi.responses import FileResponse
+from starlette.requests import ClientDisconnect
+
+from app.api.dependencies import Services, ServicesDep
+from app.api.problems import NotFound
+from app.api.routes import PNG, problems
+from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
+from app.services.image_sets import SetRecord
+from osfcore.errors import UnknownName
+from osfcore.fields.field_library import FieldInfo
+
+UPLOAD_PATH = "/api/fields/sets"
+NEEDS_MESH = "It needs a mesh of the same name before scenes can hold it; add one with 'osf assets add'."
+router = APIRouter(prefix="/api/fields", tags=["fields"], responses=problems())
+FieldName = Annotated[str, Path(examples=["006_mustard_bottle"])]
+SetId = Annotated[str, Path(description="Identifier of an image set.")]
+_ZIP_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.get("")
+def list_all(services: ServicesDep) -> FieldList:
+    """List the fields: what is shipped with the program and what was trained here."""
+    return FieldList(fields=[_out(services, info) for info in services.fields.all()])
+
+
+@router.post("/sets", status_code=status.HTTP_201_CREATED, responses=problems(409, 507), openapi_extra=_ZIP_BODY)
+async def upload_set(
+    services: ServicesDep,
+    request: Request,
+    response: Response,
+    file_name: Annotated[str, Query(max_length=200, description="What the zip is called, for people.")] = "set.zip",
+) -> SetOut:
+    """Upload a zipped image set in the OSF format: train/anno.json, test/anno.json and RGBA PNGs beside them."""
+    try:
+        record = await services.runner.sets.receive(request.stream(), file_name)
+    except ClientDisconnect:
+        raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
+    response.headers["Location"] = f"{UPLOAD_PATH}/{record.id}"
+    return SetOut.of(record)
+
+
+@router.get("/sets")
+def list_sets(services: ServicesDep) -> SetList:
+    """List the uploaded image sets, oldest first."""
+    return SetList(sets=[SetOut.of(record) for record in services.runner.sets.all()])
+
+
+@router.get("/sets/{set_id}", responses=problems(404))
+def get_set(services: ServicesDep, set_id: SetId) -> SetOut:
+    """Tell what is in an uploaded image set."""
+    return SetOut.of(_found_set(services, set_id))
+
+
+@router.delete("/sets/{set_id}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507))
+def delete_set(services: ServicesDep, set_id: SetId) -> None:
+    """Delete an uploaded image set."""
+    _found_set(services, set_id)
+    services.runner.remove_set(set_id)
+
+
+@router.get("/sets/{set_id}/overlay.png", response_class=FileResponse, responses={**problems(404), **PNG})
+def overlay(services: ServicesDep, set_id: SetId) -> FileResponse:
+    """Show how a set was understood: axes, light and the silhouettes' box, drawn into some of its images."""
+    _found_set(services, set_id)
+    path = services.runner.sets.overlay(set_id)
+    if not path.is_file():
+        raise NotFound(f"The overlay of image set {set_id} has been removed from the data directory.")
+    return FileResponse(path, media_type="image/png")
+
+
+@router.get("/{name}", responses=problems(404))
+def get(services: ServicesDep, name: FieldName) -> FieldOut:
+    """Tell what is known of one field."""
+    return _out(services, _found(services, name))
+
+
+@router.delete("/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507))
+def delete(services: ServicesDep, name: FieldName) -> None:
+    """Delete a field that was trained here; a shipped one of the same name then counts again."""
+    _found(services, name)
+    services.fields.remove(name)
+
+
+def _out(services: Services, info: FieldInfo) -> FieldOut:
+    has_mesh = services.fields.has_mesh(info.name)
+    return FieldOut(
+        name=info.name,
+        label=services.shelf.labels().get(info.name, info.name),
+        source=info.source,
+        bytes=info.bytes,
+        metrics=dict(info.metrics),
+        has_mesh=has_mesh,
+        note=None if has_mesh else NEEDS_MESH,
+    )
+
+
+def _found(services: Services, name: str) -> FieldInfo:
+    try:
+        return services.fields.get(name)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+
+
+def _found_set(services: Services, set_id: str) -> SetRecord:
+    try:
+        return services.runner.sets.get(set_id)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None

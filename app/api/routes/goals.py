@@ -1,0 +1,169 @@
+"""Goals: photos of how the table should look. Upload one, compose one by hand, draw one at random."""
+
+import json
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response, status
+from fastapi.responses import FileResponse
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from app.api.bodies import JSON, kind_of, parsed, whole_body
+from app.api.dependencies import Services, ServicesDep
+from app.api.problems import NotFound
+from app.api.routes import PNG, problems
+from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
+from app.services.goals import Draft, NoDraft
+from app.storage.goal_store import GoalRecord
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.geometry.cameras import Camera
+from osfcore.io.scene_file import camera_from_json
+
+UPLOAD_PATH = "/api/goals"
+PHOTOS = ("image/png", "image/jpeg")
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "A photo, or JSON for a goal that is made from a scene of the simulation.",
+        "content": {
+            JSON: {"schema": {"$ref": "#/components/schemas/GoalIn"}, "example": {"random": {"seed": 0}}},
+            **dict.fromkeys(PHOTOS, _BINARY),
+        },
+    }
+}
+router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems())
+
+
+def _found(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
+    try:
+        return services.goals.get(goal)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+
+
+FoundDep = Annotated[GoalRecord, Depends(_found)]
+
+
+@router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409, 415, 503, 507), openapi_extra=_BODY)
+async def create(
+    services: ServicesDep,
+    request: Request,
+    response: Response,
+    name: Annotated[str, Query(min_length=1, max_length=100, description="Of a photo, for people.")] = "Photo",
+    camera: Annotated[
+        str | None,
+        Query(max_length=4000, description="Of a photo: its camera as JSON, as in scene.json; else the goal camera."),
+    ] = None,
+) -> GoalOut:
+    """Keep a photo (PNG or JPEG) of how the table should look, or make a goal image of objects that lie elsewhere.
+
+    A photo shows the table without the pusher, as the scenes' goal camera sees it unless `camera` says otherwise.
+    """
+    kind = kind_of(request)
+    try:
+        if kind in PHOTOS:
+            data = await whole_body(request, services.settings.max_photo_bytes)
+            seen_by = None if camera is None else _camera(camera)
+            record = await run_in_threadpool(services.goals.receive, data, name, seen_by)
+        elif kind == JSON:
+            body = parsed(GoalIn, await whole_body(request, services.settings.max_body_bytes))
+            record = await run_in_threadpool(_made, services, body)
+        else:
+            allowed = f"{' or '.join(PHOTOS)} for a photo, or {JSON}"
+            raise HTTPException(
+                status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, f"The body is {kind or 'untyped'}, but it must be {allowed}."
+            )
+    except ClientDisconnect:
+        raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
+    response.headers["Location"] = f"{UPLOAD_PATH}/{record.id}"
+    return GoalOut.of(record)
+
+
+@router.get("")
+def list_all(services: ServicesDep) -> GoalList:
+    """List all goals, newest first."""
+    return GoalList(goals=[GoalOut.of(record) for record in services.goals.all()])
+
+
+@router.post("/draft", status_code=status.HTTP_201_CREATED, responses=problems(409, 503))
+def begin(services: ServicesDep, body: DraftIn) -> DraftOut:
+    """Begin to compose a goal, from where the objects are now. All visitors see the same draft."""
+    return _draft_out(services, services.goals.begin_draft(body.scene))
+
+
+@router.get("/draft", responses=problems(404))
+def draft(services: ServicesDep) -> DraftOut:
+    """Tell what is being composed."""
+    found = services.goals.draft
+    if found is None:
+        raise NotFound(str(NoDraft()))
+    return _draft_out(services, found)
+
+
+@router.patch("/draft", responses=problems(404, 409, 503))
+def lay_out(services: ServicesDep, body: DraftPatch) -> DraftOut:
+    """Put objects of the draft elsewhere; where they cannot be, `problem` says so."""
+    return _draft_out(services, services.goals.move_draft(body.named_poses()))
+
+
+@router.delete("/draft", status_code=status.HTTP_204_NO_CONTENT)
+def drop(services: ServicesDep) -> None:
+    """End composing without keeping anything."""
+    services.goals.drop_draft()
+
+
+@router.get("/draft/image.png", response_class=Response, responses={**problems(404), **PNG})
+def draft_image(services: ServicesDep) -> Response:
+    """Show what the goal camera would see; while there is a problem, the last image without."""
+    return Response(services.goals.draft_image(), media_type="image/png", headers={"Cache-Control": "no-store"})
+
+
+@router.post("/draft/save", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 507))
+def save(services: ServicesDep, body: DraftKeep, response: Response) -> GoalOut:
+    """Keep the draft as a goal, and end composing."""
+    record = services.goals.keep_draft(body.name)
+    response.headers["Location"] = f"{UPLOAD_PATH}/{record.id}"
+    return GoalOut.of(record)
+
+
+@router.get("/{goal}", responses=problems(404))
+def get(record: FoundDep) -> GoalOut:
+    """Tell about a goal."""
+    return GoalOut.of(record)
+
+
+@router.get("/{goal}/image.png", response_class=FileResponse, responses={**problems(404), **PNG})
+def image(services: ServicesDep, record: FoundDep) -> FileResponse:
+    """Show a goal."""
+    path = services.goals.image(record.id)
+    if not path.is_file():
+        raise NotFound(f"The image of goal {record.id} has been removed from the data directory.")
+    return FileResponse(path, media_type="image/png")
+
+
+@router.delete("/{goal}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))
+def remove(services: ServicesDep, record: FoundDep) -> None:
+    """Delete a goal; episodes that had it keep their own copy."""
+    services.goals.remove(record.id)
+
+
+def _made(services: Services, body: GoalIn) -> GoalRecord:
+    light = None if body.light is None else body.light.light()
+    if body.random is not None:
+        return services.goals.draw(body.scene, body.random.seed, body.random.moved, body.name, light)
+    poses = tuple(entry.named_pose() for entry in body.objects or ())
+    return services.goals.compose(body.scene, poses, body.name, light)
+
+
+def _draft_out(services: Services, draft: Draft) -> DraftOut:
+    return DraftOut.of(draft, services.shelf.labels())
+
+
+def _camera(text: str) -> Camera:
+    try:
+        return camera_from_json(json.loads(text))
+    except OsfError:
+        raise
+    except (ValueError, RecursionError):
+        raise InvalidInput("camera", text[:60], "a JSON object as in scene.json") from None

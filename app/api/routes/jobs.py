@@ -1,0 +1,95 @@
+"""Long work: start, follow, pause, cancel, download."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Path, Response, status
+from fastapi.responses import FileResponse
+
+from app.api.dependencies import Services, ServicesDep
+from app.api.problems import NotFound
+from app.api.routes import PNG, problems
+from app.api.schemas.jobs import JobIn, JobList, JobOut
+from app.jobs.job import Job, check_file_name
+from app.jobs.kinds.fields import PREVIEW
+from osfcore.errors import UnknownName
+
+router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems())
+FileName = Annotated[str, Path(description="One of the job's files.")]
+JobId = Annotated[str, Path(description="Identifier of a job.")]
+_FILE = {
+    200: {
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "description": "The file.",
+    }
+}
+
+
+@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429))
+def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Response) -> JobOut:
+    """Queue a job; one runs at a time. Outputs go to the data directory's collections/ID."""
+    job = services.runner.submit_job(body.kind, body.params.model_dump())
+    response.headers["Location"] = f"/api/jobs/{job.id}"
+    return JobOut.of(job)
+
+
+@router.get("")
+async def list_all(services: ServicesDep) -> JobList:
+    """List all jobs, newest first."""
+    return JobList(jobs=[JobOut.of(job) for job in services.runner.jobs.all()])
+
+
+@router.get("/{job}", responses=problems(404))
+async def get(services: ServicesDep, job: JobId) -> JobOut:
+    """Tell how a job is."""
+    return JobOut.of(_found(services, job))
+
+
+@router.delete("/{job}", responses=problems(404, 409))
+def cancel(services: ServicesDep, job: JobId) -> JobOut:
+    """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
+    _found(services, job)
+    return JobOut.of(services.runner.jobs.cancel(job))
+
+
+@router.post("/{job}/pause", responses=problems(404, 409))
+def pause(services: ServicesDep, job: JobId) -> JobOut:
+    """Let a running job rest after its current step. It keeps its turn."""
+    _found(services, job)
+    return JobOut.of(services.runner.jobs.pause(job))
+
+
+@router.post("/{job}/resume", responses=problems(404, 409))
+def resume(services: ServicesDep, job: JobId) -> JobOut:
+    """Let a paused job go on."""
+    _found(services, job)
+    return JobOut.of(services.runner.jobs.resume(job))
+
+
+@router.get("/{job}/files/{name}", response_class=FileResponse, responses={**problems(404), **_FILE})
+def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
+    """Download what a job has made."""
+    found = _found(services, job)
+    try:
+        path = services.runner.jobs.folder(job) / check_file_name(found, name)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
+    if not path.is_file():
+        raise NotFound(f"{name} of job {job} has been removed from the data directory.")
+    return FileResponse(path, filename=name, media_type="application/octet-stream")
+
+
+@router.get("/{job}/preview.png", response_class=FileResponse, responses={**problems(404), **PNG})
+def preview(services: ServicesDep, job: JobId) -> FileResponse:
+    """Show one unseen image of a field in training: the truth, the field's, and their difference times four."""
+    _found(services, job)
+    path = services.runner.jobs.folder(job) / PREVIEW
+    if not path.is_file():
+        raise NotFound(f"Job {job} has no preview; training a field makes one, some seconds after it has begun.")
+    return FileResponse(path, media_type="image/png", headers={"Cache-Control": "no-store"})
+
+
+def _found(services: Services, job: str) -> Job:
+    try:
+        return services.runner.jobs.get(job)
+    except UnknownName as error:
+        raise NotFound(str(error)) from None

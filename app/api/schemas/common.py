@@ -1,0 +1,277 @@
+"""Requests and responses of the REST interface; the one place where core dataclasses become JSON.
+
+Lengths in metres, time in seconds, quaternions (w, x, y, z), world z up with the table top at z = 0.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from app.processes.messages import SceneRecord
+from app.services.runner import MAX_SEED
+from osfcore.geometry.cameras import (
+    DEFAULT_IMAGE_SIDE,
+    MAX_IMAGE_SIDE,
+    MIN_IMAGE_SIDE,
+    Camera,
+    default_cameras,
+    goal_camera,
+)
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.objects.asset import ObjectInfo
+
+Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+# Bounds far beyond anything on a table keep numbers away whose squares overflow.
+Component = Annotated[FiniteFloat, Field(ge=-1.1, le=1.1)]
+Coordinate = Annotated[FiniteFloat, Field(ge=-100, le=100)]
+Quaternion = Annotated[list[Component], Field(min_length=4, max_length=4, description="Unit quaternion (w, x, y, z).")]
+Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3, description="[m], world frame.")]
+Velocity = Annotated[
+    Vector3, Field(description="Pusher velocity (vx, vy, 0) [m/s], |vx| and |vy| at most 0.3, held for 0.2 s.")
+]
+Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
+Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
+Matrix4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
+ImageSize = Annotated[int, Field(ge=MIN_IMAGE_SIDE, le=MAX_IMAGE_SIDE, description="Side of the square images [px].")]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+ObjectName = Annotated[str, Field(min_length=1, max_length=64, examples=["006_mustard_bottle"])]
+
+
+class Input(BaseModel):
+    """What comes in: unknown fields and wrong types are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class ProblemPointer(BaseModel):
+    """One thing that is wrong with a request."""
+
+    pointer: str | None = Field(default=None, description="JSON pointer into the request body.")
+    parameter: str | None = Field(default=None, description="Name of the path, query or header parameter.")
+    detail: str
+
+
+class Problem(BaseModel):
+    """An error, as in RFC 9457."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = Field(description="One sentence for a person.")
+    errors: list[ProblemPointer] | None = None
+
+
+class Health(BaseModel):
+    """Whether and how the service runs."""
+
+    status: Literal["ok"]
+    version: str
+    uptime_s: float = Field(description="Since the start [s].")
+    objects_available: int
+    stage: Literal["starting", "ready", "restarting"] = Field(description="The process that simulates.")
+
+
+class SymmetryOut(BaseModel):
+    """Which rotations an eye cannot tell apart."""
+
+    kind: Literal["none", "discrete", "continuous"]
+    reason: str
+
+
+class ObjectOut(BaseModel):
+    """An object of the catalogue or one that a user added."""
+
+    name: str
+    label: str
+    mass_kg: float = Field(description="[kg]")
+    size_m: Vector3 | None = Field(description="Extents of the bounding box [m]; null until it has been fetched.")
+    symmetry: SymmetryOut
+    licence: str
+    attribution: str
+    available: bool = Field(description="Whether it is on this machine and can be used in scenes.")
+
+    @staticmethod
+    def of(info: ObjectInfo, size_m: np.ndarray | None) -> ObjectOut:
+        """From catalogue facts."""
+        return ObjectOut(
+            name=info.name,
+            label=info.label,
+            mass_kg=info.mass_kg,
+            size_m=None if size_m is None else size_m.tolist(),
+            symmetry=SymmetryOut(kind=info.symmetry.kind, reason=info.symmetry.reason),
+            licence=info.licence,
+            attribution=info.attribution,
+            available=size_m is not None,
+        )
+
+
+class ObjectList(BaseModel):
+    """All known objects."""
+
+    objects: list[ObjectOut]
+
+
+class LightIn(Input):
+    """A distant light; only its direction counts."""
+
+    position: Position = Field(
+        description="From the table's centre toward the light [m]; brought to length 1; at least 5 deg up.",
+        examples=[[0.3, -0.4, 0.8]],
+    )
+
+    def light(self) -> Light:
+        """The light; raises InvalidInput if it is too low."""
+        return Light(np.array(self.position))
+
+
+class ObjectPose(Input):
+    """Where one object is, or shall be."""
+
+    name: ObjectName
+    position: Position
+    quaternion: Quaternion
+
+    def named_pose(self) -> tuple[str, Pose]:
+        """Name and pose, unchecked."""
+        return self.name, Pose(np.array(self.position), np.array(self.quaternion))
+
+
+class SceneIn(Input):
+    """What a new scene shall contain; everything left out is drawn from the seed."""
+
+    objects: list[ObjectName] | None = Field(None, min_length=1, max_length=MAX_OBJECTS, description="Which objects.")
+    count: int = Field(3, ge=1, le=MAX_OBJECTS, description="How many objects, where they are not named.")
+    seed: Seed | None = Field(None, description="The same seed gives the same scene; null for any.")
+    light: LightIn | None = None
+    poses: list[ObjectPose] | None = Field(
+        None, min_length=1, max_length=MAX_OBJECTS, description="Exact poses, instead of random resting ones."
+    )
+    image_size: ImageSize = DEFAULT_IMAGE_SIDE
+
+
+class ScenePatch(Input):
+    """What to move by hand, all or nothing."""
+
+    light: LightIn | None = None
+    objects: list[ObjectPose] | None = Field(None, max_length=MAX_OBJECTS)
+
+
+class ActionsIn(Input):
+    """Velocities of the pusher, one after the other."""
+
+    actions: list[Velocity] = Field(min_length=1, max_length=50, examples=[[[0.2, 0.0, 0.0]]])
+
+
+class SceneObject(BaseModel):
+    """An object on the table."""
+
+    name: str
+    label: str
+    position: Position
+    quaternion: Quaternion
+
+
+class PointOut(BaseModel):
+    """A place in the world."""
+
+    position: Position
+
+
+class CameraOut(BaseModel):
+    """A pinhole camera with OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+
+    name: str
+    T_world_camera: Matrix4 = Field(description="Maps camera coordinates to world coordinates [m].")
+    K: Matrix3 = Field(description="Intrinsics [px].")
+    width: int = Field(description="[px]")
+    height: int = Field(description="[px]")
+
+    @staticmethod
+    def of(camera: Camera) -> CameraOut:
+        """From the core's camera."""
+        return CameraOut(
+            name=camera.name,
+            T_world_camera=camera.T_world_camera.matrix().tolist(),
+            K=camera.intrinsics.tolist(),
+            width=camera.width,
+            height=camera.height,
+        )
+
+
+class SceneOut(BaseModel):
+    """A scene as it is now."""
+
+    id: str
+    seed: int
+    created_at: str = Field(description="UTC, ISO 8601.")
+    is_current: bool = Field(description="Whether it is the one that viewer and page show.")
+    time_s: float = Field(description="Simulated time since creation or reset [s].")
+    objects: list[SceneObject]
+    light: PointOut
+    pusher: PointOut | None = Field(description="Centre of the pusher.")
+    cameras: list[CameraOut]
+    image_size: int = Field(description="[px]")
+    revision: int = Field(description="Grows with every change.")
+
+    @staticmethod
+    def of(record: SceneRecord, labels: dict[str, str], *, is_current: bool) -> SceneOut:
+        """From the stage's record."""
+        state = record.state
+        poses = [(name, state.pose(name)) for name in state.names]
+        return SceneOut(
+            id=record.id,
+            seed=record.seed,
+            created_at=record.created_at,
+            is_current=is_current,
+            time_s=round(record.time_s, 6),
+            objects=[
+                SceneObject(
+                    name=name,
+                    label=labels.get(name, name),
+                    position=pose.position.tolist(),
+                    quaternion=pose.quaternion.tolist(),
+                )
+                for name, pose in poses
+            ],
+            light=PointOut(position=state.light.position.tolist()),
+            pusher=None if state.pusher is None else PointOut(position=state.pusher.tolist()),
+            cameras=_cameras(record.image_size),
+            image_size=record.image_size,
+            revision=record.revision,
+        )
+
+
+_CAMERAS: dict[int, list[CameraOut]] = {}
+
+
+def _cameras(size: int) -> list[CameraOut]:
+    if size not in _CAMERAS:
+        _CAMERAS[size] = [CameraOut.of(camera) for camera in (*default_cameras(size), goal_camera(size))]
+    return _CAMERAS[size]
+
+
+class SceneList(BaseModel):
+    """All scenes, oldest first."""
+
+    scenes: list[SceneOut]
+    current: str | None = Field(description="Identifier of the scene that is shown.")
+
+
+class FrameEvent(BaseModel):
+    """Live images, the data of a "frame" event."""
+
+    scene: str
+    revision: int
+    cameras: dict[str, str] = Field(description="Camera name to JPEG data URL.")
+
+
+class NoticeEvent(BaseModel):
+    """A sentence for whoever watches, the data of a "notice" event."""
+
+    level: Literal["info", "warning", "error"]
+    text: str

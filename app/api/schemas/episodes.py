@@ -1,0 +1,197 @@
+"""Requests and responses that concern episodes and their settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
+
+from app.api.schemas.common import Input, Seed
+from app.api.schemas.goals import Poses, SceneRef
+from app.jobs.job import Job, State
+from app.services.episodes import AskedEpisode, flat
+from osfcore.control.episode_settings import MAX_STEPS, CostKind, EpisodeSettings
+from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
+
+SAMPLES, HORIZON, STEPS, TEMPERATURE = (8, MAX_SEQUENCES), (1, MAX_HORIZON), (1, MAX_STEPS), (1e-6, 1e6)
+
+
+def _between(bounds: tuple[float, float], text: str) -> Any:  # noqa: ANN401  what pydantic's Field returns
+    return Field(None, ge=bounds[0], le=bounds[1], description=text)
+
+
+class SettingsIn(Input):
+    """What shall be other than by default, or than before."""
+
+    steps: int | None = _between(STEPS, "Actions at most, of 0.2 s each.")
+    replan_every: int | None = _between(STEPS, "Actions executed of each plan.")
+    cost: CostKind | None = Field(
+        None, description='"pose" compares futures with where things are in the goal image, "image" rendered pixels.'
+    )
+    samples: int | None = _between(SAMPLES, "Sequences of actions in each round of a plan.")
+    horizon: int | None = _between(HORIZON, "Actions in each.")
+    temperature: float | None = _between(TEMPERATURE, "Of the softmax, as a share of the spread of costs.")
+    planning: bool | None = Field(None, description="Draw plans; where not, the last plan is followed to its end.")
+    acting: bool | None = Field(None, description="Execute plans; where not, the table is only watched.")
+    despite_doubts: bool | None = Field(None, description="Go on with a goal image that is not explained well.")
+
+    def given(self) -> dict[str, Any]:
+        """Those that were."""
+        return self.model_dump(exclude_none=True)
+
+
+class EpisodeIn(Input):
+    """An episode: give either goal or poses."""
+
+    scene: SceneRef
+    goal: str | None = Field(None, min_length=1, max_length=64, description="Identifier of a goal image.")
+    poses: Poses | None = Field(None, description="Where all objects shall be.")
+    seed: Seed = 0
+    settings: SettingsIn = SettingsIn()  # pyright: ignore[reportCallIssue]
+
+    def asked(self) -> AskedEpisode:
+        """What the service's own modules take."""
+        poses = None if self.poses is None else tuple(entry.named_pose() for entry in self.poses)
+        return AskedEpisode(self.scene, self.goal, poses, self.seed, self.settings.given())
+
+
+class SettingsOut(BaseModel):
+    """How an episode goes."""
+
+    steps: int
+    replan_every: int
+    cost: CostKind
+    samples: int
+    horizon: int
+    temperature: float
+    planning: bool
+    acting: bool
+    despite_doubts: bool
+
+
+Bounds = Annotated[list[float], Field(min_length=2, max_length=2, description="Least and most.")]
+
+
+class SettingBounds(BaseModel):
+    """Which numbers are allowed."""
+
+    steps: Bounds
+    replan_every: Bounds
+    samples: Bounds
+    horizon: Bounds
+    temperature: Bounds
+
+
+class EpisodeSettingsOut(BaseModel):
+    """Defaults and bounds of an episode's settings."""
+
+    defaults: SettingsOut
+    bounds: SettingBounds
+
+
+class ServiceSettings(BaseModel):
+    """What can be set, and what it is where nothing is said."""
+
+    episode: EpisodeSettingsOut
+
+    @staticmethod
+    def now() -> ServiceSettings:
+        """Of this version."""
+        bounds = SettingBounds(
+            steps=list(STEPS),
+            replan_every=list(STEPS),
+            samples=list(SAMPLES),
+            horizon=list(HORIZON),
+            temperature=list(TEMPERATURE),
+        )
+        defaults = SettingsOut(**flat(EpisodeSettings()))
+        return ServiceSettings(episode=EpisodeSettingsOut(defaults=defaults, bounds=bounds))
+
+
+class NoticeOut(BaseModel):
+    """Something that was noticed on the way."""
+
+    step: int
+    matter: str = Field(description='"goal", "lamp", "object", "lost", "found" or "stalled".')
+    text: str
+
+
+class EpisodeStepOut(BaseModel):
+    """One round of the loop, or how it was before the first."""
+
+    step: int = Field(description="Actions executed so far.")
+    seconds: dict[str, float] = Field(description='Spent on "first", "goal", "estimate", "plan" and "act" [s].')
+    image_cost: float = Field(description="Mean squared difference of goal image and rendered estimate.")
+    ssim: float | None = Field(
+        None, description="Their structural similarity, 1 for equal images; null in episodes of earlier versions."
+    )
+    to_goal_mm: dict[str, float] = Field(description="Of each object, as estimated [mm].")
+    to_goal_deg: dict[str, float] = Field(description="Likewise [deg].")
+    estimate_off_mm: dict[str, float] = Field(description="Simulation only: errors of the estimate [mm].")
+    truly_to_goal_mm: dict[str, float] | None = Field(
+        None, description="Simulation only: true distances [mm]; null where nobody knows the truth of the goal."
+    )
+
+
+class EpisodeOut(BaseModel):
+    """An episode as it is now."""
+
+    id: str
+    scene: str
+    goal: str | None = Field(description="Identifier of the goal image; null where poses were given.")
+    objects: list[str]
+    seed: int
+    settings: SettingsOut
+    status: State
+    position: int | None = Field(description="Place in the queue, 1 is next; null when not queued.")
+    done: int = Field(description="Actions executed.")
+    total: int = Field(description="Actions at most.")
+    stage: Literal["first", "goal", "plan", "act", "next", "search"] | None
+    note: str
+    eta_s: float | None = Field(description="Estimated time left, if all actions are needed [s].")
+    created_at: str
+    started_at: str | None
+    finished_at: str | None
+    error: str | None
+    outcome: Literal["reached", "out of steps", "refused"] | None
+    text: str | None = Field(description="The outcome in a sentence.")
+    notices: list[NoticeOut]
+    steps: list[EpisodeStepOut]
+    files: list[str] = Field(description="Names to download from /api/episodes/{id}/files/{name}.")
+
+    @staticmethod
+    def of_job(
+        job: Job, settings: EpisodeSettings, report: dict[str, Any] | None, files: tuple[str, ...]
+    ) -> EpisodeOut:
+        """From the registry's job and what it has written so far."""
+        report, result = report or {}, job.result or {}
+        return EpisodeOut(
+            id=job.id,
+            scene=job.params["scene"],
+            goal=job.params["goal"]["id"],
+            objects=job.params["names"],
+            seed=job.params["seed"],
+            settings=SettingsOut(**flat(settings)),
+            status=job.state,
+            position=job.position,
+            done=job.done,
+            total=job.total,
+            stage=result.get("stage"),
+            note=job.note,
+            eta_s=job.eta_s,
+            created_at=job.created_at,
+            started_at=job.started_at,
+            finished_at=job.finished_at,
+            error=job.error,
+            outcome=result.get("outcome"),
+            text=result.get("text"),
+            notices=[NoticeOut(**notice) for notice in report.get("noticed", ())],
+            steps=[EpisodeStepOut.model_validate(step) for step in report.get("steps", ())],
+            files=list(files),
+        )
+
+
+class EpisodeList(BaseModel):
+    """Episodes, newest first, without their steps."""
+
+    episodes: list[EpisodeOut]

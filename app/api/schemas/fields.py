@@ -1,0 +1,49 @@
+"""Requests and responses that concern fields and the image sets that they are trained from."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+from app.services.image_sets import SetRecord
+
+
+class FieldOut(BaseModel):
+    """A trained field."""
+
+    name: str
+    label: str
+    source: Literal["shipped", "trained"] = Field(description="With the program, or trained on this machine.")
+    bytes: int = Field(description="Size of the weights.")
+    metrics: dict[str, Any] = Field(description="What was measured on unseen views under unseen lights [dB].")
+    has_mesh: bool = Field(description="Whether scenes can simulate it: they need a mesh of the same name.")
+    note: str | None = Field(description="What is missing, in words.")
+
+
+class FieldList(BaseModel):
+    """All fields, sorted by name."""
+
+    fields: list[FieldOut]
+
+
+class SetOut(BaseModel):
+    """An uploaded image set that was found sound."""
+
+    id: str
+    file_name: str
+    created_at: str = Field(description="UTC, ISO 8601.")
+    train: int = Field(description="Images to learn from.")
+    test: int = Field(description="Images that only measure.")
+    summary: str
+
+    @staticmethod
+    def of(record: SetRecord) -> SetOut:
+        """From the store of sets."""
+        return SetOut.model_validate(record, from_attributes=True)
+
+
+class SetList(BaseModel):
+    """Uploaded image sets, oldest first."""
+
+    sets: list[SetOut]

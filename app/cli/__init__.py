@@ -1,0 +1,1 @@
+"""The command line `osf`: one dataclass per command, from which tyro makes the options."""

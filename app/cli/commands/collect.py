@@ -1,0 +1,160 @@
+"""`osf collect`: image sets, pushes and observations from the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from app.cli.progress_bar import follow
+from app.cli.workers import worker_pool
+from app.storage.paths import default_data_dir
+
+
+@dataclass(frozen=True)
+class CollectObjectCommand:
+    """Images of one object from all sides under lights from all directions, in the OSF format."""
+
+    name: tyro.conf.Positional[str]
+    """Name of the object, such as 006_mustard_bottle."""
+    out: Path
+    """Folder to write; must be new or empty."""
+    images: int = 300
+    """Train and test images together; one in eight, at least 40, are for testing."""
+    size: int = 128
+    """Side of the square images [px]."""
+    seed: int = 0
+    """Of views and lights."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result names the folder and the counts."""
+        from osfcore.objects.asset_library import AssetLibrary
+        from osfcore.world.collection.collect_images import CollectObject, collect_object
+
+        config = CollectObject(self.name, self.out, self.images, self.size, self.seed)
+        last = follow(collect_object(config, AssetLibrary(self.data_dir / "objects")))
+        return {"out": str(self.out), "images": last.total if last else 0}
+
+
+@dataclass(frozen=True)
+class CollectTableCommand:
+    """Images of the bare table under many lights, in the OSF format."""
+
+    out: Path
+    """Folder to write; must be new or empty."""
+    images: int = 300
+    """Train and test images together; one in eight, at least 40, are for testing."""
+    size: int = 128
+    """Side of the square images [px]."""
+    seed: int = 0
+    """Of views and lights."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result names the folder and the counts."""
+        from osfcore.world.collection.collect_images import CollectTable, collect_table
+
+        last = follow(collect_table(CollectTable(self.out, self.images, self.size, self.seed)))
+        return {"out": str(self.out), "images": last.total if last else 0}
+
+
+@dataclass(frozen=True)
+class CollectPushesCommand:
+    """Episodes of pushes for learning dynamics. A killed collection goes on where it was when started again."""
+
+    out: Path
+    """HDF5 file to write; must be new."""
+    episodes: int = 1000
+    """Number of episodes."""
+    steps: int = 50
+    """Actions of 0.2 s per episode."""
+    objects: int = 3
+    """Objects per scene, chosen at random among those fetched."""
+    policy: Literal["paper", "directed"] = "paper"
+    """Uniform random velocities, or a pusher that seeks sustained contact."""
+    workers: int = 2
+    """Processes that simulate side by side; the content does not depend on it."""
+    seed: int = 0
+    """Of everything."""
+    images: bool = False
+    """Keep frames of camera 0 as well."""
+    renderer: Literal["embree", "tiny"] = "embree"
+    """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
+    names: tuple[str, ...] | None = None
+    """Objects to choose from; by default all that were fetched."""
+    disturb: int = 0
+    """From how many slightly disturbed states to simulate each quarter of an action in which something moves."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result tells shares of steps with contact and motion, and the rate."""
+        from osfcore.objects.asset_library import AssetLibrary
+        from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+
+        config = CollectPushes(self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images,
+                               self.renderer, self.names, self.disturb)  # fmt: skip
+        with worker_pool(self.workers) as executor:
+            last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, self.workers + 2))
+        result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}
+        if last is not None:
+            result |= {
+                "contact_share": round(last.contact_share, 4),
+                "motion_share": round(last.motion_share, 4),
+                "episodes_per_s": round(last.episodes_per_s, 2),
+            }
+        return result
+
+
+@dataclass(frozen=True)
+class CollectObservationCommand:
+    """One observation of a random scene, to try 'osf estimate' with; truth.json in it tells what was there."""
+
+    out: Path
+    """Folder to write; must be new or empty."""
+    names: tuple[str, ...] | None = None
+    """Names of the objects; by default a random choice among those with a field."""
+    objects: int = 3
+    """How many objects, where no names are given."""
+    seed: int = 0
+    """Of objects, places and light."""
+    size: int = 128
+    """Side of the square images [px]."""
+    goal: bool = False
+    """Only the goal camera's view, without pusher and masks."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects, and fields trained on this machine, are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Collect; the result names the folder and what is to be seen."""
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.objects.asset_library import AssetLibrary
+        from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
+
+        config = CollectObservation(self.out, self.names, self.objects, self.seed, self.size, self.goal)
+        known = FieldLibrary(self.data_dir).names()
+        made = collect_observation(config, AssetLibrary(self.data_dir / "objects"), known)
+        if not self.json:
+            views = "1 view" if len(made.cameras) == 1 else f"{len(made.cameras)} views"
+            print(f"Wrote {self.out}: {views} of {', '.join(made.names)}.")
+        return {"out": str(self.out), "objects": list(made.names), "cameras": [c.name for c in made.cameras]}
+
+
+Collect = Annotated[
+    Annotated[CollectObjectCommand, tyro.conf.subcommand("object")]
+    | Annotated[CollectTableCommand, tyro.conf.subcommand("table")]
+    | Annotated[CollectPushesCommand, tyro.conf.subcommand("pushes")]
+    | Annotated[CollectObservationCommand, tyro.conf.subcommand("observation")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

@@ -1,0 +1,258 @@
+"""`osf eval`: the paper's experiments, measured on what nothing was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from app.cli.progress_bar import follow
+from app.cli.workers import worker_pool
+from app.storage.paths import default_data_dir
+from osfcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from osfcore.experiments.estimation.evaluation import EstimateEvaluationStep
+    from osfcore.experiments.fields.evaluation import EvaluationStep
+
+_FOLDER = "evaluation"  # of the data directory
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure fields, the estimators that use them, predicted pushes, or whole episodes, on what was never trained on.
+
+    fields: each object alone on unseen views under unseen lights, and scenes of several. estimate: poses and light
+    from first frames, along pushes without masks and of goals, what each ingredient is worth, and spoiled inputs.
+    dynamics: predicted pushes of two to six objects against the simulator, against a quasi-static model, and against
+    the constant pose; objects and pairs of objects that training never saw.
+    mpc: tables that shall become what a goal image shows, in 30 pushes; the same planner told the truth; no action.
+    Results are kept in the output folder: a killed evaluation goes on when started again, and may be run in pieces.
+    """
+
+    what: tyro.conf.Positional[Literal["fields", "estimate", "dynamics", "mpc"]]
+    """What to evaluate."""
+    out: Path | None = None
+    """Folder for results and pictures; DATA_DIR/evaluation by default."""
+    names: tuple[str, ...] | None = None
+    """Objects; by default all that have a field and a mesh, with estimate the ten default ones."""
+    tasks: int = 20
+    """Scenes against the simulator, each with its own objects and light; with fields, 0 for objects alone."""
+    objects: int = 3
+    """Objects in a scene."""
+    seed: int = 0
+    """Of views, lights, scenes and searches."""
+    parts: tuple[Literal["first", "track", "goal", "ablations"], ...] = ("first", "track", "goal", "ablations")
+    """With estimate: what to measure; first frames are in any case."""
+    bad: int = 0
+    """With estimate: number of spoiled inputs (100 gives ten of each kind)."""
+    cost: Literal["pose", "image"] = "pose"
+    """With mpc: futures are compared with the goal's poses, or rendered and compared with the goal image."""
+    oracle: bool = True
+    """With mpc: also measure the planner that is told the truth."""
+    workers: int = 2
+    """With dynamics and mpc: processes that simulate side by side."""
+    data: Path | None = None
+    """With --weights: measure on the test images of this set in the OSF format instead of the simulator's."""
+    weights: Path | None = None
+    """With --data: the field to measure."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fetched objects and trained fields are."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Measure with a progress bar; the result holds what the evaluation's report does."""
+        if self.what != "fields" and (self.data is not None or self.weights is not None):
+            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
+        if self.what == "dynamics":
+            return self._dynamics()
+        if self.what == "mpc":
+            return self._mpc()
+        last, show = self._estimates() if self.what == "estimate" else (follow(self._steps()), _show)
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        result = last.report.to_json()
+        if not self.json:
+            show(result)
+        return result
+
+    @property
+    def _folder(self) -> Path:
+        return self.data_dir / _FOLDER if self.out is None else self.out
+
+    def _steps(self) -> Iterator[EvaluationStep]:
+        from osfcore.experiments.fields.evaluation import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.objects.asset_library import AssetLibrary
+
+        if self.data is not None and self.weights is not None:
+            return evaluate_set(EvaluateSet(self.data, self.weights, self._folder))
+        if self.data is not None or self.weights is not None:
+            raise InvalidInput("choice of --data and --weights", "one alone", "both or none")
+        config = EvaluateFields(self._folder, self.names, self.tasks, self.objects, self.seed)
+        return evaluate_fields(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects"))
+
+    def _estimates(self) -> tuple[EstimateEvaluationStep | None, Callable[[dict[str, Any]], None]]:
+        """Measure estimators; the last step, and how to show its report."""
+        from osfcore.experiments.estimation.evaluation import evaluate_estimate
+        from osfcore.experiments.estimation.parts import EvaluateEstimate
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.objects.asset_library import AssetLibrary
+
+        config = EvaluateEstimate(self._folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        return follow(evaluate_estimate(config, fields, assets)), partial(_show_estimate, config.folder)
+
+    def _dynamics(self) -> dict[str, Any]:
+        """Measure predicted pushes."""
+        from osfcore.experiments.dynamics.evaluation import EvaluateDynamics, evaluate_dynamics
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.objects.asset_library import AssetLibrary
+
+        config = EvaluateDynamics(self._folder, self.tasks, self.seed, self.names, self.data_dir)
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        with worker_pool(self.workers) as executor:
+            last = follow(evaluate_dynamics(config, fields, assets, executor))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        if not self.json:
+            _show_dynamics(config.folder, last.report)
+        return last.report
+
+    def _mpc(self) -> dict[str, Any]:
+        """Measure whole episodes."""
+        from osfcore.experiments.rearrangement.evaluation import EvaluateMpc, evaluate_mpc
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.objects.asset_library import AssetLibrary
+
+        config = EvaluateMpc(
+            self._folder, self.data_dir, self.tasks, self.objects, self.seed, self.cost, self.names, self.oracle
+        )
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        with worker_pool(self.workers) as executor:
+            last = follow(evaluate_mpc(config, fields, assets, executor))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        if not self.json:
+            _show_mpc(config.folder, last.report)
+        return last.report
+
+
+def _show(result: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for title in ("object", "full dB", "mask dB", "SSIM", "MB", "minutes"):
+        table.add_column(title, justify="left" if title == "object" else "right", no_wrap=True)
+    for name, row in result["objects"].items():
+        minutes = "" if row["minutes"] is None else f"{row['minutes']:.1f}"
+        figures = (f"{row['psnr_full']:.2f}", f"{row['psnr_mask']:.2f}", f"{row['ssim']:.4f}", f"{row['file_mb']:.2f}")
+        table.add_row(name, *figures, minutes)
+    means = (f"{result['psnr_full_mean']:.2f}", f"{result['psnr_mask_mean']:.2f}", f"{result['ssim_mean']:.4f}")
+    table.add_row("mean (size: most)", *means, f"{result['max_file_mb']:.2f}", "")
+    console = Console()
+    console.print(table)
+    if result["scenes"]:
+        shares = {"whole": "scene_psnr_mean", "objects": "scene_psnr_object_mean", "shadow": "scene_psnr_shadow_mean"}
+        told = [f"{what} {result[key]:.2f} dB" for what, key in shares.items() if result[key] is not None]
+        console.print(f"{result['scenes']} scenes: {', '.join(told)}", highlight=False)
+
+
+def _show_estimate(folder: Path, result: dict[str, Any]) -> None:
+    """The report for people, a line for each part."""
+    print(
+        f"First frames: {result['tasks']} scenes, {result['objects_total']} objects: "
+        f"{_percent(result['frac_1cm_5deg'])} under 1 cm and 5 deg; medians {_errors(result)}, "
+        f"ADD-S {_number(result['adds_mm_median'])} mm, {_number(result['first_s_median'])} s."
+    )
+    print(
+        f"Claimed deviations: {_percent(result['two_sigma_coverage'])} of errors within two; "
+        f"{_number(result['mean_position_std_mm'], 2)} mm on average. "
+        f"Flagged: {_percent(result['flagged_good'])} of right estimates, "
+        f"{_percent(result['flagged_bad'])} of wrong ones."
+    )
+    if result["track_episodes"] is not None:
+        drift = ", ".join(f"{_number(mm)} mm after {step}" for step, mm in result["drift_mm"].items())
+        print(
+            f"Tracks: {result['track_lost']} of {result['track_episodes']} lost "
+            f"({result['track_lost_from_wrong_start']} from a wrong first frame), {drift} steps; "
+            f"{_number(result['refine_hz'])} Hz."
+        )
+    if result["goal_objects_total"] is not None:
+        goals = {key.removeprefix("goal_"): value for key, value in result.items() if key.startswith("goal_")}
+        print(
+            f"Goals: {_percent(goals['frac_1cm_5deg'])} of {goals['objects_total']} objects under 1 cm and 5 deg; "
+            f"medians {_errors(goals)}, {_number(goals['s_median'])} s."
+        )
+    if result["by_views"] is not None:
+        rows = {f"{n} views" if n != "1" else "1 view": row for n, row in result["by_views"].items()}
+        for what, row in {"light held overhead": result["fixed_light"], **rows}.items():
+            print(f"  {what}: {_percent(row['frac_1cm_5deg'])} under 1 cm and 5 deg; medians {_errors(row)}")
+    if "bad_cases" in result:
+        print(
+            f"Bad cases: {result['bad_cases']}: {result['bad_refused']} refused, {result['bad_flagged']} flagged, "
+            f"{result['bad_right']} right, {result['bad_confident_wrong']} wrong without a warning."
+        )
+    print(f"Pictures and figures: {folder}")
+
+
+def _show_dynamics(folder: Path, result: dict[str, Any]) -> None:
+    """The report for people, a line for each part."""
+    print(f"Three objects, {result['windows']} that moved within 4 steps of 0.2 s:")
+    for horizon in (1, 4, 10, 30):
+        mm, deg = result[f"median_mm_{horizon}"], result[f"median_deg_{horizon}"]
+        others = [_number(result[f"{who}_mm_{horizon}"]) for who in ("constant", "analytic")]
+        told = f"constant pose {others[0]}, quasi-static {others[1]} mm"
+        print(f"  after {horizon}: median {_number(mm)} mm, {_number(deg)} deg ({told})")
+    print(f"  what does not move drifts by {_number(result['still_drift_mm_30'], 2)} mm in 30 steps")
+    for count, row in result["by_objects"].items():
+        print(f"{count} objects: {_number(row['median_mm_4'])} mm, {_number(row['median_deg_4'])} deg after 4 steps")
+    if result["unseen_objects"]:
+        told = (
+            f"{_number(result['unseen_objects_mm_4'])} mm; having seen them {_number(result['seen_objects_mm_4'])} mm"
+        )
+        print(f"Objects never seen ({', '.join(result['unseen_objects'])}): {told}")
+    print(f"{result['rollout_steps_per_s']} steps of scenes a second. Pictures and figures: {folder}")
+
+
+def _show_mpc(folder: Path, result: dict[str, Any]) -> None:
+    """The report for people, a line for each part."""
+    low, high = result["success_2cm_interval"]
+    print(
+        f"{result['tasks']} tasks with {result['objects']} objects, {result['cost']} cost: "
+        f"{_percent(result['success_2cm'])} within 2 cm ({100 * low:.0f} to {_percent(high)}), "
+        f"{_percent(result['success_2cm_15deg'])} also within 15 deg."
+    )
+    moved = ", ".join(f"{_percent(share)} of {count}" for count, share in result["success_by_moved"].items())
+    print(f"By number of objects that had to move: {moved}.")
+    ends = f"{_number(result['final_mm_mean'])} mm (median {_number(result['final_mm_median'])} mm)"
+    print(f"These end {ends} from their goals, from {_number(result['start_mm_mean'])} mm.")
+    if result["oracle_success_2cm"] is not None:
+        print(
+            f"Told the truth, the same planner: {_percent(result['oracle_success_2cm'])}, "
+            f"{_number(result['oracle_final_mm_mean'])} mm."
+        )
+    plan, look, whole = (result[f"{stage}_s_median"] for stage in ("replan", "estimate", "episode"))
+    print(f"A plan takes {_number(plan)} s, an estimate {_number(look, 2)} s, an episode {_number(whole, 0)} s.")
+    print(f"Pictures and figures: {folder}")
+
+
+def _errors(row: dict[str, Any]) -> str:
+    return (
+        f"{_number(row['position_mm_median'])} mm, {_number(row['rotation_deg_median'])} deg, "
+        f"light {_number(row['light_deg_median'])} deg"
+    )
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"

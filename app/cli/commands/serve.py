@@ -1,0 +1,142 @@
+"""`osf serve`: the service and its page on one port."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import socket
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from app.storage.paths import default_data_dir
+from osfcore.errors import InvalidInput, OsfError
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    import uvicorn
+    from fastapi import FastAPI
+
+_BACKLOG = 128
+_GRACE_S = 2  # for open requests after Ctrl-C
+
+
+class CannotListen(OsfError):
+    """The address cannot be served."""
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Start the service and print the address of its page. Ctrl-C stops it."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines in."""
+    port: int = 8000
+    """Port of page, REST and viewer alike; 0 takes a free one."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Objects, database and collections."""
+    json: bool = False
+    """Print a JSON object as the last line when the service has stopped."""
+
+    def run(self) -> dict[str, Any]:
+        """Serve until interrupted."""
+        from app.storage.database import Store
+
+        listener = bound_socket(self.host, self.port)
+        with contextlib.closing(listener):
+            Store(self.data_dir).close()  # tells now, in one sentence, if the data directory cannot be used
+            url = _url(self.host, listener.getsockname()[1])
+            logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
+            with contextlib.suppress(KeyboardInterrupt):  # the server raises it again once everything has stopped
+                _server(self, url).run(sockets=[listener])
+        return {"url": url}
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """A socket that has the port, so that nobody takes it while the service starts.
+
+    Raises:
+        CannotListen: if it cannot be had.
+    """
+    if not 0 <= port <= 65535:
+        raise CannotListen(f"port is {port}, but it must be between 0 and 65535.")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except OSError:
+        raise CannotListen(f"The host {host!r} is not an address of this machine.") from None
+    listener = socket.socket(family, kind, protocol)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+        listener.listen(_BACKLOG)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            text = f"Port {port} on {host} is in use; stop the program that has it or choose another with --port."
+        elif error.errno == errno.EACCES:
+            text = f"Port {port} may not be used by this user; choose one above 1023 with --port."
+        else:
+            text = f"Port {port} on {host} cannot be used ({error.strerror})."
+        raise CannotListen(text) from None
+    return listener
+
+
+def _server(serve: Serve, url: str) -> uvicorn.Server:
+    """A server that tells its address once it is ready, and ends event streams before it waits for them."""
+    import uvicorn
+    from pydantic import ValidationError
+
+    from app.api.app_factory import create_app
+    from app.services.service_settings import Settings
+
+    try:
+        settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "OSF_" + "_".join(str(part) for part in first["loc"]).upper()
+        raise InvalidInput(name, repr(first["input"])[:60], f"valid ({first['msg']})") from None
+    app = create_app(settings)
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            if self.started:
+                _tell_ready(app, url)
+
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            services = getattr(app.state, "services", None)
+            if services is not None:
+                services.closing.set()
+            super().handle_exit(sig, frame)
+
+    return Server(
+        uvicorn.Config(
+            app,
+            workers=1,  # the state is in the process
+            lifespan="on",
+            log_level="warning",
+            access_log=False,
+            ws_max_size=64 << 20,
+            ws_per_message_deflate=False,  # the viewer's frames are compressed already
+            timeout_graceful_shutdown=_GRACE_S,
+            proxy_headers=True,
+        )
+    )
+
+
+def _tell_ready(app: FastAPI, url: str) -> None:
+    if not app.state.services.shelf.names():
+        print(
+            "There are no objects on this machine yet; fetch them on the page or with 'osf assets fetch'.",
+            file=sys.stderr,
+            flush=True,
+        )
+    print(url, flush=True)
+
+
+def _url(host: str, port: int) -> str:
+    shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    return f"http://{shown}:{port}"

@@ -1,0 +1,175 @@
+"""`osf train`: fields from image sets, dynamics from pushes."""
+
+from __future__ import annotations
+
+import json as json_text
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from app.cli.progress_bar import follow
+from app.storage.paths import default_data_dir
+
+if TYPE_CHECKING:
+    from osfcore.fields.training.kiloosf_training import FieldStep
+    from osfcore.progress import Progress
+
+
+@dataclass(frozen=True)
+class TrainFieldCommand:
+    """An object's field from an image set in the OSF format. A killed training goes on when started again."""
+
+    data: Path
+    """Folder with train/anno.json and test/anno.json."""
+    out: Path
+    """File to write, such as 006_mustard_bottle.safetensors; its metrics go beside it as .json."""
+    minutes: float = 30.0
+    """How long to train [min]."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    hollow: bool = False
+    """The object has hollows that no silhouette shows, such as a bowl's."""
+    iterations: int | None = None
+    """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    recipe: Literal["direct", "distil"] = "direct"
+    """direct learns from the images at once; distil, the paper's way, goes over a teacher and is slower."""
+    teacher_width: int = 64
+    """Units of each layer of the teacher."""
+    teacher_depth: int = 4
+    """Layers of the teacher."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
+        from osfcore.fields.training.kiloosf_training import TrainField, train_field
+
+        config = TrainField(
+            self.data,
+            self.out,
+            minutes=self.minutes,
+            device=self.device,
+            seed=self.seed,
+            iterations=self.iterations,
+            hollow=self.hollow,
+            recipe=self.recipe,
+            teacher_width=self.teacher_width,
+            teacher_depth=self.teacher_depth,
+        )
+        follow(_progress(train_field(config)))
+        metrics = _metrics(self.out)
+        if not self.json:
+            full, mask = metrics["psnr_full"], metrics["psnr_mask"]
+            quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
+            print(f"Wrote {self.out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
+        return {"out": str(self.out), **metrics}
+
+
+@dataclass(frozen=True)
+class TrainTableCommand:
+    """The table's field from an image set of the bare table."""
+
+    data: Path
+    """Folder with train/anno.json and test/anno.json, such as 'osf collect table' writes."""
+    out: Path
+    """File to write, such as table.safetensors; its metrics go beside it as .json."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        from osfcore.fields.training.table_training import TrainTable, train_table
+
+        follow(train_table(TrainTable(self.data, self.out, self.device, self.seed)))
+        metrics = _metrics(self.out)
+        if not self.json:
+            print(f"Wrote {self.out}: {metrics['psnr']:.1f} dB on unseen views and lights.")
+        return {"out": str(self.out), **metrics}
+
+
+@dataclass(frozen=True)
+class TrainDynamicsCommand:
+    """What pushes do, from recorded ones. A killed training goes on when started again."""
+
+    data: tuple[Path, ...]
+    """Push files that 'osf collect pushes' wrote; one in twelve episodes is held out."""
+    out: Path
+    """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
+    iterations: int = 26_000
+    """Steps of descent on single substeps, at most."""
+    long_iterations: int = 500
+    """Steps of descent on windows of three actions, after these."""
+    patience: int = 20
+    """Measurements on held-out episodes without a better one after which training stops."""
+    without: tuple[str, ...] = ()
+    """Objects whose episodes are left out."""
+    hidden: int = 192
+    """Width of the network."""
+    batch: int = 512
+    """Substeps in each step of descent."""
+    long_batch: int = 96
+    """Windows in each."""
+    rate: float = 4e-3
+    """Of learning, at its highest."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fields trained on this machine are: shapes come from fields."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        from osfcore.dynamics.push_models import load_shapes
+        from osfcore.dynamics.training.network_training import TrainDynamics, train_dynamics
+        from osfcore.fields.field_library import FieldLibrary
+
+        config = TrainDynamics(
+            self.data,
+            self.out,
+            iterations=self.iterations,
+            batch=self.batch,
+            long_iterations=self.long_iterations,
+            long_batch=self.long_batch,
+            hidden=self.hidden,
+            rate=self.rate,
+            patience=self.patience,
+            without=self.without,
+            device=self.device,
+            seed=self.seed,
+        )
+        library = FieldLibrary(self.data_dir)
+        follow(train_dynamics(config, load_shapes(self.data_dir, library, library.names())))
+        metrics = _metrics(self.out)
+        if not self.json:
+            mm, deg = metrics["validation_mm_4"], metrics["validation_deg_4"]
+            print(f"Wrote {self.out}: held out, {mm:.1f} mm and {deg:.1f} deg after 4 steps.")
+        return {"out": str(self.out), **metrics}
+
+
+def _progress(steps: Iterator[FieldStep]) -> Iterator[Progress]:
+    for step in steps:
+        yield step.progress
+
+
+def _metrics(out: Path) -> dict[str, Any]:
+    return json_text.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+
+
+Train = Annotated[
+    Annotated[TrainFieldCommand, tyro.conf.subcommand("field")]
+    | Annotated[TrainTableCommand, tyro.conf.subcommand("table")]
+    | Annotated[TrainDynamicsCommand, tyro.conf.subcommand("dynamics")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

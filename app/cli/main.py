@@ -1,0 +1,83 @@
+"""The command line `osf`: one dataclass per command, each in `app/cli/commands/`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from typing import Annotated, Any, Protocol
+
+import tyro
+
+from app.cli.commands.assets import Assets
+from app.cli.commands.bench import Bench
+from app.cli.commands.check import Check
+from app.cli.commands.collect import Collect
+from app.cli.commands.episode import RunEpisode
+from app.cli.commands.estimate import Estimate
+from app.cli.commands.evaluate import Evaluate
+from app.cli.commands.predict import Predict
+from app.cli.commands.render import Render
+from app.cli.commands.serve import Serve
+from app.cli.commands.train import Train
+from osfcore.errors import OsfError
+
+
+class Command(Protocol):
+    """What every command offers."""
+
+    @property
+    def json(self) -> bool:
+        """Whether the result is printed as JSON."""
+        ...
+
+    def run(self) -> dict[str, Any]:
+        """Do it; return what `--json` prints."""
+        ...
+
+
+Commands = Annotated[
+    Annotated[Serve, tyro.conf.subcommand("serve", description="Start the service and its page.")]
+    | Annotated[Assets, tyro.conf.subcommand("assets", description="List, fetch and add objects.")]
+    | Annotated[Collect, tyro.conf.subcommand("collect", description="Collect image sets, pushes and observations.")]
+    | Annotated[Train, tyro.conf.subcommand("train", description="Train fields from images, dynamics from pushes.")]
+    | Annotated[Render, tyro.conf.subcommand("render", description="Render a scene through its fields.")]
+    | Annotated[Estimate, tyro.conf.subcommand("estimate", description="Find poses and light in images.")]
+    | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
+    | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
+    | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
+    | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
+    | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],
+    tyro.conf.OmitSubcommandPrefixes,
+]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; 0 on success, 1 if it could not be done, 2 for a wrong call, 130 when interrupted."""
+    # Threads spin while they wait for each other; for long, that stalls a machine that has anything else to do.
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    try:
+        command: Command = tyro.cli(
+            Commands, prog="osf", args=arguments, description="Rearrange real objects from a photo."
+        )
+        result = command.run()
+    except OsfError as error:
+        print(f"osf: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:  # whoever read our output has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        print(f"osf: {error.strerror or error}{f': {error.filename}' if error.filename else ''}.", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("osf: interrupted", file=sys.stderr)
+        return 130
+    if command.json:
+        print(json.dumps(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

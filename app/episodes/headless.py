@@ -1,0 +1,109 @@
+"""Runs an episode in the simulator, from an order to a folder of results, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from app.episodes.file_names import RECORDING_FILE
+from app.episodes.record import About, EpisodeRecord
+from app.episodes.request import EpisodeOrder, SimulatedTable, given
+from osfcore.control.closed_loop import Episode
+from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning, Stepped
+from osfcore.control.knowledge import knowledge_of
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.objects.asset_library import AssetLibrary
+
+_FOUND = {
+    "first": "Knows where everything is",
+    "goal": "Comparing the goal image with the table",
+    "next": "Knows where everything is now",
+    "search": "Knows where everything is now",
+}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EpisodeStep:
+    """How far an episode is.
+
+    Attributes:
+        done: actions executed.
+        total: actions at most.
+        note: what is being done.
+        event: what just happened, if anything did.
+        report: with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    event: Event | None = None
+    report: dict[str, Any] | None = None
+
+
+def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
+    """Run an episode; the last step brings the report, and the folder holds everything.
+
+    Raises:
+        OsfError: if the order cannot be met, or the disk refuses.
+    """
+    from app.episodes.recording import write_recording
+
+    total = order.settings.steps
+    yield EpisodeStep(0, total, "Loading fields and setting the table")
+    begin = given(order)
+    try:
+        assets = AssetLibrary(order.data_dir / "objects")
+        knowledge = knowledge_of(begin.world.names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
+        symmetries = {name: assets.info(name).symmetry for name in begin.world.names}
+        about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries)
+        record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
+        rng = np.random.default_rng([order.seed, 1])
+        done, note = 0, ""
+        for event in Episode(begin.world, knowledge, begin.goal, order.settings, rng).run():
+            record.take(event)
+            done = event.number if isinstance(event, Acted) else done
+            note = note_of(event) or note
+            yield EpisodeStep(done, total, note, event)
+        yield EpisodeStep(done, total, "Writing video and recording")
+        report = record.finish()
+        write_recording(order.out / RECORDING_FILE, assets, record.states)
+        yield EpisodeStep(done, total, str(report["text"]), report=report)
+    finally:
+        begin.world.close()
+
+
+def note_of(event: Event) -> str | None:
+    """What is being done, for a person; None if this event changes nothing about it."""
+    match event:
+        case Looking():
+            if event.step.estimate is not None:
+                return _FOUND[event.look]
+            where = {"first": "first frame", "goal": "goal image", "next": "table", "search": "lost objects"}
+            return f"Looking at the {where[event.look]}: {event.step.progress.note}"
+        case GoalFound():
+            return "Knows where everything should be"
+        case Stepped() | Planning():
+            return "Planning pushes"
+        case Acted():
+            return "Pushing"
+        case Noticed():
+            return event.text
+        case _:
+            return None
+
+
+def stage_of(event: Event) -> str | None:
+    """Which part of the loop an event belongs to; None if it says nothing about that."""
+    match event:
+        case Looking():
+            return event.look
+        case Stepped() | Planning():
+            return "plan"
+        case Acted():
+            return "act"
+        case _:
+            return None

@@ -1,0 +1,226 @@
+"""What an episode leaves in its folder: report.json, steps.csv, frames, video, a recording, the goal image."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
+from app.episodes.frames import TILE_PX, frame, read_frames, write_video
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
+from osfcore.io.files import write_atomically, write_json
+from osfcore.io.image_file import to_uint8, write_png
+from osfcore.io.scene_file import Scene, scene_to_json
+from osfcore.io.state_file import estimated_to_json
+from osfcore.metrics.image_errors import ssim
+from osfcore.metrics.success import RearrangementTask, score_of
+from osfcore.objects.asset import Symmetry
+
+
+class Table(Protocol):
+    """What only a simulation tells of a table; for reports, never for the loop."""
+
+    def truth(self) -> SceneState:
+        """Where everything truly is."""
+        ...
+
+    def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """What a camera would see, the pusher included."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class About:
+    """What a record says besides what happens.
+
+    Attributes:
+        seed: of the searches, and of the scene where the episode made it.
+        settings: at the beginning.
+        goal: how the table truly should be; None where nobody knows.
+        moved: objects that truly should move, where that is known.
+        symmetries: which orientations of the objects look the same.
+    """
+
+    seed: int
+    settings: EpisodeSettings
+    goal: SceneState | None
+    moved: tuple[str, ...]
+    symmetries: Mapping[str, Symmetry]
+
+
+class EpisodeRecord:
+    """Takes an episode's events and writes its results.
+
+    Args:
+        folder: for them.
+        table: that the episode is about.
+        about: what it was asked to be.
+
+    Attributes:
+        states: true ones, at the beginning and after each action.
+    """
+
+    states: list[SceneState]
+
+    def __init__(self, folder: Path, table: Table, about: About) -> None:
+        self._folder, self._table, self._about = folder, table, about
+        self._views: Float[np.ndarray, "V h w 3"] | None = None
+        self._goal: GoalFound | None = None
+        self._steps: list[dict[str, Any]] = []
+        self._notices: list[dict[str, Any]] = []
+        self._began = time.perf_counter()
+        self._actions: list[list[float]] = []
+        self._end: Finished | None = None
+        self._start = table.truth()
+        self.states = [self._start]
+        for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
+            left.unlink()
+
+    def take(self, event: Event) -> None:
+        """Note an event, and draw a frame where a step is over.
+
+        Raises:
+            CannotWrite: if the disk refuses.
+        """
+        match event:
+            case Observed():
+                self._views = event.observation.images
+            case GoalFound():
+                self._goal = event
+                write_png(self._folder / GOAL_FILE, to_uint8(event.image))
+            case Acted():
+                self._actions.append(event.action.tolist())
+                self.states.append(self._table.truth())
+            case Noticed():
+                self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
+            case Stepped():
+                self._steps.append(self._told(event))
+                self._draw(event)
+            case Finished():
+                self._end = event
+            case _:
+                pass
+        if isinstance(event, GoalFound | Noticed | Stepped | Finished):
+            self._write()
+
+    def finish(self) -> dict[str, Any]:
+        """Write the video, and tell the report.
+
+        Raises:
+            CannotWrite: if the disk refuses.
+        """
+        write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
+        return self._write()
+
+    def _write(self) -> dict[str, Any]:
+        """Report and table so far: an episode that is broken off leaves what it has done."""
+        report = self._report()
+        write_json(self._folder / REPORT_FILE, report)
+        self._write_csv()
+        return report
+
+    def _told(self, event: Stepped) -> dict[str, Any]:
+        """A step as the report has it; lengths in mm, angles in degrees."""
+        assert self._goal is not None
+        truth, estimate = self._table.truth(), event.estimate
+        off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
+        told = {
+            "step": event.number,
+            "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
+            "image_cost": event.image_cost,
+            "ssim": round(ssim(self._goal.image, event.rendered), 4),
+            "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m),
+            "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)),
+            "estimate_off_mm": _by_name(truth.names, 1000 * off),
+            "estimate": estimated_to_json(estimate),
+            "truth": _scene(truth),
+        }
+        if self._about.goal is not None:
+            told["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._about.goal))
+        return told
+
+    def _draw(self, event: Stepped) -> None:
+        assert self._goal is not None
+        assert self._views is not None
+        camera = self._goal.camera
+        scale = TILE_PX / max(camera.width, camera.height)
+        now = self._table.photo(camera.resized(round(scale * camera.width), round(scale * camera.height)))
+        title = f"step {event.number} of {event.steps}"
+        picture = frame(self._goal.image, now, event.rendered, self._views, title)
+        write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps) - 1:03d}.png", picture)
+
+    def _write_csv(self) -> None:
+        names = self._start.names
+        keys = ("to_goal_mm", "to_goal_deg", "estimate_off_mm", "truly_to_goal_mm")
+        present = [key for key in keys if self._steps and key in self._steps[0]]
+        stages = ("first", "goal", "estimate", "plan", "act")
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["step", "image_cost", "ssim", *(f"{stage}_s" for stage in stages),
+                        *(f"{name} {key}" for key in present for name in names)])  # fmt: skip
+        for step in self._steps:
+            seconds = [step["seconds"].get(stage, "") for stage in stages]
+            values = [step[key][name] for key in present for name in names]
+            table.writerow([step["step"], step["image_cost"], step["ssim"], *seconds, *values])
+        write_atomically(self._folder / CSV_FILE, text.getvalue().encode())
+
+    def _report(self) -> dict[str, Any]:
+        end, about = self._end, self._about
+        report: dict[str, Any] = {
+            "outcome": None if end is None else end.outcome,
+            "text": None if end is None else end.text,
+            "steps_done": len(self._actions),
+            "seconds": round(time.perf_counter() - self._began, 2),
+            "seed": about.seed,
+            "objects": list(self._start.names),
+            "settings": asdict(about.settings),
+            "goal": None if self._goal is None else _goal_to_json(self._goal),
+            "noticed": self._notices,
+            "actions": self._actions,
+            "steps": self._steps,
+        }
+        if about.goal is not None:
+            report["moved"] = list(about.moved)
+        if about.goal is not None and about.moved:  # else there is nothing to score
+            task = RearrangementTask(0, self._start, about.goal, about.moved)
+            score = score_of(task, self._table.truth(), about.symmetries)
+            report["score"], report["success_2cm"] = score.to_json(), score.is_success()
+        return report
+
+
+def _by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+    return {name: round(float(value), 3) for name, value in zip(names, values, strict=True)}
+
+
+def _shift(state: SceneState, goal: SceneState) -> Float[np.ndarray, "N"]:
+    there = np.array([goal.pose(name).position for name in state.names])
+    return np.linalg.norm(state.poses.position - there, axis=1)
+
+
+def _scene(state: SceneState) -> dict[str, Any]:
+    scene = scene_to_json(Scene(state, ()))
+    del scene["cameras"]
+    return scene
+
+
+def _goal_to_json(goal: GoalFound) -> dict[str, Any]:
+    names, poses = goal.goal.names, goal.goal.poses
+    wanted = [_pose_to_json(name, poses[n]) for n, name in enumerate(names)]
+    estimate = None if goal.estimate is None else estimated_to_json(goal.estimate)
+    return {"objects": wanted, "estimate": estimate}
+
+
+def _pose_to_json(name: str, pose: Pose) -> dict[str, Any]:
+    return {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}

@@ -1,0 +1,41 @@
+"""Recordings of what happened on a table, for viser's own player: one file that needs no service."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterable
+from pathlib import Path
+
+import viser
+
+from app.processes.messages import SceneRecord
+from app.storage.database import now_utc
+from app.viewer.nodes.scene_nodes import SceneDrawing
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import STEP_S
+from osfcore.io.files import write_atomically
+from osfcore.objects.asset_library import AssetLibrary
+
+
+def write_recording(path: Path, library: AssetLibrary, states: Iterable[SceneState]) -> None:
+    """Write a `.viser` file that plays true states, one every 0.2 s.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    first, *later = states
+    with contextlib.redirect_stdout(io.StringIO()):  # viser greets
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        drawing = SceneDrawing(server, library, lambda *_: None, lambda *_: None)
+        drawing.show(SceneRecord("recording", 0, now_utc(), 128, first, first, 0.0, 0))
+        serializer = server.get_scene_serializer()
+        for state in later:
+            serializer.insert_sleep(STEP_S)
+            drawing.place(state)
+        serializer.insert_sleep(STEP_S)
+        write_atomically(path, serializer.serialize())
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):  # viser says goodbye
+            server.stop()

@@ -1,0 +1,138 @@
+"""What an episode in the simulator is asked to be, and the world and goal that this means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.goal import GoalImage
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import Camera, goal_camera
+from osfcore.geometry.states import SceneState
+from osfcore.io.files import reading_png
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.goal_layouts import random_goal
+from osfcore.world.tabletop import SceneRequest, Tabletop
+
+_MODES = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's, of 8 bits a channel: others would be clipped silently
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeOrder:
+    """An episode in the simulator.
+
+    Attributes:
+        out: folder for its results.
+        data_dir: where objects, and fields and networks trained on this machine, are.
+        names: the objects; None for a random choice.
+        objects: how many, where names are not given.
+        seed: of the scene, its light, a random goal, and the searches.
+        goal: PNG of how the table should look, from the goal camera; None for a random goal.
+        moved: how many objects a random goal moves; as the seed will have it if None.
+        settings: how it goes.
+        device: that computes.
+    """
+
+    out: Path
+    data_dir: Path
+    names: tuple[str, ...] | None = None
+    objects: int = 3
+    seed: int = 0
+    goal: Path | None = None
+    moved: int | None = None
+    settings: EpisodeSettings = field(default_factory=EpisodeSettings)
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Given:
+    """What an episode begins with.
+
+    Attributes:
+        world: with the scene on the table.
+        goal: the image.
+        truth: how the table truly should be, where that is known.
+        moved: objects that truly should move, where that is known.
+    """
+
+    world: Tabletop
+    goal: GoalImage
+    truth: SceneState | None
+    moved: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SimulatedTable:
+    """A simulated table as reports see it.
+
+    Attributes:
+        world: the simulation.
+    """
+
+    world: Tabletop
+
+    def truth(self) -> SceneState:
+        """Where everything truly is."""
+        return self.world.truth()
+
+    def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """What a camera sees, the pusher included."""
+        return self.world.render((camera,)).images[0]
+
+
+def given(order: EpisodeOrder) -> Given:
+    """Set the table and take or draw the goal.
+
+    Raises:
+        OsfError: if the objects, the image or the numbers are not as they must be.
+    """
+    assets, fields = AssetLibrary(order.data_dir / "objects"), FieldLibrary(order.data_dir)
+    for name in order.names or ():
+        fields.info(name)
+    among = tuple(name for name in fields.names() if assets.has(name))
+    world = Tabletop(assets, request=SceneRequest(names=order.names, count=order.objects, among=among))
+    try:
+        return _begun(order, world)
+    except BaseException:
+        world.close()
+        raise
+
+
+def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
+    world.arrange(order.seed)
+    if order.goal is not None:
+        goal = read_goal(order.goal, goal_camera())
+        if order.moved is not None:
+            raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
+        return Given(world, goal, None, ())
+    start, camera = world.truth(), goal_camera()
+    found = random_goal(world, order.seed, order.moved)
+    image = world.render((camera,), with_pusher=False).images[0]
+    world.restore(start)
+    return Given(world, GoalImage(camera, image), *found)
+
+
+def read_goal(path: Path, camera: Camera) -> GoalImage:
+    """A goal image from a file, seen by the camera at whatever size the image has.
+
+    Raises:
+        CorruptFile: if it is no PNG.
+        InvalidInput: if its sides are not in the proportion of the camera's, or out of range.
+    """
+    if not path.is_file():
+        raise CorruptFile(path, "there is no such file")
+    with reading_png(path, "it is no readable PNG image"), Image.open(path, formats=("PNG",)) as image:
+        width, height = image.size  # from the header: nothing is decoded yet
+        if width * camera.height != height * camera.width:
+            allowed = f"in proportion {camera.width}:{camera.height}, as the goal camera sees"
+            raise InvalidInput(f"size of {path.name} [px]", f"{width} x {height}", allowed)
+        seen = camera.resized(width, height)
+        if image.mode not in _MODES:
+            raise CorruptFile(path, "it is no image of 8 bits a channel")
+        return GoalImage(seen, np.asarray(image.convert("RGB"), np.float32) / 255)

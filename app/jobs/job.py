@@ -1,0 +1,136 @@
+"""A job: what is known of it, how it is written as JSON, what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+from app.storage.database import now_utc
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+
+State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
+INPUTS = "inputs"  # in the folder of a job that was given files
+FINISHED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
+
+
+class WrongJobState(OsfError):
+    """An order that does not fit the state that a job is in."""
+
+    def __init__(self, job: Job, wanted: str) -> None:
+        super().__init__(f"Job {job.id} is {job.state}, so it cannot be {wanted}.")
+
+
+class TrainingAlready(OsfError):
+    """A second order for a field that is being trained."""
+
+    def __init__(self, name: str, job: str) -> None:
+        super().__init__(f"Job {job} trains a field named {name} already; wait for it, cancel it or take another name.")
+
+
+class SetInUse(OsfError):
+    """An image set that a job needs."""
+
+    def __init__(self, set_id: str, job: str) -> None:
+        super().__init__(f"Job {job} needs image set {set_id}; wait for it or cancel it first.")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A job as it is now.
+
+    Attributes:
+        id: identifier.
+        kind: what is done.
+        params: with what.
+        state: where it is in its life.
+        done: units finished.
+        total: units in all; 0 before it is known.
+        note: what is being done, for a person.
+        created_at: UTC, ISO 8601.
+        started_at: when it left the queue.
+        finished_at: when it ended, in whatever way.
+        eta_s: time left, estimated [s].
+        error: why it failed, one sentence.
+        result: what its kind tells at the end.
+        files: names that can be downloaded.
+        position: in the queue, the next one has 1.
+    """
+
+    id: str
+    kind: str
+    params: dict[str, Any]
+    state: State = "queued"
+    done: int = 0
+    total: int = 0
+    note: str = "Waiting"
+    created_at: str = field(default_factory=now_utc)
+    started_at: str | None = None
+    finished_at: str | None = None
+    eta_s: float | None = None
+    error: str | None = None
+    result: dict[str, Any] | None = None
+    files: tuple[str, ...] = ()
+    position: int | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether nothing will change any more."""
+        return self.state in FINISHED
+
+
+@dataclass(frozen=True, slots=True)
+class JobChanged:
+    """A job is now like this; `event` is the number under which a page can ask for what came later."""
+
+    event: int
+    job: Job
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JobSeen:
+    """What a running job lets the live view draw; it is neither kept nor told to pages."""
+
+    job: Job
+    seen: object
+
+
+def job_fields(job: Job) -> dict[str, Any]:
+    """A job as JSON."""
+    return {**asdict(job), "files": list(job.files)}
+
+
+def job_from_fields(fields: dict[str, Any]) -> Job:
+    """The inverse of `job_fields`."""
+    return Job(**{**fields, "files": tuple(fields["files"])})
+
+
+def ended(job: Job, state: State, **changes: Any) -> Job:  # noqa: ANN401  any field of Job
+    """The job as it is once it has ended, in whatever way."""
+    return replace(job, state=state, finished_at=now_utc(), eta_s=None, position=None, **changes)
+
+
+def check_file_name(job: Job, name: str) -> str:
+    """The name of one of a job's files.
+
+    Raises:
+        UnknownName: if it has none of this name.
+    """
+    if name not in job.files:
+        raise UnknownName(f"file of job {job.id}", name, job.files)
+    return name
+
+
+def check_params(kind: str, params: dict[str, Any], known: Callable[[str], object], available: int) -> None:
+    """Refuse at once what the job would refuse later.
+
+    Raises:
+        OsfError: if an object is unknown or there are too few.
+    """
+    if kind == "collect_object":
+        known(params["name"])
+    for name in params.get("names", ()):
+        known(name)
+    if kind == "collect_pushes" and params["objects"] > available:
+        allowed = f"at most {available}, as many as were fetched" if available else "0 until some have been fetched"
+        raise InvalidInput("number of objects", params["objects"], allowed)

@@ -1,0 +1,173 @@
+"""The job that runs an episode on a scene of the service.
+
+Its parameters name the scene, which it drives while it runs: hands may move things while it pauses. A goal image lies
+in its inputs as `goal.png`; goal poses stand in the parameters. Where everything truly is in the image, if that is
+known, is for the report alone. It leaves what `osf episode` leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from app.episodes.file_names import GOAL_FILE, RECORDING_FILE
+from app.jobs.job import INPUTS
+from osfcore.geometry.poses import Pose, rotation_angle
+from osfcore.geometry.states import SceneState
+from osfcore.io.scene_file import camera_from_json
+
+if TYPE_CHECKING:
+    from app.jobs.context import JobContext
+    from app.processes.plan_summary import PlanSketch
+    from osfcore.control.episode_settings import EpisodeSettings
+    from osfcore.control.events import Event
+    from osfcore.control.goal import GoalImage
+    from osfcore.planning.pose_cost import PoseGoal
+
+_STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EpisodeProgress:
+    """How far an episode is.
+
+    Attributes:
+        done: actions executed.
+        total: actions at most; 0 until the goal is known, for looking tells nothing of how long acting takes.
+        note: what is being done, for a person.
+        stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
+        steps: rounds whose results are in the report.
+        outcome: how it ended; only at the end.
+        text: the same in a sentence.
+        seen: what just happened, as a picture shows it.
+    """
+
+    done: int
+    total: int
+    note: str
+    stage: str | None = None
+    steps: int = 0
+    outcome: str | None = None
+    text: str | None = None
+    seen: Event | PlanSketch | None = None
+
+    @property
+    def ends_round(self) -> bool:
+        """Whether a round of the loop is over, so that a job that goes on by single steps rests now."""
+        from osfcore.control.events import Stepped
+
+        return isinstance(self.seen, Stepped)
+
+    @property
+    def must_be_told(self) -> bool:
+        """Whether a view that misses this would show something wrong."""
+        from osfcore.control.events import Looking
+
+        return self.seen is not None and not isinstance(self.seen, Looking)
+
+
+def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeProgress]:
+    """Run an episode.
+
+    Raises:
+        OsfError: if an object has no field, the goal does not fit, the simulation is gone, or the disk refuses.
+    """
+    from app.episodes.record import About, EpisodeRecord
+    from app.episodes.recording import write_recording
+    from app.jobs.kinds.remote_world import RemoteWorld
+    from osfcore.control.closed_loop import Episode
+    from osfcore.control.knowledge import knowledge_of
+    from osfcore.fields.field_library import FieldLibrary
+
+    assert place.orders is not None, "the job's process sets it"
+    settings, names = settings_of(params["settings"]), tuple(params["names"])
+    yield EpisodeProgress(0, 0, "Loading fields, half a minute the first time")
+    knowledge = knowledge_of(names, FieldLibrary(place.data_dir), place.library, place.data_dir)
+    world = RemoteWorld(place.orders.ask, params["scene"], place.folder)
+    goal, start = params["goal"], world.truth()
+    wanted = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
+    about = About(params["seed"], settings, wanted, _moved(start, wanted), knowledge.symmetries)
+    record = EpisodeRecord(place.folder, world, about)
+    rng = np.random.default_rng([params["seed"], 1])
+    episode = Episode(world, knowledge, _goal(goal, names, place.folder / INPUTS), settings, rng)
+    told = EpisodeProgress(0, 0, "Looking")
+    for event in episode.run():
+        for change in place.orders.changes():
+            episode.settings = settings_of(change["settings"])
+        record.take(event)
+        told = _told(told, event, episode.settings.steps)
+        yield told
+    yield replace(told, note="Writing video and recording", seen=None)
+    record.finish()
+    write_recording(place.folder / RECORDING_FILE, place.library, record.states)
+    world.close()
+    yield replace(told, note=told.text or told.note, seen=None)
+
+
+def _told(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
+    """How far an episode is after an event."""
+    from app.episodes.headless import note_of, stage_of
+    from app.processes.plan_summary import sketch_of
+    from osfcore.control.events import Acted, Finished, GoalFound, Observed, Planning, Stepped
+
+    is_known = before.total > 0 or isinstance(event, GoalFound)
+    total = total if is_known else 0
+    then = replace(before, total=total, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
+    match event:
+        case Observed():  # its images are on the page already
+            return replace(then, seen=None)
+        case Planning(number, round_):
+            return replace(then, seen=sketch_of(number, round_))
+        case Acted(number):
+            return replace(then, done=number, seen=event)
+        case Stepped():
+            return replace(then, steps=before.steps + 1, seen=event)
+        case Finished(_, outcome, text):
+            return replace(then, outcome=outcome, text=text, note=text, seen=event)
+        case _:
+            return replace(then, seen=event)
+
+
+def settings_of(given: Mapping[str, Any]) -> EpisodeSettings:
+    """Settings from JSON; what is left out is as by default.
+
+    Raises:
+        InvalidInput: if a number is out of range.
+    """
+    from osfcore.control.episode_settings import EpisodeSettings
+    from osfcore.planning.mppi import PlanSettings
+
+    own = {key: value for key, value in given.items() if key != "plan"}
+    return EpisodeSettings(**own, plan=PlanSettings(**given.get("plan", {})))
+
+
+def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:
+    """The goal image among the inputs, or the poses in the parameters."""
+    from app.episodes.request import read_goal
+    from osfcore.planning.pose_cost import PoseGoal
+
+    if given["poses"] is None:
+        return read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
+    return PoseGoal(names, _poses(given["poses"], names))
+
+
+def _poses(entries: list[dict[str, Any]], names: tuple[str, ...]) -> Pose:
+    """Poses from JSON, in the order of `names`."""
+    by_name = {entry["name"]: entry for entry in entries}
+    positions, quaternions = (np.array([by_name[n][part] for n in names], float) for part in ("position", "quaternion"))
+    return Pose(positions, quaternions)
+
+
+def _moved(start: SceneState, wanted: SceneState | None) -> tuple[str, ...]:
+    """Objects that lie elsewhere in the goal than at the beginning."""
+    if wanted is None:
+        return ()
+    shift_m = np.linalg.norm(wanted.poses.position - start.poses.position, axis=1)
+    turn_rad = rotation_angle(wanted.poses.quaternion, start.poses.quaternion)
+    return tuple(
+        n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > _STAYS_M or rad > _STAYS_RAD
+    )

@@ -1,0 +1,158 @@
+"""The job that estimates poses and light from an observation: told step by step, with all steps kept in a file.
+
+Its inputs lie in the job's folder: `inputs/observation`, and `inputs/prior.json` where an earlier estimate is needed.
+It leaves `steps.jsonl`, one line a step, and `state.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from app.jobs.job import INPUTS
+from osfcore.errors import CannotWrite, CorruptFile
+from osfcore.io.scene_file import Scene, scene_from_json, scene_to_json
+
+if TYPE_CHECKING:
+    from app.jobs.context import JobContext
+    from osfcore.estimation.objective.object_models import ObjectModels
+    from osfcore.estimation.steps import EstimateStep
+    from osfcore.geometry.states import Observation, SceneState
+
+Mode = Literal["first", "next", "goal"]
+OBSERVATION, PRIOR, TRUTH = "observation", "prior.json", "truth.json"
+STEPS, STATE = "steps.jsonl", "state.json"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Estimating:
+    """How far an estimate is.
+
+    Attributes:
+        done: units finished.
+        total: units in all.
+        note: what is being done, for a person.
+        step: how many steps there were.
+        stage: which part of the method is at work; None before the first step.
+        losses: of each object, in the units of the stage.
+        loss: of the whole, likewise; None where only the objects are looked at.
+        trusted: whether the result may be acted on; None until it is there.
+        seen: the step itself.
+    """
+
+    done: int
+    total: int
+    note: str
+    step: int = 0
+    stage: str | None = None
+    losses: tuple[float | None, ...] = ()
+    loss: float | None = None
+    trusted: bool | None = None
+    seen: EstimateStep | None = None
+
+
+def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimating]:
+    """Estimate what was observed.
+
+    Raises:
+        OsfError: if the observation does not fit the mode, an object has no field, or the disk refuses.
+    """
+    from osfcore.io.observation_file import read_observation
+    from osfcore.io.state_file import read_estimated, write_estimated
+
+    yield Estimating(0, 0, "Loading fields, half a minute the first time")
+    inputs = place.folder / INPUTS
+    observation = read_observation(inputs / OBSERVATION)
+    mode: Mode = params["mode"]
+    prior = None if mode == "first" else read_estimated(inputs / PRIOR).state
+    models = load_models(place.data_dir, observation.names)
+    rng = np.random.default_rng(params["seed"])
+    for number, step in enumerate(steps_of(mode, models, observation, prior, rng), 1):
+        told = _told(number, step)
+        _keep(place.folder / STEPS, told, step.guess)
+        if step.estimate is not None:
+            write_estimated(place.folder / STATE, step.estimate)
+        yield told
+
+
+def load_models(data_dir: Path, names: tuple[str, ...]) -> ObjectModels:
+    """The fields of some objects and the table, ready to be rendered.
+
+    Raises:
+        UnknownName: if an object has no field.
+        CorruptFile: if a field is broken.
+    """
+    from osfcore.estimation.objective.object_models import ObjectModels
+    from osfcore.fields.field_library import FieldLibrary
+
+    library = FieldLibrary(data_dir)
+    return ObjectModels({name: library.load(name) for name in names}, library.load_table())
+
+
+def steps_of(
+    mode: Mode, models: ObjectModels, observation: Observation, prior: SceneState | None, rng: np.random.Generator
+) -> Iterator[EstimateStep]:
+    """The estimator for a first frame, a later one (begun at the prior), or a goal image (objects as in the prior)."""
+    if prior is None:
+        from osfcore.estimation.first_frame import estimate_first
+
+        return estimate_first(models, observation, rng)
+    if mode == "goal":
+        from osfcore.estimation.goal_image import estimate_goal
+
+        return estimate_goal(models, observation, prior)
+    from osfcore.estimation.tracking import estimate_next
+
+    return estimate_next(models, observation, prior, rng)
+
+
+def read_steps(path: Path) -> tuple[dict[str, Any], ...]:
+    """What was told of each step so far, with "guess", a scene without cameras; nothing before the first one.
+
+    Raises:
+        CorruptFile: if the file is damaged.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")[:-1]  # the last one may be in the making
+        return tuple(json.loads(line) for line in lines)
+    except FileNotFoundError:
+        return ()
+    except (OSError, ValueError, RecursionError) as error:
+        raise CorruptFile(path, "it is no list of an estimate's steps") from error
+
+
+def guess_of(step: dict[str, Any]) -> SceneState:
+    """The best scene of a step that was read."""
+    return scene_from_json(step["guess"]).state
+
+
+def _told(number: int, step: EstimateStep) -> Estimating:
+    progress = step.progress
+    trusted = None if step.estimate is None else step.estimate.trusted
+    losses = tuple(_number(loss) for loss in step.losses)
+    return Estimating(
+        progress.done, progress.total, progress.note, number, step.stage, losses, _number(step.loss), trusted, step
+    )
+
+
+def _number(value: float) -> float | None:
+    """JSON has neither NaN nor infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _keep(path: Path, told: Estimating, guess: SceneState) -> None:
+    scene = scene_to_json(Scene(guess, ()))
+    del scene["cameras"]
+    names = ("done", "total", "note", "step", "stage", "losses", "loss")
+    line = json.dumps({**{name: getattr(told, name) for name in names}, "guess": scene})
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise CannotWrite(path, error.strerror or str(error)) from error

@@ -1,0 +1,435 @@
+"""The job registry: one job runs at a time in a process of its own, the others wait their turn.
+
+Everything is written through to the store. A service that stops fails the job it was running; waiting ones go on after
+the next start.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import shutil
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any
+
+from app.jobs.clock import JobClock
+from app.jobs.context import JobContext
+from app.jobs.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended, job_fields, job_from_fields
+from app.jobs.outcomes import DIED, STOPPED, after
+from app.jobs.worker import job_main
+from app.processes.child_process import end, launch
+from app.processes.messages import (
+    AskStage,
+    CancelJob,
+    ChangeJob,
+    Command,
+    Failure,
+    JobCancelled,
+    JobDone,
+    JobRests,
+    JobStep,
+    PauseJob,
+    Reply,
+    ResumeJob,
+    StepJob,
+)
+from app.storage.database import CannotStore, Store, now_utc
+from app.storage.field_files import clear_workshop
+from osfcore.errors import OsfError, UnknownName
+
+_TEMPORARY_PREFIX = ".new-"
+_ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
+_LOOK_INTERVAL_S = 0.2
+_EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
+_log = logging.getLogger(__name__)
+
+
+class QueueFull(OsfError):
+    """Too many jobs wait already."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"{limit} jobs are waiting already, which is the most; wait for one or cancel one.")
+
+
+@dataclass
+class _Run:
+    """The one job that has a process."""
+
+    id: str
+    process: SpawnProcess
+    connection: Connection
+    clock: JobClock
+    cancel_at: float | None = None  # when patience with a cancelled job ends
+
+
+class Jobs:
+    """All jobs of one data directory.
+
+    Args:
+        store: where they are kept.
+        data_dir: objects are read from it, outputs go to `collections/JOB` in it.
+        publish: told of every change, and of what running jobs let the live view draw.
+        max_queued: how many may wait.
+        cancel_grace_s: how long a cancelled job may take to stop by itself.
+        serve: carries out what a job asks for with the scene that it drives.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        data_dir: Path,
+        publish: Callable[[JobChanged | JobSeen], None],
+        max_queued: int = 20,
+        cancel_grace_s: float = 0.7,
+        serve: Callable[[Command], Any] | None = None,
+    ) -> None:
+        self._store = store
+        self._data_dir = data_dir
+        self._root = data_dir / "collections"
+        self._publish = publish
+        self._max_queued = max_queued
+        self._cancel_grace_s = cancel_grace_s
+        self._serve = serve
+        self._changed = threading.Condition(threading.RLock())
+        self._jobs: dict[str, Job] = {}
+        self._numbers: dict[str, int] = {}
+        self._run: _Run | None = None
+        self._is_stopping = False
+        self._last_event = 0.0
+        self._untold: Job | None = None  # the latest progress, if it came too soon after the one before
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Take over what the store holds, remove what was left half done, and begin to work."""
+        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
+            shutil.rmtree(folder, ignore_errors=True)
+        for number, fields in self._store.jobs():
+            job = job_from_fields(fields)
+            self._jobs[job.id], self._numbers[job.id] = job, number
+        for job in list(self._jobs.values()):
+            if job.state in ("running", "paused"):
+                self._set(after(job, STOPPED, self.folder(job.id)))
+        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the running job, which counts as failed. Calling it again does nothing."""
+        with self._changed:
+            self._is_stopping = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    # What pages and programs ask for
+
+    def all(self) -> tuple[Job, ...]:
+        """All jobs, newest first."""
+        with self._changed:
+            return tuple(self._with_position(job) for job in reversed(self._jobs.values()))
+
+    def get(self, job: str) -> Job:
+        """One job.
+
+        Raises:
+            UnknownName: if there is none of this name.
+        """
+        with self._changed:
+            if job not in self._jobs:
+                raise UnknownName("job", job, list(self._jobs)[-5:])
+            return self._with_position(self._jobs[job])
+
+    def live(self, kind: str) -> tuple[Job, ...]:
+        """Jobs of a kind that wait, run or pause."""
+        return tuple(job for job in self.all() if job.kind == kind and not job.is_finished)
+
+    def folder(self, job: str) -> Path:
+        """Where a job's outputs are."""
+        return self._root / job
+
+    def holder(self, scene: str) -> str | None:
+        """The job that drives a scene now, if one does: its parameters name it as "scene"."""
+        with self._changed:
+            job = self._jobs[self._run.id] if self._run else None
+            return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
+
+    def inputs(self, job: str) -> Path:
+        """Where a job's inputs are, if it was given any."""
+        return self.folder(job) / INPUTS
+
+    @contextlib.contextmanager
+    def new_inputs(self) -> Iterator[Path]:
+        """Where a folder of inputs may be made for `submit`; what no job has taken is removed."""
+        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def submit(self, kind: str, params: dict[str, Any], inputs: Path | None = None) -> Job:
+        """Put a job into the queue.
+
+        Args:
+            kind: what to do.
+            params: with what.
+            inputs: a folder from `new_inputs`; becomes the job's and goes with it.
+
+        Raises:
+            QueueFull: if too many wait already.
+            CannotStore: if the inputs cannot be put in place.
+        """
+        with self._changed:
+            if len(self._queue()) >= self._max_queued:
+                raise QueueFull(self._max_queued)
+            job = Job(uuid.uuid4().hex[:12], kind, params)
+            if inputs is not None:
+                self._take(job, inputs)
+            self._numbers[job.id] = 1 + max(self._numbers.values(), default=0)
+            self._set(job)
+            self._changed.notify_all()
+            return self.get(job.id)
+
+    def cancel(self, job: str, wait_s: float = 3.0) -> Job:
+        """Take a job out of the queue or end it; waits until it has ended.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it has finished.
+        """
+        with self._changed:
+            found = self.get(job)
+            if found.is_finished:
+                raise WrongJobState(found, "cancelled")
+            if found.state == "queued":
+                shutil.rmtree(self.folder(job), ignore_errors=True)
+                self._forget_workshop(found)
+                self._set(ended(self._jobs[job], "cancelled", note="Cancelled"))
+                self._tell_queue()
+                return self.get(job)
+            if self._run is not None and self._run.cancel_at is None:
+                grace_s = 0.0 if found.kind in _ENDED_AT_ONCE else self._cancel_grace_s
+                self._run.cancel_at = time.monotonic() + grace_s
+                self._order(CancelJob())
+            self._changed.wait_for(lambda: self._jobs[job].is_finished, wait_s)
+            return self.get(job)
+
+    def pause(self, job: str) -> Job:
+        """Let a running job rest after its current step.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it is not running.
+        """
+        return self._switch(job, "running", "paused", PauseJob())
+
+    def resume(self, job: str) -> Job:
+        """Let a paused job go on.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it is not paused.
+        """
+        return self._switch(job, "paused", "running", ResumeJob())
+
+    def step(self, job: str) -> Job:
+        """Let a paused job go on to the end of its round, and rest again.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it is not paused.
+        """
+        return self._switch(job, "paused", "running", StepJob())
+
+    def change(self, job: str, params: dict[str, Any]) -> Job:
+        """Let a running or paused job work with other parameters from now on.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it neither runs nor pauses.
+        """
+        with self._changed:
+            found = self.get(job)
+            if found.state not in ("running", "paused") or self._run is None or self._run.cancel_at is not None:
+                raise WrongJobState(found, "changed")
+            self._order(ChangeJob(params))
+            self._set(replace(self._jobs[job], params={**found.params, **params}))
+            return self.get(job)
+
+    def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
+        with self._changed:
+            found = self.get(job)
+            if found.state != before or self._run is None or self._run.cancel_at is not None:
+                raise WrongJobState(found, "paused" if after == "paused" else "resumed")
+            self._order(order)
+            self._run.clock.switch(is_running=after == "running")
+            self._set(replace(self._jobs[job], state=after, eta_s=None))
+            return self.get(job)
+
+    # The working thread
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_stopping or bool(self._queue()))
+                if self._is_stopping:
+                    return
+                job = self._queue()[0]
+                try:
+                    self._begin(job)
+                except OSError as error:
+                    self._set(ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
+                    continue
+            self._attend()
+
+    def _begin(self, job: Job) -> None:
+        folder = self.folder(job.id)
+        if job.kind != "fetch_assets":
+            folder.mkdir(parents=True, exist_ok=True)
+        process, connection = launch(
+            job_main, f"osf-job-{job.id}", job.kind, job.params, JobContext(self._data_dir, folder)
+        )
+        self._run = _Run(job.id, process, connection, JobClock())
+        self._set(replace(job, state="running", started_at=now_utc(), note="Starting"))
+        self._tell_queue()
+
+    def _attend(self) -> None:
+        """Follow the running job until its process has ended."""
+        run = self._run
+        assert run is not None
+        outcome: object = None
+        while outcome is None:
+            if wait([run.connection], _LOOK_INTERVAL_S if run.cancel_at is None else 0.05):
+                try:
+                    message = run.connection.recv()
+                except (EOFError, OSError):
+                    outcome = DIED
+                    break
+                if isinstance(message, JobStep):
+                    self._progress(message)
+                    if message.seen is not None:
+                        self._publish(JobSeen(self._jobs[run.id], message.seen))
+                elif isinstance(message, AskStage):
+                    self._answer(run, message)
+                elif isinstance(message, JobRests):
+                    self._rest(run)
+                else:
+                    outcome = message
+            with self._changed:
+                if outcome is not None:
+                    break
+                if self._untold is not None:
+                    self._set(self._untold, is_progress=True)
+                if self._is_stopping:
+                    outcome = STOPPED
+                elif run.cancel_at is not None and time.monotonic() > run.cancel_at:
+                    outcome = JobCancelled()
+        end(run.process, 0.0 if isinstance(outcome, Failure | JobCancelled) else 1.0)
+        run.connection.close()
+        self._finish(run, outcome)
+
+    def _finish(self, run: _Run, outcome: object) -> None:
+        job = self._jobs[run.id]
+        if run.cancel_at is not None and not isinstance(outcome, JobDone):
+            outcome = JobCancelled()  # whatever ended it first, it was asked to
+        then = after(job, outcome, self.folder(job.id))
+        if then.state == "cancelled":
+            self._forget_workshop(job)
+        with self._changed:
+            self._run = None
+            self._set(then)
+            self._changed.notify_all()
+
+    def _progress(self, step: JobStep) -> None:
+        with self._changed:
+            run = self._run
+            assert run is not None
+            eta_s = run.clock.left_s(step.done, step.total)
+            job = self._jobs[run.id]
+            result = step.result or None
+            job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
+            self._set(job, is_progress=True)
+
+    def _answer(self, run: _Run, asked: AskStage) -> None:
+        """Carry out what a job asks for, with the scene that it drives and no other."""
+        scene = self._jobs[run.id].params.get("scene")
+        try:
+            if self._serve is None or asked.command.id != scene:
+                raise UnknownName("scene of this job", asked.command.id, [str(scene)])
+            answer: Reply | Failure = Reply(0, self._serve(asked.command))
+        except OsfError as error:
+            answer = Failure.of(error)
+        self._order(answer)
+
+    def _rest(self, run: _Run) -> None:
+        """The job has come to the end of a round, and waits."""
+        with self._changed:
+            run.clock.switch(is_running=False)
+            self._set(replace(self._jobs[run.id], state="paused", eta_s=None))
+
+    def _order(self, order: PauseJob | ResumeJob | StepJob | ChangeJob | CancelJob | Reply | Failure) -> None:
+        assert self._run is not None
+        try:
+            self._run.connection.send(order)
+        except OSError:  # it has just ended; the working thread will see that
+            _log.info("job %s ended before it could be told %s", self._run.id, type(order).__name__)
+
+    # State
+
+    def _queue(self) -> list[Job]:
+        return [job for job in self._jobs.values() if job.state == "queued"]
+
+    def _with_position(self, job: Job) -> Job:
+        if job.state != "queued":
+            return job
+        return replace(job, position=1 + [other.id for other in self._queue()].index(job.id))
+
+    def _set(self, job: Job, *, is_progress: bool = False) -> None:
+        """Keep and tell a job's new state; progress is thinned out."""
+        with self._changed:
+            self._jobs[job.id] = job
+            now = time.monotonic()
+            if is_progress and now - self._last_event < _EVENT_INTERVAL_S:
+                self._untold = job
+                return
+            if self._untold is not None and self._untold.id == job.id:
+                self._untold = None
+            self._last_event = now if is_progress else self._last_event
+            self._keep_and_tell(job)
+
+    def _keep_and_tell(self, job: Job) -> None:
+        told = self._with_position(job)
+        number = 0
+        try:
+            self._store.save_job(job.id, self._numbers[job.id], job_fields(job))
+            number = self._store.add_event(job_fields(told))
+        except OsfError as error:  # a full disk must not stop the jobs
+            _log.error("job %s: %s", job.id, error)
+        self._publish(JobChanged(number, told))
+
+    def _tell_queue(self) -> None:
+        """Positions have moved up."""
+        for job in self._queue():
+            self._keep_and_tell(job)
+
+    def _take(self, job: Job, inputs: Path) -> None:
+        place = self.inputs(job.id)
+        try:
+            place.parent.mkdir(parents=True)
+            inputs.rename(place)
+        except OSError as error:
+            raise CannotStore(place, error.strerror or str(error)) from error
+
+    def _forget_workshop(self, job: Job) -> None:
+        """Remove what a cancelled training would find at its next try, unless another works there."""
+        if job.kind != "train_field":
+            return
+        name = job.params["name"]
+        if not any(other.id != job.id and other.params["name"] == name for other in self.live("train_field")):
+            clear_workshop(self._data_dir, name)

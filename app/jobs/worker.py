@@ -1,0 +1,144 @@
+"""A job process: runs the generator of one job, step by step, and listens for pause, resume and cancel."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import signal
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from app.jobs.context import JobContext, JobControl
+from app.processes.child_process import end_own_group, import_quietly, own_group, silence_stdout
+from app.processes.messages import (
+    Failure,
+    JobCancelled,
+    JobDone,
+    JobRests,
+    JobStep,
+)
+from osfcore.errors import OsfError
+
+STEP_INTERVAL_S = 0.1  # steps that come faster are not told one by one
+_log = logging.getLogger(__name__)
+
+
+def _collect_pushes(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+
+    yield from collect_pushes(CollectPushes(out=place.folder / "pushes.h5", **params), place.library)
+
+
+def _collect_object(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from osfcore.world.collection.collect_images import CollectObject, collect_object
+
+    out = place.folder / params["name"]
+    yield from collect_object(CollectObject(out=out, **params), place.library)
+    _pack(out)
+
+
+def _collect_table(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from osfcore.world.collection.collect_images import CollectTable, collect_table
+
+    out = place.folder / "table"
+    yield from collect_table(CollectTable(out=out, **params))
+    _pack(out)
+
+
+def _fetch_assets(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from osfcore.objects.fetch import fetch
+    from osfcore.objects.sources import source_from
+
+    source = source_from("pypi", place.data_dir / "downloads")
+    yield from fetch(tuple(params["names"]), source, place.library)
+
+
+def _train_field(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.fields import train_field_job
+
+    yield from train_field_job(params, place)
+
+
+def _estimate(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.estimates import estimate_job
+
+    yield from estimate_job(params, place)
+
+
+def _episode(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.episodes import episode_job
+
+    yield from episode_job(params, place)
+
+
+KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
+    "collect_pushes": _collect_pushes,
+    "collect_object": _collect_object,
+    "collect_table": _collect_table,
+    "fetch_assets": _fetch_assets,
+    "train_field": _train_field,
+    "estimate": _estimate,
+    "episode": _episode,
+}
+_WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
+_NOT_EXTRA = ("done", "total", "note", "seen")
+
+
+def job_main(connection: Connection, kind: str, params: dict[str, Any], place: JobContext) -> None:
+    """Run a job to its end and tell how it went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
+    own_group()
+    silence_stdout()
+    orders = JobControl(connection, on_lost=end_own_group)
+    if kind not in _WITHOUT_PHYSICS:
+        import_quietly("osfcore.world.tabletop")
+    with contextlib.suppress(OSError):  # the web process has gone
+        connection.send(_run(connection, orders, kind, params, place))
+
+
+def _run(connection: Connection, orders: JobControl, kind: str, params: dict[str, Any], place: JobContext) -> object:
+    result: dict[str, Any] = {}
+    last = 0.0
+    try:
+        place = dataclasses.replace(place, orders=orders)
+        with contextlib.closing(KINDS[kind](params, place)) as steps:  # pyright: ignore[reportArgumentType]
+            for step in steps:
+                result = _extras(step)
+                now = time.monotonic()
+                if now - last >= STEP_INTERVAL_S or step.done == step.total or getattr(step, "must_be_told", False):
+                    connection.send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
+                    last = now
+                if getattr(step, "ends_round", False) and orders.rests_now():
+                    connection.send(JobRests())
+                if orders.must_stop():
+                    return JobCancelled()
+    except OsfError as error:
+        return Failure.of(error)
+    except MemoryError:
+        return Failure(0, "OutOfMemory", "The job ran out of memory; take fewer or smaller images.")
+    except Exception as error:
+        _log.exception("a %s job failed", kind)
+        return Failure(0, "Internal", f"The job failed ({type(error).__name__}); the service's log tells more.")
+    return JobDone(result)
+
+
+def _extras(step: object) -> dict[str, Any]:
+    """What a step tells besides done, total, note and what the live view draws."""
+    if not dataclasses.is_dataclass(step) or isinstance(step, type):
+        return {}
+    names = (field.name for field in dataclasses.fields(step))
+    return {name: getattr(step, name) for name in names if name not in _NOT_EXTRA}
+
+
+def _pack(folder: Path) -> None:
+    """Put a folder into one ZIP beside it, for downloading; PNGs do not shrink, so they are only stored."""
+    partial = folder.with_name(f".{folder.name}.zip")
+    with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder.parent))
+    partial.replace(folder.with_name(f"{folder.name}.zip"))

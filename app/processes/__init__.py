@@ -1,0 +1,1 @@
+"""Child processes: clients, server loops, and the messages between them."""

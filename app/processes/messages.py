@@ -1,0 +1,395 @@
+"""What crosses the lines between the web process, the stage process and job processes: frozen dataclasses only.
+
+Errors cross as `Failure` (class name and sentence), because exceptions with constructors of their own do not pickle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from osfcore.errors import OsfError
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneRecord:
+    """A scene as the stage last reported it.
+
+    Attributes:
+        id: identifier.
+        seed: from which it was drawn.
+        created_at: UTC, ISO 8601.
+        image_size: side of its camera images [px].
+        initial: where `reset` goes back to.
+        state: where everything is now.
+        time_s: simulated time since creation or reset [s].
+        revision: grows with every change.
+    """
+
+    id: str
+    seed: int
+    created_at: str
+    image_size: int
+    initial: SceneState
+    state: SceneState
+    time_s: float
+    revision: int
+
+
+# Commands to the stage; each is answered by one Reply or Failure.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CreateScene:
+    """Make a scene: random from the seed, or with exact poses. Answered by a SceneRecord."""
+
+    id: str
+    seed: int
+    created_at: str
+    image_size: int
+    names: tuple[str, ...] | None
+    count: int
+    light: Light | None
+    poses: Pose | None  # of `names`; None for random ones
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AdoptScene:
+    """Take over a scene that was known before this stage started. Answered by its SceneRecord."""
+
+    record: SceneRecord
+
+
+@dataclass(frozen=True, slots=True)
+class DropScene:
+    """Forget a scene."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class ResetScene:
+    """Go back to how the scene was created. Answered by a SceneRecord."""
+
+    id: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EditScene:
+    """Move light and objects by hand, all or nothing. Answered by a SceneRecord.
+
+    With `settle`, the objects then come to rest as if let go.
+    """
+
+    id: str
+    light: Light | None = None
+    poses: tuple[tuple[str, Pose], ...] = ()
+    settle: bool = False
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Act:
+    """Hold each velocity [m/s] for one step. Answered by a SceneRecord."""
+
+    id: str
+    actions: tuple[Float[np.ndarray, "3"], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TakeImage:
+    """One camera's image as PNG, with the masks drawn over it on demand. Answered by bytes."""
+
+    id: str
+    camera: str
+    size: int
+    masks: bool = False
+    pusher: bool = True
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TakeView:
+    """What any camera would see, as PNG. Answered by bytes."""
+
+    id: str
+    camera: Camera
+    pusher: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class TakeMask:
+    """The visible pixels of one object, as 8-bit PNG of 0 and 255. Answered by bytes."""
+
+    id: str
+    camera: str
+    object: str
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class ObserveScene:
+    """What the robot sees of a scene now, as an observation folder. Answered by the SceneRecord that was observed.
+
+    Attributes:
+        id: of the scene.
+        folder: to write; nothing in it tells the truth.
+        goal: the goal camera's view alone, without the pusher.
+        masks: whether to tell each object's visible pixels.
+    """
+
+    id: str
+    folder: Path
+    goal: bool
+    masks: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ComposeGoal:
+    """How a scene could become, seen by the goal camera without the pusher. Answered by a ComposedGoal.
+
+    The scene stays as it is.
+
+    Attributes:
+        id: of the scene.
+        poses: of objects that lie elsewhere; they come to rest as if let go.
+        seed: of a random layout, instead of poses; None for the poses.
+        moved: objects that a random layout moves; as the seed will have it if None.
+        light: in which it is seen; None for the scene's.
+        size: side of the image [px].
+    """
+
+    id: str
+    poses: tuple[tuple[str, Pose], ...] = ()
+    seed: int | None = None
+    moved: int | None = None
+    light: Light | None = None
+    size: int = DEFAULT_IMAGE_SIDE
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ComposedGoal:
+    """How a scene could become.
+
+    Attributes:
+        png: what the goal camera sees.
+        poses: of all objects, at rest.
+    """
+
+    png: bytes
+    poses: tuple[tuple[str, Pose], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShowScene:
+    """Which scene's camera images are wanted live; None for no scene."""
+
+    id: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class WatchFrames:
+    """Whether anyone looks at live camera images."""
+
+    wanted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Leave:
+    """End the process."""
+
+
+Command = (
+    CreateScene
+    | AdoptScene
+    | DropScene
+    | ResetScene
+    | EditScene
+    | Act
+    | TakeImage
+    | TakeView
+    | TakeMask
+    | ObserveScene
+    | ComposeGoal
+    | ShowScene
+    | WatchFrames
+    | Leave
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Request:
+    """A command with the number under which it is answered."""
+
+    number: int
+    command: Command
+
+
+# From the stage.
+
+
+@dataclass(frozen=True, slots=True)
+class StageReady:
+    """The process has loaded its libraries and takes commands."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Reply:
+    """A command's result."""
+
+    number: int
+    value: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A command that could not be done, or a job that ended in an error.
+
+    Attributes:
+        number: of the request; 0 for a job.
+        kind: class name of the error.
+        text: one sentence for a person.
+    """
+
+    number: int
+    kind: str
+    text: str
+
+    @staticmethod
+    def of(error: OsfError, number: int = 0) -> Failure:
+        """The failure that an error amounts to."""
+        return Failure(number, type(error).__name__, str(error))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneChanged:
+    """A scene has changed.
+
+    Attributes:
+        record: how it is now.
+        states: the way there, `interval_s` apart in simulated time, the end included; empty for a jump.
+        interval_s: time between two states [s].
+    """
+
+    record: SceneRecord
+    states: tuple[SceneState, ...] = ()
+    interval_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FramesTaken:
+    """Live images of a scene's cameras.
+
+    Attributes:
+        scene: identifier of the scene.
+        revision: of the scene when they were taken.
+        names: of the cameras.
+        images: 8-bit RGB.
+        jpegs: the same, encoded.
+    """
+
+    scene: str
+    revision: int
+    names: tuple[str, ...]
+    images: UInt8[np.ndarray, "V h w 3"]
+    jpegs: tuple[bytes, ...]
+
+
+# From and to job processes.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JobStep:
+    """How far a job is.
+
+    Attributes:
+        done: units finished.
+        total: units in all.
+        note: what is being done, for a person.
+        result: what its kind tells besides.
+        seen: what the live view draws of it, and nobody keeps; None for most kinds.
+    """
+
+    done: int
+    total: int
+    note: str
+    result: dict[str, Any]
+    seen: object = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AskStage:
+    """A job wants something done with the scene that it drives. Answered by a Reply or Failure, numbered 0."""
+
+    command: Act | ObserveScene | TakeView
+
+
+@dataclass(frozen=True, slots=True)
+class JobRests:
+    """A job has come to the end of the round after which it was to rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobDone:
+    """A job has finished."""
+
+    result: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class JobCancelled:
+    """A job has stopped because it was asked to."""
+
+
+@dataclass(frozen=True, slots=True)
+class PauseJob:
+    """Stop after the current step, until resumed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResumeJob:
+    """Go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepJob:
+    """Go on to the end of the current round, then rest; for kinds of jobs that have rounds."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ChangeJob:
+    """From now on, work with these parameters; for kinds of jobs that look at changes."""
+
+    params: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CancelJob:
+    """Stop after the current step."""
+
+
+# Only within the web process.
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentScene:
+    """Another scene is shown now, or none."""
+
+    record: SceneRecord | None
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A sentence for whoever watches; `level` is "info", "warning" or "error"."""
+
+    level: str
+    text: str
+
+
+StageEvent = SceneChanged | FramesTaken

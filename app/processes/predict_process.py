@@ -1,0 +1,87 @@
+"""The predicting process: tells where sequences of actions would lead. It starts when somebody first asks.
+
+Only `predictor_main` is imported by the web process, by name; torch loads in the child.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from app.processes.neural_messages import Order, Predicted, PredictPushes
+from app.processes.render_process import serve
+from osfcore.errors import OsfError
+from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
+
+if TYPE_CHECKING:
+    from osfcore.dynamics.rollout import PushModel
+
+WHO = "predictor of pushes"
+_MOST_MODELS = 8
+
+
+def predictor_main(connection: Connection, data_dir: Path) -> None:
+    """Serve orders until the other end is gone."""
+    serve(connection, Oracle(data_dir).answer, WHO)
+
+
+class Oracle:
+    """Predicts; keeps the models of the latest sets of objects, and loads one again when one of its files has changed.
+
+    Args:
+        data_dir: where trained fields, and perhaps a trained network, are.
+    """
+
+    def __init__(self, data_dir: Path) -> None:
+        self._data_dir = data_dir
+        self._fields = FieldLibrary(data_dir)
+        self._models: OrderedDict[object, PushModel] = OrderedDict()
+
+    def answer(self, order: Order, is_overtaken: Callable[[], bool] = lambda: False) -> Predicted | None:
+        """What answers an order; None if nobody waits for it any more.
+
+        Raises:
+            InvalidInput: if the state or the actions cannot be predicted.
+            UnknownName: if an object has no field.
+            CorruptFile: if a field or the network is broken.
+        """
+        if not isinstance(order, PredictPushes):
+            raise TypeError(f"{type(order).__name__} is no prediction")
+        if is_overtaken():
+            return None
+        model = self._model(order.state.names)
+        start = time.perf_counter()
+        rollouts = model.rollout(order.state, order.actions, order.before)
+        took_s = time.perf_counter() - start
+        if not all(np.isfinite(part).all() for part in (rollouts.positions, rollouts.quaternions, rollouts.pusher)):
+            raise OsfError("The prediction runs out of all bounds, so there is none; begin with objects on the table.")
+        return Predicted(rollouts, took_s)
+
+    def _model(self, names: tuple[str, ...]) -> PushModel:
+        from osfcore.dynamics.push_models import load_push_model, network_path
+
+        wanted = tuple(sorted(names))
+        stamps = [_stamp(self._fields.folder(name) / FIELD_FILE) for name in wanted]
+        key = (wanted, *stamps, _stamp(network_path(self._data_dir)))
+        if key not in self._models:
+            self._models[key] = load_push_model(self._data_dir, self._fields, wanted)
+            while len(self._models) > _MOST_MODELS:
+                self._models.popitem(last=False)
+        self._models.move_to_end(key)
+        return self._models[key]
+
+
+def _stamp(path: Path) -> object:
+    """Changes when a file is written again or deleted; what ships with the program has none here and stays."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size

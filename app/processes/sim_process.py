@@ -1,0 +1,401 @@
+"""The stage process: holds the simulated scenes, carries out commands, tells what moves and what the cameras see.
+
+Nothing here is imported by the web process but `stage_main`, by name; physics and ray tracing load in the child only.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections import OrderedDict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from app.processes.child_process import import_quietly, silence_stdout
+from app.processes.messages import (
+    Act,
+    AdoptScene,
+    Command,
+    ComposedGoal,
+    ComposeGoal,
+    CreateScene,
+    DropScene,
+    EditScene,
+    Failure,
+    FramesTaken,
+    Leave,
+    ObserveScene,
+    Reply,
+    Request,
+    ResetScene,
+    SceneChanged,
+    SceneRecord,
+    ShowScene,
+    StageReady,
+    TakeImage,
+    TakeMask,
+    TakeView,
+    WatchFrames,
+)
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.geometry.cameras import Camera, default_cameras, goal_camera, image_side
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import STEP_S, check_action
+from osfcore.objects.asset_library import AssetLibrary
+
+if TYPE_CHECKING:
+    from osfcore.world.tabletop import Tabletop
+
+STATES_HZ = 60.0
+FRAME_INTERVAL_S = 0.2
+MAX_FRAME_SIDE = 192  # live images larger than this cost more than they show
+_PARENT_CHECK_S = 1.0
+_log = logging.getLogger(__name__)
+
+
+def stage_main(connection: Connection, objects_root: Path, max_live_worlds: int) -> None:
+    """Serve commands until told to leave or the other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
+    silence_stdout()
+    import_quietly("osfcore.world.tabletop")  # slow, so before the stage calls itself ready
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
+        stage = Stage(connection, AssetLibrary(objects_root), executor, max_live_worlds)
+        try:
+            connection.send(StageReady())
+            stage.serve()
+        except (EOFError, OSError):  # the web process has gone
+            pass
+        finally:
+            stage.close()
+
+
+class Stage:
+    """Scenes by identifier; the latest few have a live simulation, the others are loaded when needed."""
+
+    def __init__(
+        self, connection: Connection, library: AssetLibrary, executor: ThreadPoolExecutor, max_live_worlds: int
+    ) -> None:
+        self._connection = connection
+        self._library = library
+        self._executor = executor
+        self._max_live_worlds = max_live_worlds
+        self._records: dict[str, SceneRecord] = {}
+        self._worlds: OrderedDict[str, Tabletop] = OrderedDict()
+        self._time_offsets: dict[str, float] = {}
+        self._shown: str | None = None
+        self._frames_wanted = False
+        self._frames_due = False
+        self._last_frames = 0.0
+        self._last_lag_s = 0.0
+
+    def serve(self) -> None:
+        """Carry out commands in order; take live images in between."""
+        while True:
+            if not self._connection.poll(self._wait_s()):
+                self._take_frames()
+                continue
+            request = self._connection.recv()
+            if isinstance(request.command, Leave):
+                return
+            self._connection.send(self._answer(request))
+            # A page that keeps pushing would otherwise starve the live images.
+            if time.monotonic() - self._last_frames > 3 * FRAME_INTERVAL_S:
+                self._take_frames()
+
+    def close(self) -> None:
+        """Free all simulations."""
+        for world in self._worlds.values():
+            world.close()
+        self._worlds.clear()
+
+    def _wait_s(self) -> float:
+        if not (self._frames_due and self._frames_wanted):
+            return _PARENT_CHECK_S
+        return max(self._last_frames + FRAME_INTERVAL_S - time.monotonic(), 0.0)
+
+    def _answer(self, request: Request) -> Reply | Failure:
+        try:
+            return Reply(request.number, self._carry_out(request.command))
+        except OsfError as error:
+            return Failure.of(error, request.number)
+        except (EOFError, BrokenPipeError):
+            raise
+        except Exception as error:
+            # A defect: the simulation may be in any state, so it is loaded afresh from the last record.
+            _log.exception("the stage could not carry out %s", type(request.command).__name__)
+            self._forget_world(getattr(request.command, "id", ""))
+            return Failure(request.number, "Internal", f"The simulation failed ({type(error).__name__}).")
+
+    def _carry_out(self, command: Command) -> object:
+        match command:
+            case CreateScene():
+                return self._create(command)
+            case AdoptScene(record):
+                self._records[record.id] = record
+                return record
+            case DropScene(scene):
+                self._records.pop(scene, None)
+                self._forget_world(scene)
+            case ResetScene(scene):
+                record = self._record(scene)
+                return self._put(record, record.initial, time_s=0.0)
+            case EditScene():
+                return self._edit(command)
+            case Act(scene, actions):
+                return self._act(scene, tuple(check_action(a) for a in actions))
+            case TakeImage():
+                return self._image(command)
+            case TakeView(scene, camera, pusher):
+                image = self._world(scene).render((camera,), with_pusher=pusher).images[0]
+                return _encoded(_eight_bit(image), ".png")
+            case TakeMask():
+                return self._mask(command)
+            case ObserveScene():
+                return self._observe(command)
+            case ComposeGoal():
+                return self._compose(command)
+            case ShowScene(scene):
+                self._shown = scene
+                self._frames_due = scene is not None
+            case WatchFrames(wanted):
+                self._frames_wanted = wanted
+                self._frames_due = self._frames_due or wanted
+        return None
+
+    def _record(self, scene: str) -> SceneRecord:
+        if scene not in self._records:
+            raise UnknownName("scene", scene, self._records)
+        return self._records[scene]
+
+    # Worlds
+
+    def _create(self, command: CreateScene) -> SceneRecord:
+        from osfcore.world.tabletop import SceneRequest, Tabletop
+
+        request = SceneRequest(command.names, command.count, command.light)
+        world = Tabletop(self._library, request=request, executor=self._executor)
+        try:
+            if command.poses is None:
+                world.arrange(command.seed)
+            else:
+                light = command.light or Light.random(np.random.default_rng(command.seed))
+                world.load(SceneState(command.names or (), command.poses, light, None))
+        except BaseException:
+            world.close()
+            raise
+        state = world.truth()
+        record = SceneRecord(
+            command.id, command.seed, command.created_at, command.image_size, state, state, time_s=0.0, revision=1
+        )
+        self._keep_world(record.id, world, time_offset_s=0.0)
+        self._tell(record)
+        return record
+
+    def _world(self, scene: str) -> Tabletop:
+        """The scene's simulation, loaded from its record if it is not in memory."""
+        from osfcore.world.tabletop import SceneRequest, Tabletop
+
+        record = self._record(scene)
+        if scene in self._worlds:
+            self._worlds.move_to_end(scene)
+            return self._worlds[scene]
+        world = Tabletop(self._library, request=SceneRequest(record.state.names), executor=self._executor)
+        world.restore(record.state)
+        self._keep_world(scene, world, time_offset_s=record.time_s)
+        return world
+
+    def _keep_world(self, scene: str, world: Tabletop, *, time_offset_s: float) -> None:
+        self._worlds[scene] = world
+        self._time_offsets[scene] = time_offset_s
+        while len(self._worlds) > self._max_live_worlds:
+            self._forget_world(next(iter(self._worlds)))
+
+    def _forget_world(self, scene: str) -> None:
+        world = self._worlds.pop(scene, None)
+        self._time_offsets.pop(scene, None)
+        if world is not None:
+            world.close()
+
+    # Changes
+
+    def _put(self, record: SceneRecord, state: SceneState, *, time_s: float) -> SceneRecord:
+        self._world(record.id).load(state)
+        self._time_offsets[record.id] = time_s
+        return self._report(record)
+
+    def _edit(self, command: EditScene) -> SceneRecord:
+        record, world = self._record(command.id), self._world(command.id)
+        if command.poses:
+            self._move(world, record, dict(command.poses))
+        if command.light is not None:
+            world.set_light(command.light)
+        if command.settle:
+            self._report(record)  # the jump; from there they fall
+            self._stream(record.id, world.settle(rate_hz=STATES_HZ), 1 / STATES_HZ)
+        return self._report(record)
+
+    def _move(self, world: Tabletop, record: SceneRecord, poses: dict[str, Pose]) -> None:
+        """Put objects somewhere else, all at once, so that two may swap places."""
+        if len(poses) == 1:
+            ((name, pose),) = poses.items()
+            world.move_object(name, pose)
+            return
+        state = world.truth()
+        for name in poses:
+            if name not in state.names:
+                raise UnknownName("object on the table", name, state.names)
+        every = [poses.get(name, state.pose(name)) for name in state.names]
+        stacked = Pose(np.array([p.position for p in every]), np.array([p.quaternion for p in every]))
+        time_s = self._time_s(record.id)
+        world.load(SceneState(state.names, stacked, state.light, state.pusher))
+        self._time_offsets[record.id] = time_s
+
+    def _act(self, scene: str, actions: tuple[np.ndarray, ...]) -> SceneRecord:
+        world, record = self._world(scene), self._record(scene)
+        for action in actions:
+            record = self._stream(scene, world.act_steps(action, rate_hz=STATES_HZ), 0.0)
+            if time.monotonic() - self._last_frames > FRAME_INTERVAL_S + self._last_lag_s:
+                self._take_frames()
+        return record
+
+    def _stream(self, scene: str, steps: Iterator[SceneState], interval_s: float) -> SceneRecord:
+        """Run through the steps, then tell all of them; an interval of 0 spreads them over one action."""
+        states = tuple(steps)
+        return self._report(self._record(scene), states, interval_s or STEP_S / max(len(states), 1))
+
+    def _report(self, record: SceneRecord, states: tuple[SceneState, ...] = (), interval_s: float = 0.0) -> SceneRecord:
+        changed = replace(
+            record,
+            state=self._world(record.id).truth(),
+            time_s=self._time_s(record.id),
+            revision=self._record(record.id).revision + 1,
+        )
+        self._tell(changed, states, interval_s)
+        return changed
+
+    def _tell(self, record: SceneRecord, states: tuple[SceneState, ...] = (), interval_s: float = 0.0) -> None:
+        self._records[record.id] = record
+        self._connection.send(SceneChanged(record, states, interval_s))
+        self._frames_due = self._frames_due or record.id == self._shown
+
+    def _time_s(self, scene: str) -> float:
+        return self._time_offsets[scene] + self._worlds[scene].time_s
+
+    # Pictures
+
+    def _camera(self, name: str, size: int) -> Camera:
+        cameras = {c.name: c for c in (*default_cameras(image_side(size)), goal_camera(size))}
+        if name not in cameras:
+            raise UnknownName("camera", name, cameras)
+        return cameras[name]
+
+    def _image(self, command: TakeImage) -> bytes:
+        world, camera = self._world(command.id), self._camera(command.camera, command.size)
+        seen = world.render((camera,), masks=command.masks, with_pusher=command.pusher)
+        pixels = _eight_bit(seen.images[0])
+        if command.masks and seen.masks is not None:
+            pixels = draw_masks(pixels, seen.masks[0])
+        return _encoded(pixels, ".png")
+
+    def _mask(self, command: TakeMask) -> bytes:
+        world, camera = self._world(command.id), self._camera(command.camera, command.size)
+        if command.object not in world.names:
+            raise UnknownName("object on the table", command.object, world.names)
+        masks = world.render((camera,), masks=True).masks
+        if masks is None:
+            raise InvalidInput("renderer", "without masks", "one that makes masks")
+        return _encoded(masks[0][world.names.index(command.object)].astype(np.uint8) * 255, ".png")
+
+    def _observe(self, command: ObserveScene) -> SceneRecord:
+        from osfcore.io.observation_file import write_observation
+
+        record, world = self._record(command.id), self._world(command.id)
+        cameras = (goal_camera(record.image_size),) if command.goal else default_cameras(record.image_size)
+        seen = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
+        write_observation(command.folder, seen)
+        return replace(record, state=world.truth())
+
+    def _compose(self, command: ComposeGoal) -> ComposedGoal:
+        from osfcore.world.goal_layouts import arranged_goal, random_goal
+
+        world, time_s = self._world(command.id), self._time_s(command.id)
+        try:
+            if command.seed is not None:
+                goal, _ = random_goal(world, command.seed, command.moved)
+            else:
+                goal = arranged_goal(world, dict(command.poses))
+            if command.light is not None:
+                world.set_light(command.light)
+            image = world.render((goal_camera(image_side(command.size)),), with_pusher=False).images[0]
+        finally:
+            world.restore(self._record(command.id).state)
+            self._time_offsets[command.id] = time_s
+        poses = tuple((name, goal.pose(name)) for name in goal.names)
+        return ComposedGoal(_encoded(_eight_bit(image), ".png"), poses)
+
+    def _take_frames(self) -> None:
+        """Send the shown scene's live images if they are wanted and stale."""
+        if not (self._frames_due and self._frames_wanted) or self._shown not in self._records:
+            self._frames_due = self._frames_due and self._shown in self._records
+            return
+        start = time.monotonic()
+        self._frames_due = False
+        record = self._records[self._shown]
+        try:
+            seen = self._world(record.id).render(default_cameras(min(record.image_size, MAX_FRAME_SIDE)))
+        except OsfError as error:
+            _log.warning("no live images of scene %s: %s", record.id, error)
+            return
+        images = _eight_bit(seen.images)
+        jpegs = tuple(_encoded(image, ".jpg") for image in images)
+        names = tuple(camera.name for camera in seen.cameras)
+        self._connection.send(FramesTaken(record.id, record.revision, names, images, jpegs))
+        self._last_frames = time.monotonic()
+        self._last_lag_s = self._last_frames - start
+
+
+MASK_COLOURS = np.array(
+    [
+        [230, 85, 60],
+        [60, 140, 230],
+        [70, 180, 90],
+        [235, 180, 50],
+        [160, 95, 210],
+        [40, 190, 190],
+        [235, 110, 170],
+        [140, 120, 90],
+    ],
+    np.uint8,
+)
+
+
+def draw_masks(pixels: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """An 8-bit image (h, w, 3) with masks (N, h, w) laid over it, half transparent, one colour each."""
+    drawn = pixels.copy()
+    for number, mask in enumerate(masks):
+        colour = MASK_COLOURS[number % len(MASK_COLOURS)]
+        drawn[mask] = (pixels[mask].astype(np.uint16) + colour) // 2
+    return drawn
+
+
+def _eight_bit(images: np.ndarray) -> np.ndarray:
+    return np.round(np.clip(images, 0, 1) * 255).astype(np.uint8)
+
+
+def _encoded(pixels: np.ndarray, suffix: str) -> bytes:
+    import cv2
+
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 85] if suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
+    _, data = cv2.imencode(suffix, pixels[..., ::-1] if pixels.ndim == 3 else pixels, quality)
+    return data.tobytes()

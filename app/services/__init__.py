@@ -1,0 +1,1 @@
+"""What REST, viewer and jobs have in common: one service for each noun."""

@@ -1,0 +1,311 @@
+"""Estimates of poses and light: taking in what is to be estimated, and telling what came of it.
+
+The work is a job (`estimate_job`). What it gets is an observation folder, of a scene of the simulation or uploaded. The
+truth of a scene stays beside that folder, where only this module reads it, after the work.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+
+from app.jobs.job import Job
+from app.jobs.kinds.estimates import OBSERVATION, PRIOR, STATE, STEPS, TRUTH, Mode, guess_of, read_steps
+from app.processes.neural_messages import CompareView
+from app.services.estimate_errors import errors_of
+from app.services.fields import FieldCatalogue, MissingFields
+from app.services.runner import Runner
+from app.storage.uploads import Examiner, save
+from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName, check_seed
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.io.files import read_json, write_json
+from osfcore.io.scene_file import Scene, camera_from_json, read_scene, scene_to_json
+from osfcore.io.state_file import estimated_to_json, read_estimated, write_estimated
+
+KIND = "estimate"
+_ARCHIVE = "observation.zip"
+
+
+class NoScene(OsfError):
+    """There is nothing to look at."""
+
+    def __init__(self) -> None:
+        super().__init__("There is no scene to estimate; make one, or upload an observation.")
+
+
+class NoPrior(OsfError):
+    """An estimate that needs an earlier one."""
+
+    def __init__(self, mode: str, where: str) -> None:
+        super().__init__(f'Mode "{mode}" begins with an earlier estimate, and there is none {where}.')
+
+
+class NoImages(OsfError):
+    """An estimate whose images are gone, or not there yet."""
+
+    def __init__(self, job: str, why: str) -> None:
+        super().__init__(f"Estimate {job} has no images to show; {why}.")
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What to estimate, and how.
+
+    Attributes:
+        mode: "first" with masks, "next" from an earlier estimate, "goal" for one view without masks.
+        seed: of the searches.
+        prior: the earlier estimate; None for the latest one of the same scene.
+    """
+
+    mode: Mode = "first"
+    seed: int = 0
+    prior: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """What was found in an uploaded observation.
+
+    Attributes:
+        names: of the objects.
+        cameras: their names.
+        has_masks: whether it tells visible pixels.
+        unseen: objects whose masks are all empty.
+        has_prior: whether a state of how the objects lie came with it.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[str, ...]
+    has_masks: bool
+    unseen: tuple[str, ...]
+    has_prior: bool
+
+
+class Estimates:
+    """The estimates of one service. Methods that change something block; any thread may call them.
+
+    Args:
+        runner: holds scenes and jobs.
+        fields: what can be recognised.
+    """
+
+    def __init__(self, runner: Runner, fields: FieldCatalogue) -> None:
+        self._runner = runner
+        self._fields = fields
+        self._examiner: Examiner[Uploaded] = Examiner(examine, "observation", _names)
+
+    def stop(self) -> None:
+        """End the process that looks at an upload, if there is one. Calling it again does nothing."""
+        self._examiner.stop()
+
+    # Asking for one
+
+    def of_scene(self, asked: Asked, scene: str | None = None) -> Job:
+        """Look at a scene, the current one if none is named, and estimate what is seen.
+
+        Raises:
+            NoScene, UnknownName: if there is no such scene.
+            MissingFields: if an object in it cannot be recognised.
+            NoPrior: if an earlier estimate is needed and there is none.
+            QueueFull: if too many jobs wait.
+        """
+        check_seed(asked.seed)
+        scene = scene or self._runner.current
+        if scene is None:
+            raise NoScene
+        names = self._runner.scene(scene).state.names
+        if missing := sorted(set(names) - set(self._fields.names())):
+            raise MissingFields(missing)
+        prior = None if asked.mode == "first" else self._prior(asked, names, scene)
+        with self._runner.jobs.new_inputs() as folder:
+            is_goal = asked.mode == "goal"
+            seen = self._runner.observe(scene, folder / OBSERVATION, goal=is_goal, masks=asked.mode == "first")
+            write_json(folder / TRUTH, scene_to_json(Scene(seen.state, ())))
+            if prior is not None:
+                write_estimated(folder / PRIOR, prior)
+            cameras = _cameras(folder / OBSERVATION)
+            of = {"scene": scene, "revision": seen.revision, "file_name": None}
+            return self._submit(asked, of, names, tuple(camera.name for camera in cameras), folder)
+
+    async def of_upload(self, asked: Asked, chunks: AsyncIterator[bytes], file_name: str) -> Job:
+        """Take in a zipped observation folder, bit by bit, and estimate what it shows.
+
+        Raises:
+            UploadRefused: if it cannot be read.
+            InvalidInput: if it does not fit the mode.
+            UnknownName: if an object in it cannot be recognised, or the earlier estimate is unknown.
+            NoPrior: if an earlier estimate is needed and there is none.
+            QueueFull: if too many jobs wait.
+        """
+        check_seed(asked.seed)
+        with self._runner.jobs.new_inputs() as folder:
+            await save(chunks, folder / _ARCHIVE)
+            found = await self._examiner.examine(folder)
+            return await run_in_threadpool(self._of_examined, asked, found, folder, file_name)
+
+    def _of_examined(self, asked: Asked, found: Uploaded, folder: Path, file_name: str) -> Job:
+        known = self._fields.names()
+        for name in found.names:
+            if name not in known:
+                raise UnknownName("field", name, known)
+        _check_fits(asked.mode, found)
+        if asked.mode != "first" and not (found.has_prior and asked.prior is None):
+            write_estimated(folder / PRIOR, self._prior(asked, found.names, None))
+        of = {"scene": None, "revision": None, "file_name": file_name}
+        return self._submit(asked, of, found.names, found.cameras, folder)
+
+    def _submit(
+        self, asked: Asked, of: dict[str, Any], names: tuple[str, ...], cameras: tuple[str, ...], folder: Path
+    ) -> Job:
+        params = {"mode": asked.mode, "seed": asked.seed, "of": of, "names": list(names), "cameras": list(cameras)}
+        return self._runner.jobs.submit(KIND, params, folder)
+
+    def _prior(self, asked: Asked, names: tuple[str, ...], scene: str | None) -> EstimatedState:
+        """The estimate to begin with, its objects in the order of `names`."""
+        if asked.prior is not None:
+            job = self.get(asked.prior)
+            if job.state != "done":
+                raise InvalidInput(f"status of estimate {job.id}", job.state, "done")
+        elif scene is None:
+            raise NoPrior(asked.mode, "in the archive (prior.json) or named in the request (prior)")
+        else:
+            done = (job for job in self.all() if job.state == "done" and job.params["of"]["scene"] == scene)
+            job = next((job for job in done if job.params["mode"] != "goal"), None)
+            if job is None:
+                raise NoPrior(asked.mode, "of this scene")
+        prior = self._state(job)
+        if prior.state.names != names:
+            raise InvalidInput(f"objects of estimate {job.id}", ", ".join(prior.state.names), ", ".join(names))
+        return prior
+
+    # Telling of one
+
+    def all(self) -> tuple[Job, ...]:
+        """All estimates, newest first."""
+        return tuple(job for job in self._runner.jobs.all() if job.kind == KIND)
+
+    def get(self, estimate: str) -> Job:
+        """One estimate.
+
+        Raises:
+            UnknownName: if there is none of this name.
+        """
+        known = [job.id for job in self.all()]
+        if estimate not in known:
+            raise UnknownName("estimate", estimate, known[:5])
+        return self._runner.jobs.get(estimate)
+
+    def steps(self, job: Job) -> tuple[dict[str, Any], ...]:
+        """What was told of each step so far, see `read_steps`."""
+        return read_steps(self._runner.jobs.folder(job.id) / STEPS)
+
+    def result(self, job: Job) -> dict[str, Any] | None:
+        """What state.json holds; None until it is there."""
+        return estimated_to_json(self._state(job)) if job.state == "done" else None
+
+    def simulation_errors(self, job: Job) -> dict[str, Any] | None:
+        """How far the result is from the truth, which only a simulation knows; None without either."""
+        truth = self._runner.jobs.inputs(job.id) / TRUTH
+        if job.state != "done" or not truth.is_file():
+            return None
+        return errors_of(self._state(job).state, read_scene(truth).state, self._runner.library)
+
+    def observed(self, job: Job, view: int) -> Path:
+        """The image of a camera, by number.
+
+        Raises:
+            UnknownName: if there is no such camera.
+            NoImages: if the estimate was cancelled or failed.
+        """
+        return self._observed(job, view)[1]
+
+    def comparison(self, job: Job, view: int, step: int | None = None) -> CompareView:
+        """The order that compares what a camera saw with a step's guess, by default the latest one's.
+
+        Raises:
+            UnknownName: if there is no such camera or step.
+            NoImages: if the estimate was cancelled, failed or has not begun.
+        """
+        camera, image = self._observed(job, view)
+        steps = self.steps(job)
+        if not steps:
+            raise NoImages(job.id, "its first step has not been made yet")
+        if step is not None and not 1 <= step <= len(steps):
+            raise UnknownName("step", str(step), [f"1 to {len(steps)}"])
+        guess = guess_of(steps[-1 if step is None else step - 1])
+        return CompareView(uuid.uuid4().hex, guess, camera, image.read_bytes())
+
+    def _observed(self, job: Job, view: int) -> tuple[Camera, Path]:
+        names = job.params["cameras"]
+        if not 0 <= view < len(names):
+            raise UnknownName("view", str(view), [str(number) for number in range(len(names))])
+        folder = self._runner.jobs.inputs(job.id) / OBSERVATION
+        if not folder.is_dir():
+            raise NoImages(job.id, f"it was {job.state}" if job.state == "cancelled" else f"it has {job.state}")
+        return _cameras(folder)[view], folder / _images(folder)[names[view]]
+
+    def _state(self, job: Job) -> EstimatedState:
+        return read_estimated(self._runner.jobs.folder(job.id) / STATE)
+
+
+def examine(folder: Path) -> Uploaded:
+    """Unpack `observation.zip` of a folder to `observation` beside it and judge it, as `osf check` does.
+
+    Raises:
+        OsfError: if it is no sound observation.
+    """
+    from osfcore.io.archives import unpack_observation
+    from osfcore.io.observation_file import read_observation
+
+    place = unpack_observation(folder / _ARCHIVE, folder / OBSERVATION)
+    (folder / _ARCHIVE).unlink()
+    seen = read_observation(place)
+    unseen = () if seen.masks is None else tuple(n for i, n in enumerate(seen.names) if not seen.masks[:, i].any())
+    has_prior = (place / PRIOR).is_file()
+    if has_prior:
+        prior = read_estimated(place / PRIOR)
+        if set(prior.state.names) != set(seen.names):
+            raise InvalidInput("objects of prior.json", ", ".join(prior.state.names), ", ".join(seen.names))
+        try:
+            (place / PRIOR).rename(folder / PRIOR)
+        except OSError as error:
+            raise CannotWrite(folder, error.strerror or str(error)) from error
+    return Uploaded(seen.names, tuple(c.name for c in seen.cameras), seen.masks is not None, unseen, has_prior)
+
+
+def _names(folder: Path) -> dict[str, str]:
+    """What the uploader calls the places in a folder."""
+    return {
+        f"{folder / _ARCHIVE}": "The uploaded file",
+        f"{folder / OBSERVATION}/": "",
+        f"{folder / OBSERVATION}": "The uploaded observation",
+    }
+
+
+def _check_fits(mode: Mode, found: Uploaded) -> None:
+    """Refuse at once what the estimator would refuse."""
+    if mode == "first" and not found.has_masks:
+        raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
+    if mode == "first" and found.unseen:
+        raise InvalidInput(f"mask of {found.unseen[0]}", "empty in every view", "not empty in at least one view")
+    if mode == "goal" and len(found.cameras) != 1:
+        raise InvalidInput("number of views of a goal", len(found.cameras), "1")
+
+
+def _cameras(folder: Path) -> tuple[Camera, ...]:
+    return read_json(folder / "observation.json", lambda data: tuple(map(camera_from_json, _root(data)["cameras"])))
+
+
+def _images(folder: Path) -> Mapping[str, str]:
+    return read_json(folder / "observation.json", lambda data: _root(data)["images"])
+
+
+def _root(data: object) -> dict[str, Any]:
+    assert isinstance(data, dict)  # it was checked when it came
+    return data

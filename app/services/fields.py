@@ -1,0 +1,74 @@
+"""The fields of this machine as the page lists them: those shipped with the program and those trained here."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+from app.storage.field_files import uninstall
+from osfcore.errors import OsfError
+from osfcore.fields.field_library import FieldInfo, FieldLibrary
+
+
+class ShippedField(OsfError):
+    """A field that belongs to the program."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"The field of {name} is shipped with the program and cannot be deleted.")
+
+
+class MissingFields(OsfError):
+    """Objects that can be neither rendered nor recognised."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
+
+
+class FieldCatalogue:
+    """Reads and deletes fields.
+
+    Args:
+        data_dir: of the service.
+        meshes: tells the names of the objects that scenes can hold.
+    """
+
+    def __init__(self, data_dir: Path, meshes: Callable[[], Collection[str]]) -> None:
+        self._library = FieldLibrary(data_dir)
+        self._meshes = meshes
+
+    def all(self) -> tuple[FieldInfo, ...]:
+        """All fields that can be told about, sorted by name."""
+        found = []
+        for name in self._library.names():
+            with contextlib.suppress(OsfError, OSError):  # one that is being deleted must not hide the others
+                found.append(self._library.info(name))
+        return tuple(found)
+
+    def names(self) -> tuple[str, ...]:
+        """Objects with a field."""
+        return self._library.names()
+
+    def get(self, name: str) -> FieldInfo:
+        """One field.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        return self._library.info(name)
+
+    def has_mesh(self, name: str) -> bool:
+        """Whether scenes can simulate the object."""
+        return name in self._meshes()
+
+    def remove(self, name: str) -> None:
+        """Delete a field that was trained here; a shipped one of the same name then counts again.
+
+        Raises:
+            UnknownName: if there is none.
+            ShippedField: if it was not trained here.
+            CannotWrite: if that is not allowed.
+        """
+        if self._library.info(name).source != "trained":
+            raise ShippedField(name)
+        uninstall(self._library.folder(name))

@@ -1,0 +1,284 @@
+"""Goals: photos of how the table should look, uploaded, composed by hand, or drawn at random."""
+
+from __future__ import annotations
+
+import io
+import threading
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from app.processes.messages import ComposedGoal, ComposeGoal
+from app.processes.sim_client import StageError
+from app.services.runner import Runner
+from app.storage.database import now_utc
+from app.storage.goal_store import GoalRecord, GoalStore, Poses, Source
+from app.storage.photos import read_photo
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.geometry.cameras import Camera, goal_camera
+from osfcore.geometry.light import Light
+
+GOAL_SIDE = 256  # of images that are made here [px]
+_MISPLACED = ("OverlappingObjects", "InvalidInput")  # what a hand can do wrong while it composes
+
+
+class NoDraft(OsfError):
+    """Nothing is being composed."""
+
+    def __init__(self) -> None:
+        super().__init__("No goal is being composed; begin one first.")
+
+
+class NoTable(OsfError):
+    """There is no scene from which a goal could be made."""
+
+    def __init__(self) -> None:
+        super().__init__("There is no scene to make a goal of; make one first.")
+
+
+class DraftUnsound(OsfError):
+    """A draft that cannot be a goal yet."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Draft:
+    """A goal that is being composed, the same for all visitors.
+
+    Attributes:
+        scene: whose objects are laid out.
+        poses: where they shall be.
+        problem: why they cannot be there; empty if they can.
+        revision: grows with every change.
+    """
+
+    scene: str
+    poses: Poses
+    problem: str = ""
+    revision: int = 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DraftChanged:
+    """A goal is being composed like this now; None if none is."""
+
+    draft: Draft | None
+
+
+@dataclass(frozen=True, slots=True)
+class GoalsChanged:
+    """The list of goals is another one now."""
+
+
+class Goals:
+    """The goals of one service. Methods that change something block; any thread may call.
+
+    Args:
+        runner: holds the scenes, and tells everybody what has changed.
+        data_dir: of the service.
+        max_goals: kept at once.
+    """
+
+    def __init__(self, runner: Runner, data_dir: Path, max_goals: int) -> None:
+        self._runner = runner
+        self._store = GoalStore(data_dir / "goals", max_goals)
+        self._decoding = threading.Lock()  # one at a time: photos take much memory
+        self._drafting = threading.RLock()
+        self._draft: Draft | None = None
+        self._draft_png = b""
+
+    def start(self) -> None:
+        """Remove what an earlier service left half done."""
+        self._store.start()
+
+    # Goals that are kept
+
+    def all(self) -> tuple[GoalRecord, ...]:
+        """All goals, newest first."""
+        return self._store.all()
+
+    def get(self, goal: str) -> GoalRecord:
+        """One goal.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        return self._store.get(goal)
+
+    def image(self, goal: str) -> Path:
+        """The image of a goal that exists."""
+        return self._store.image(goal)
+
+    def remove(self, goal: str) -> None:
+        """Delete a goal.
+
+        Raises:
+            UnknownName: if there is none.
+            CannotStore: if that is not allowed.
+        """
+        self._store.remove(goal)
+        self._runner.hub.publish(GoalsChanged())
+
+    def receive(self, data: bytes, name: str, camera: Camera | None = None) -> GoalRecord:
+        """Keep a photo.
+
+        Args:
+            data: a PNG or JPEG.
+            name: for people.
+            camera: that took it; None for the scenes' goal camera.
+
+        Raises:
+            PhotoRefused: if it cannot be used.
+            InvalidInput: if its sides are not in the proportion of the camera's.
+            TooManyGoals: if there are too many.
+            CannotStore: if the disk is full.
+        """
+        with self._decoding:
+            pixels = read_photo(data)
+        height, width = pixels.shape[:2]
+        camera = camera or goal_camera()
+        if abs(width * camera.height / (height * camera.width) - 1) > 0.01:  # scaling down rounds
+            asked = f"in proportion {camera.width}:{camera.height}, as its camera sees; crop it"
+            raise InvalidInput("size of the photo [px]", f"{width} x {height}", asked)
+        return self._keep("upload", name, None, camera.resized(width, height), None, _png(pixels))
+
+    def compose(self, scene: str | None, poses: Poses, name: str, light: Light | None = None) -> GoalRecord:
+        """Keep a goal in which objects of a scene, by default the current one, lie elsewhere.
+
+        Raises:
+            NoTable, UnknownName: if there is no such scene or object.
+            SceneHeld: if a job uses the scene.
+            OsfError: if objects would overlap or lie beside the table; or as `receive`.
+        """
+        return self._made("composed", ComposeGoal(self._scene(scene), poses, light=light, size=GOAL_SIDE), name)
+
+    def draw(
+        self, scene: str | None, seed: int, moved: int | None, name: str, light: Light | None = None
+    ) -> GoalRecord:
+        """Keep a goal in which some objects of a scene lie elsewhere at random.
+
+        Raises:
+            NoTable, UnknownName: if there is no such scene.
+            SceneHeld: if a job uses the scene.
+            OsfError: if there is no room, or as `receive`.
+        """
+        command = ComposeGoal(self._scene(scene), seed=seed, moved=moved, light=light, size=GOAL_SIDE)
+        return self._made("drawn", command, name)
+
+    def _made(self, source: Source, command: ComposeGoal, name: str) -> GoalRecord:
+        made = self._runner.compose(command)
+        return self._keep(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png)
+
+    def _keep(
+        self, source: Source, name: str, scene: str | None, camera: Camera, poses: Poses | None, png: bytes
+    ) -> GoalRecord:
+        record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses)
+        self._store.keep(record, png)
+        self._runner.hub.publish(GoalsChanged())
+        return record
+
+    def _scene(self, scene: str | None) -> str:
+        scene = scene or self._runner.current
+        if scene is None:
+            raise NoTable
+        return self._runner.scene(scene).id
+
+    # The one that is being composed
+
+    @property
+    def draft(self) -> Draft | None:
+        """What is being composed now."""
+        return self._draft
+
+    def begin_draft(self, scene: str | None = None) -> Draft:
+        """Begin with where the objects of a scene, by default the current one, are now.
+
+        Raises:
+            NoTable, UnknownName: if there is no such scene.
+            SceneHeld: if a job uses the scene.
+        """
+        with self._drafting:
+            scene = self._scene(scene)
+            made = self._runner.compose(ComposeGoal(scene, size=GOAL_SIDE))
+            return self._set_draft(Draft(scene, made.poses, revision=self._next_revision()), made)
+
+    def move_draft(self, poses: Poses) -> Draft:
+        """Put objects of the draft elsewhere; where they cannot be, the draft says so.
+
+        Raises:
+            NoDraft: if there is none.
+            UnknownName: if an object is not in it.
+            OsfError: if the scene has gone, is used by a job, or the simulation is not there now.
+        """
+        with self._drafting:
+            draft = self._require_draft()
+            wanted = dict(draft.poses)
+            for name, pose in poses:
+                if name not in wanted:
+                    raise UnknownName("object of the draft", name, wanted)
+                wanted[name] = pose
+            laid = tuple(wanted.items())
+            number = self._next_revision()
+            try:
+                made = self._runner.compose(ComposeGoal(draft.scene, laid, size=GOAL_SIDE))
+            except StageError as error:
+                if error.kind not in _MISPLACED:
+                    raise
+                return self._set_draft(Draft(draft.scene, laid, str(error), number), None)
+            return self._set_draft(Draft(draft.scene, made.poses, "", number), made)
+
+    def draft_image(self) -> bytes:
+        """PNG of what the goal camera would see; while there is a problem, the last one without.
+
+        Raises:
+            NoDraft: if there is none.
+        """
+        with self._drafting:
+            self._require_draft()
+            return self._draft_png
+
+    def keep_draft(self, name: str) -> GoalRecord:
+        """Keep the draft as a goal, and end it.
+
+        Raises:
+            NoDraft: if there is none.
+            DraftUnsound: if objects cannot be where they are in it.
+            TooManyGoals, CannotStore: as `receive`.
+        """
+        with self._drafting:
+            draft = self._require_draft()
+            if draft.problem:
+                raise DraftUnsound(f"This cannot be a goal yet. {draft.problem}")
+            camera = goal_camera(GOAL_SIDE)
+            record = self._keep("composed", name, draft.scene, camera, draft.poses, self._draft_png)
+            self.drop_draft()
+            return record
+
+    def drop_draft(self) -> None:
+        """End composing; does nothing if nothing is being composed."""
+        with self._drafting:
+            if self._draft is not None:
+                self._draft = None
+                self._runner.hub.publish(DraftChanged(None))
+
+    def _set_draft(self, draft: Draft, made: ComposedGoal | None) -> Draft:
+        self._draft = draft
+        if made is not None:
+            self._draft_png = made.png
+        self._runner.hub.publish(DraftChanged(draft))
+        return draft
+
+    def _require_draft(self) -> Draft:
+        if self._draft is None:
+            raise NoDraft
+        return self._draft
+
+    def _next_revision(self) -> int:
+        return 1 if self._draft is None else self._draft.revision + 1
+
+
+def _png(pixels: object) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(pixels).save(data, "PNG")  # pyright: ignore[reportArgumentType]
+    return data.getvalue()

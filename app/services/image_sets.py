@@ -1,0 +1,208 @@
+"""Image sets that people upload: stored under DATA_DIR/sets/ID once they were unpacked and found sound.
+
+A folder holds `images` (train and test), `overlay.png`, which shows how cameras, light and silhouettes were understood,
+and `set.json`. It is made under another name beside its place, so that a set is there whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import threading
+import uuid
+from collections.abc import AsyncIterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from starlette.concurrency import run_in_threadpool
+
+from app.storage.database import CannotStore, now_utc
+from app.storage.uploads import Examiner, save
+from osfcore.errors import CorruptFile, OsfError, UnknownName
+
+_ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"
+_TEMPORARY_PREFIX = ".new-"
+
+
+class TooManySets(OsfError):
+    """No more sets are kept."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"There are {limit} image sets already, which is the most; delete one first.")
+
+
+@dataclass(frozen=True, slots=True)
+class Examined:
+    """What was found in a set.
+
+    Attributes:
+        train: number of images to learn from.
+        test: number of images that only measure.
+        summary: the same in words.
+    """
+
+    train: int
+    test: int
+    summary: str
+
+
+@dataclass(frozen=True, slots=True)
+class SetRecord:
+    """A stored set.
+
+    Attributes:
+        id: identifier.
+        file_name: of the zip that was uploaded.
+        created_at: UTC, ISO 8601.
+        train: number of images to learn from.
+        test: number of images that only measure.
+        summary: the same in words.
+    """
+
+    id: str
+    file_name: str
+    created_at: str
+    train: int
+    test: int
+    summary: str
+
+
+class ImageSets:
+    """The uploaded sets of one data directory. Any thread may call; uploads belong to the event loop.
+
+    Args:
+        root: the folder, DATA_DIR/sets; made at the first upload.
+        max_sets: kept at once.
+    """
+
+    def __init__(self, root: Path, max_sets: int = 20) -> None:
+        self._root = root
+        self._max_sets = max_sets
+        self._keeping = threading.Lock()
+        self._examiner = Examiner(examine, "set", _names)
+
+    def start(self) -> None:
+        """Remove what an earlier service left half done."""
+        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def stop(self) -> None:
+        """End the process that looks at a set, if there is one. Calling it again does nothing."""
+        self._examiner.stop()
+
+    def all(self) -> tuple[SetRecord, ...]:
+        """All sets, oldest first."""
+        if not self._root.is_dir():
+            return ()
+        records = []
+        for path in self._root.glob(f"[!.]*/{_FACTS}"):
+            with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
+                records.append(_read(path))
+        return tuple(sorted(records, key=lambda record: record.created_at))
+
+    def get(self, set_id: str) -> SetRecord:
+        """One set.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        for record in self.all():
+            if record.id == set_id:
+                return record
+        raise UnknownName("image set", set_id[:80], [record.id for record in self.all()])
+
+    def folder(self, set_id: str) -> Path:
+        """The folder with train and test of a set that exists."""
+        return self._root / set_id / _IMAGES
+
+    def overlay(self, set_id: str) -> Path:
+        """The picture of how a set was understood."""
+        return self._root / set_id / _OVERLAY
+
+    def remove(self, set_id: str) -> None:
+        """Delete a set.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        self.get(set_id)
+        trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            (self._root / set_id).rename(trash)
+        except OSError as error:
+            raise CannotStore(self._root, error.strerror or str(error)) from error
+        shutil.rmtree(trash, ignore_errors=True)
+
+    async def receive(self, chunks: AsyncIterator[bytes], file_name: str) -> SetRecord:
+        """Take in an uploaded zip, bit by bit, and keep the set in it if it is sound.
+
+        Raises:
+            TooManySets: if there are too many.
+            UploadRefused: if it is no sound set of an object; nothing is kept.
+            CannotStore: if the disk is full.
+        """
+        await run_in_threadpool(self._check_room)
+        set_id = uuid.uuid4().hex[:12]
+        folder = self._root / f"{_TEMPORARY_PREFIX}{set_id}"
+        try:
+            await save(chunks, folder / _ARCHIVE)
+            found = await self._examiner.examine(folder)
+            record = SetRecord(set_id, file_name, now_utc(), found.train, found.test, found.summary)
+            await run_in_threadpool(self._keep, folder, record)
+        finally:
+            await run_in_threadpool(shutil.rmtree, folder, True)
+        return record
+
+    def _check_room(self) -> None:
+        if len(self.all()) >= self._max_sets:
+            raise TooManySets(self._max_sets)
+
+    def _keep(self, folder: Path, record: SetRecord) -> None:
+        try:
+            (folder / _FACTS).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
+            with self._keeping:  # others may have come in since the upload began
+                self._check_room()
+                folder.rename(self._root / record.id)
+        except OSError as error:
+            raise CannotStore(self._root, error.strerror or str(error)) from error
+
+
+def examine(folder: Path) -> Examined:
+    """Unpack `set.zip` of a folder to `images` beside it, judge it as `osf check` does, and draw `overlay.png`.
+
+    Raises:
+        OsfError: if it is no sound image set of an object.
+    """
+    from osfcore.inspection.check import check_path, draw_overlay
+    from osfcore.io.archives import unpack_set
+    from osfcore.io.image_set import read_image_set
+
+    images = unpack_set(folder / _ARCHIVE, folder / _IMAGES)
+    (folder / _ARCHIVE).unlink()
+    report = check_path(images)
+    if read_image_set(images, "test").is_opaque:
+        raise CorruptFile(images, "its images are opaque all over; an object on transparent background is expected")
+    draw_overlay(images, folder / _OVERLAY)
+    return Examined(report.facts["train"], report.facts["test"], report.summary)
+
+
+def _names(folder: Path) -> dict[str, str]:
+    """What the uploader calls the places in a folder."""
+    return {
+        f"{folder / _ARCHIVE}": "The uploaded file",
+        f"{folder / _IMAGES}/": "",
+        f"{folder / _IMAGES}": "The uploaded set",
+    }
+
+
+def _read(path: Path) -> SetRecord:
+    try:
+        record = SetRecord(**json.loads(path.read_text(encoding="utf-8")))
+        "".join((record.id, record.file_name, record.created_at, record.summary)).encode()  # text, and whole characters
+        counts = (record.train, record.test)
+        if record.id != path.parent.name or not all(type(n) is int and 0 <= n < 1 << 31 for n in counts):
+            raise ValueError("of another place or kind")
+    except (ValueError, TypeError, RecursionError) as error:
+        raise CorruptFile(path, "it does not describe an image set") from error
+    return record

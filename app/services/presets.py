@@ -1,0 +1,101 @@
+"""Six tables to begin with: objects, light, and how it should become."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from app.processes.messages import SceneRecord
+from app.services.goals import Goals
+from app.services.runner import Runner
+from app.storage.goal_store import GoalRecord
+from osfcore.errors import OsfError, UnknownName
+from osfcore.geometry.light import Light
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """A table and its goal.
+
+    Attributes:
+        id: identifier.
+        title: for people.
+        text: likewise, a line.
+        objects: on the table.
+        seed: of where they lie.
+        azimuth_deg: of the light, from +x toward +y.
+        elevation_deg: of the light, above the table.
+        goal_seed: of the random layout that the goal shows.
+        moved: objects that lie elsewhere in it.
+        goal_angles_deg: azimuth and elevation of the light in the goal image; None for the same light.
+    """
+
+    id: str
+    title: str
+    text: str
+    objects: tuple[str, ...]
+    seed: int
+    azimuth_deg: float
+    elevation_deg: float
+    goal_seed: int
+    moved: int
+    goal_angles_deg: tuple[float, float] | None = field(default=None)
+
+    @property
+    def light(self) -> Light:
+        """On the table."""
+        return _light(self.azimuth_deg, self.elevation_deg)
+
+    @property
+    def goal_light(self) -> Light | None:
+        """In the goal image, where it is another one."""
+        return None if self.goal_angles_deg is None else _light(*self.goal_angles_deg)
+
+
+# Of the ten objects that are fetched by default.
+PRESETS = (
+    Preset("first", "First push", "Two objects, one of them in the wrong place.",
+           ("006_mustard_bottle", "007_tuna_fish_can"), 11, 60, 55, 1, 1),
+    Preset("pair", "Both of them", "Two objects that both have to move.",
+           ("003_cracker_box", "005_tomato_soup_can"), 12, 200, 50, 2, 2),
+    Preset("three", "Three things", "Three objects, two in the wrong place.",
+           ("006_mustard_bottle", "010_potted_meat_can", "008_pudding_box"), 13, 320, 45, 3, 2),
+    Preset("low-sun", "Low sun", "Light from 15° above the table: shadows longer than the objects.",
+           ("009_gelatin_box", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15, 4, 2),
+    Preset("other-light", "Another light", "The photo was taken under a lamp from the other side.",
+           ("004_sugar_box", "009_gelatin_box", "006_mustard_bottle"), 15, 40, 30, 5, 2, (220, 30)),
+    Preset("four", "Four at once", "Four objects close together, two in the wrong place.",
+           ("003_cracker_box", "005_tomato_soup_can", "010_potted_meat_can", "006_mustard_bottle"), 16, 280, 35, 6, 2),
+)  # fmt: skip
+
+
+def preset(name: str) -> Preset:
+    """One of them.
+
+    Raises:
+        UnknownName: if there is none.
+    """
+    for one in PRESETS:
+        if one.id == name:
+            return one
+    raise UnknownName("preset", name[:80], [one.id for one in PRESETS])
+
+
+def set_up(wanted: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, GoalRecord]:
+    """Make a preset's table, which is then shown, and its goal.
+
+    Raises:
+        OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
+    """
+    scene = runner.create_scene(names=wanted.objects, seed=wanted.seed, light=wanted.light)
+    try:
+        goal = goals.draw(scene.id, wanted.goal_seed, wanted.moved, wanted.title, wanted.goal_light)
+    except OsfError:
+        runner.delete_scene(scene.id)
+        raise
+    return scene, goal
+
+
+def _light(azimuth_deg: float, elevation_deg: float) -> Light:
+    return Light.from_angles(float(np.deg2rad(azimuth_deg)), float(np.deg2rad(elevation_deg)))

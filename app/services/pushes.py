@@ -1,0 +1,118 @@
+"""Pushes as people think of them: a way to go at some speed, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from app.services.estimate_errors import errors_of
+from osfcore.errors import InvalidInput
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
+from osfcore.objects.asset_library import AssetLibrary
+
+MAX_ACTIONS = 50
+_STILL_M = 1e-9
+
+
+def straight(heading_rad: float, speed_m_s: float, count: int) -> Float[np.ndarray, "T 3"]:
+    """The same action again and again.
+
+    Args:
+        heading_rad: from +x toward +y.
+        speed_m_s: along the heading.
+        count: of actions.
+    """
+    velocity = speed_m_s * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    return np.tile(velocity, (count, 1))
+
+
+def along(
+    start: Float[np.ndarray, "2"], waypoints: Float[np.ndarray, "P 2"], speed_m_s: float
+) -> Float[np.ndarray, "T 3"]:
+    """Actions that lead from one waypoint to the next, each straight and with as many equal actions as it takes.
+
+    Args:
+        start: where the pusher is [m].
+        waypoints: where it is to go [m]; what is beyond its reach is brought back to the edge.
+        speed_m_s: not to be exceeded, nor are 0.3 m/s on an axis.
+
+    Raises:
+        InvalidInput: if the way is empty, not finite or takes more than 50 actions.
+    """
+    if not np.all(np.isfinite(waypoints)):
+        raise InvalidInput("waypoints [m]", waypoints.tolist(), "finite")
+    actions, here = [], np.asarray(start, float)
+    for waypoint in np.clip(waypoints, -PUSHER_REACH_M, PUSHER_REACH_M):
+        way, here = waypoint - here, waypoint
+        most = max(float(np.linalg.norm(way)) / speed_m_s, float(np.abs(way).max()) / MAX_SPEED_M_S)
+        count = int(np.ceil(most / STEP_S - 1e-9))
+        if np.abs(way).max() > _STILL_M:
+            actions += [(*(way / (max(count, 1) * STEP_S)), 0.0)] * max(count, 1)
+    if not 1 <= len(actions) <= MAX_ACTIONS:
+        raise InvalidInput("number of actions on this path", len(actions), f"between 1 and {MAX_ACTIONS}")
+    return np.clip(np.array(actions), -MAX_SPEED_M_S, MAX_SPEED_M_S)
+
+
+def way(start: Float[np.ndarray, "2"], actions: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T1 2"]:
+    """Where actions lead the pusher, the start included, as long as nothing is in its way [m]."""
+    places = [np.asarray(start, float)]
+    for action in actions:
+        places.append(np.clip(places[-1] + STEP_S * action[:2], -PUSHER_REACH_M, PUSHER_REACH_M))
+    return np.array(places)
+
+
+def toward_nearest(state: SceneState) -> tuple[float, float]:
+    """Heading [rad] and distance [m] from the pusher to the nearest object; 0 without pusher or object."""
+    if state.pusher is None or not state.names:
+        return 0.0, 0.0
+    ways = state.poses.position[:, :2] - state.pusher[:2]
+    x, y = ways[int(np.linalg.norm(ways, axis=1).argmin())]
+    return float(np.arctan2(y, x)), float(np.hypot(x, y))
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a push did to one object.
+
+    Attributes:
+        name: of the object.
+        predicted_mm: how far it was predicted to go.
+        predicted_deg: how far it was predicted to turn.
+        went_mm: how far it went; None before it was tried, like all that follows.
+        turned_deg: how far it turned.
+        off_mm: between where it was predicted and where it is.
+        off_deg: likewise, between orientations that look different.
+    """
+
+    name: str
+    predicted_mm: float
+    predicted_deg: float
+    went_mm: float | None = None
+    turned_deg: float | None = None
+    off_mm: float | None = None
+    off_deg: float | None = None
+
+
+def outcomes(
+    before: SceneState, rollouts: Rollouts, after: SceneState | None, library: AssetLibrary
+) -> tuple[Outcome, ...]:
+    """The first of some rollouts, against the truth if it is known, object by object.
+
+    Args:
+        before: the start.
+        rollouts: what was predicted.
+        after: what the simulator made of it; None before it was tried.
+        library: knows which rotations of an object look alike.
+    """
+    end = Pose(rollouts.positions[0, -1], rollouts.quaternions[0, -1])
+    predicted = SceneState(rollouts.names, end, before.light, before.pusher)
+    columns = [errors_of(predicted, before, library)["objects"]]
+    if after is not None:
+        columns += [errors_of(after, before, library)["objects"], errors_of(predicted, after, library)["objects"]]
+    found = [{entry["name"]: (entry["position_mm"], entry["rotation_deg"]) for entry in column} for column in columns]
+    return tuple(Outcome(name, *(value for column in found for value in column[name])) for name in rollouts.names)

@@ -1,0 +1,1 @@
+"""What outlives the service: the database, and files under the data directory."""

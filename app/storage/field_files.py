@@ -1,0 +1,130 @@
+"""Where training a field for the service leaves its files, and how a finished field is put in place.
+
+The workshop DATA_DIR/training/NAME holds images and checkpoint while NAME is being trained; it outlives a service or a
+job that was killed, so that the same order goes on from there. A finished field moves to DATA_DIR/fields/NAME.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from osfcore.errors import CannotWrite
+from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+
+_ORDER = "order.json"
+_TEMPORARY_PREFIX = ".writing-"
+_ASIDE_PREFIX = ".replaced-"  # its folder holds an older field under its name, until the new one is in place
+
+
+def workshop(data_dir: Path, name: str) -> Path:
+    """The folder in which a field of this name is trained."""
+    return data_dir / "training" / name
+
+
+def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
+    """The workshop, emptied if it was left by another order than this one.
+
+    Raises:
+        CannotWrite: if it cannot be made.
+    """
+    place = workshop(data_dir, name)
+    text = json.dumps(order, sort_keys=True)
+    try:
+        if not (place / _ORDER).is_file() or (place / _ORDER).read_text(encoding="utf-8") != text:
+            clear_workshop(data_dir, name)
+            place.mkdir(parents=True)
+            (place / _ORDER).write_text(text, encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CannotWrite(place, getattr(error, "strerror", None) or str(error)) from error
+    return place
+
+
+def clear_workshop(data_dir: Path, name: str) -> None:
+    """Forget what was made for a field that is not finished."""
+    shutil.rmtree(workshop(data_dir, name), ignore_errors=True)
+
+
+def install(made: Path, place: Path) -> None:
+    """Copy weights and metrics from `made` to the folder `place`, in one piece, over an older field if there is one.
+
+    Raises:
+        CannotWrite: if the disk is full or the folder cannot be written; then nothing is changed.
+    """
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY_PREFIX}{place.name}-", dir=place.parent))
+        try:
+            folder = temporary / "new"  # one level down, where nobody looks for fields
+            folder.mkdir(mode=0o755)
+            for name in (FIELD_FILE, METRICS_FILE):
+                shutil.copyfile(made / name, folder / name)
+                _sync(folder / name)
+            _swap(folder, place)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as error:
+        raise CannotWrite(place, error.strerror or str(error)) from error
+
+
+def uninstall(place: Path) -> None:
+    """Delete a field's folder, in one piece.
+
+    Raises:
+        CannotWrite: if that is not allowed.
+    """
+    try:
+        trash = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY_PREFIX}{place.name}-", dir=place.parent))
+        try:
+            place.rename(trash / "old")
+        finally:
+            shutil.rmtree(trash, ignore_errors=True)
+    except OSError as error:
+        raise CannotWrite(place, error.strerror or str(error)) from error
+
+
+def sweep(fields: Path) -> None:
+    """Remove what a killed service left in DATA_DIR/fields; a field that was put aside and has no successor returns."""
+    for aside in fields.glob(f"{_ASIDE_PREFIX}*"):
+        for older in aside.glob("*"):
+            if not (fields / older.name).exists():
+                with contextlib.suppress(OSError):  # then it stays aside, and the next start tries again
+                    older.rename(fields / older.name)
+        if all((fields / older.name).exists() for older in aside.glob("*")):
+            shutil.rmtree(aside, ignore_errors=True)
+    for folder in fields.glob(f"{_TEMPORARY_PREFIX}*"):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _swap(folder: Path, place: Path) -> None:
+    """Rename a folder to its place; the older one is put aside first, and returns if that fails."""
+    if not place.exists():
+        folder.rename(place)
+        _sync(place.parent)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=_ASIDE_PREFIX, dir=place.parent))
+    older = aside / place.name
+    try:
+        place.rename(older)
+        try:
+            folder.rename(place)
+        except OSError:
+            older.rename(place)
+            raise
+        _sync(place.parent)
+    finally:
+        if place.exists():  # else the older one is all there is, and the next start puts it back
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

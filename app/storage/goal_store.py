@@ -1,0 +1,181 @@
+"""Goal images on disk: DATA_DIR/goals/ID with `goal.png` and `goal.json`, there whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import threading
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from app.storage.database import CannotStore
+from osfcore.errors import CorruptFile, OsfError, UnknownName, finite_vector
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose, unit_quaternion
+from osfcore.io.scene_file import camera_from_json, camera_to_json
+
+Source = Literal["upload", "composed", "drawn"]
+Poses = tuple[tuple[str, Pose], ...]
+IMAGE, _FACTS = "goal.png", "goal.json"
+_TEMPORARY_PREFIX = ".new-"
+
+
+class TooManyGoals(OsfError):
+    """No more goals are kept."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"There are {limit} goals already, which is the most; delete one first.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GoalRecord:
+    """A goal image that is kept.
+
+    Attributes:
+        id: identifier.
+        name: for people.
+        created_at: UTC, ISO 8601.
+        source: an uploaded photo, a layout by hand, or a random one.
+        scene: that it was made from; None for an upload.
+        camera: that took the image.
+        poses: of the objects in it, where they are known.
+    """
+
+    id: str
+    name: str
+    created_at: str
+    source: Source
+    scene: str | None
+    camera: Camera
+    poses: Poses | None
+
+
+class GoalStore:
+    """The goals of one data directory. Any thread may call.
+
+    Args:
+        root: the folder, DATA_DIR/goals; made when the first goal comes.
+        max_goals: kept at once.
+    """
+
+    def __init__(self, root: Path, max_goals: int) -> None:
+        self._root = root
+        self._max_goals = max_goals
+        self._lock = threading.Lock()
+
+    def start(self) -> None:
+        """Remove what an earlier service left half done."""
+        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def all(self) -> tuple[GoalRecord, ...]:
+        """All goals, newest first."""
+        records = []
+        for path in self._root.glob(f"[!.]*/{_FACTS}"):
+            with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
+                records.append(_read(path))
+        return tuple(sorted(records, key=lambda record: record.created_at, reverse=True))
+
+    def get(self, goal: str) -> GoalRecord:
+        """One goal.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        records = self.all()
+        for record in records:
+            if record.id == goal:
+                return record
+        raise UnknownName("goal", goal[:80], [record.id for record in records][:5])
+
+    def image(self, goal: str) -> Path:
+        """The image of a goal that exists."""
+        return self._root / goal / IMAGE
+
+    def keep(self, record: GoalRecord, png: bytes) -> None:
+        """Keep a new goal.
+
+        Raises:
+            TooManyGoals: if there are too many.
+            CannotStore: if the disk is full.
+        """
+        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            with self._lock:  # others may come in at the same time
+                if len(self.all()) >= self._max_goals:
+                    raise TooManyGoals(self._max_goals)
+                folder.mkdir(parents=True)
+                (folder / IMAGE).write_bytes(png)
+                (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
+                folder.rename(self._root / record.id)
+        except OSError as error:
+            raise CannotStore(self._root, error.strerror or str(error)) from error
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def remove(self, goal: str) -> None:
+        """Delete a goal; episodes that had it keep their own copy.
+
+        Raises:
+            UnknownName: if there is none.
+            CannotStore: if that is not allowed.
+        """
+        self.get(goal)
+        trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            (self._root / goal).rename(trash)
+        except OSError as error:
+            raise CannotStore(self._root, error.strerror or str(error)) from error
+        shutil.rmtree(trash, ignore_errors=True)
+
+
+def poses_to_json(poses: Poses) -> list[dict[str, Any]]:
+    """Poses as in scene.json."""
+    return [
+        {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
+        for name, pose in poses
+    ]
+
+
+def _to_json(record: GoalRecord) -> dict[str, Any]:
+    return {
+        "id": record.id,
+        "name": record.name,
+        "created_at": record.created_at,
+        "source": record.source,
+        "scene": record.scene,
+        "camera": camera_to_json(record.camera),
+        "objects": None if record.poses is None else poses_to_json(record.poses),
+    }
+
+
+def _read(path: Path) -> GoalRecord:
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        record = GoalRecord(
+            id=facts["id"],
+            name=facts["name"],
+            created_at=facts["created_at"],
+            source=facts["source"],
+            scene=facts["scene"],
+            camera=camera_from_json(facts["camera"]),
+            poses=None if facts["objects"] is None else tuple(map(_named_pose, facts["objects"])),
+        )
+        "".join((record.name, record.created_at)).encode()  # text, and whole characters
+        if not (record.scene is None or (isinstance(record.scene, str) and record.scene.encode())):
+            raise TypeError("no scene")
+        if record.id != path.parent.name or record.source not in get_args(Source):
+            raise ValueError("of another place or kind")
+        return record
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OsfError) as error:
+        raise CorruptFile(path, "it does not describe a goal") from error
+
+
+def _named_pose(entry: dict[str, Any]) -> tuple[str, Pose]:
+    name = str(entry["name"])
+    name.encode()
+    position = finite_vector(entry["position"], 3, "position [m]")
+    return name, Pose(position, unit_quaternion(finite_vector(entry["quaternion"], 4, "quaternion")))

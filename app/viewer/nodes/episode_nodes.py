@@ -1,0 +1,176 @@
+"""The nodes that show an episode in the 3D view: the goal, what is believed, what is planned and what it leads to."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import Literal
+
+import numpy as np
+import viser
+from jaxtyping import Float, UInt8
+
+from app.processes.plan_summary import PlanSketch
+from app.viewer.nodes.estimate_nodes import Colour, EstimateDrawing
+from app.viewer.nodes.future_nodes import FutureDrawing
+from app.viewer.nodes.ghosts import mesh_of
+from app.viewer.nodes.push_nodes import PREDICTED
+from osfcore.control.events import Looking
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.planning.pose_cost import PoseGoal
+
+Part = Literal["goal", "plan", "estimate"]
+PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")
+GOAL = (245, 140, 0)
+CHEAP, DEAR = (45, 215, 90), (150, 62, 58)
+PLAY_S, REST_S = 2.0, 0.7  # how long the best future is played, and stands at its end
+_GAMMA = 2.2
+_CELLS = 28
+_GOAL_OPACITY = 0.5
+_GOAL_SCALE = 1.015  # or ghosts and the surfaces below them would flicker
+_WAY_M, _BEST_M = 0.0025, 0.007  # thickness
+_DEAREST_Z_M, _CHEAPEST_Z_M, _BEST_Z_M = 0.003, 0.006, 0.008  # cheap ways lie above dear ones
+_NOWHERE = np.zeros((1, 2, 3), np.float32)
+
+
+class EpisodeDrawing:
+    """Nodes below /episode. Any thread may call.
+
+    Args:
+        server: to draw in.
+        library: knows the objects' shapes.
+        is_named: tells whether an object is drawn with its name already, since it is on the table.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, library: AssetLibrary, is_named: Callable[[str], bool] = lambda _: True
+    ) -> None:
+        self._server = server
+        self._scene = server.scene
+        self._library = library
+        self._lock = threading.RLock()
+        # What is below a hidden node is hidden with it.
+        self._roots = {part: self._scene.add_frame(f"/episode/{part}", show_axes=False) for part in PARTS}
+        self._now = EstimateDrawing(server, library, is_named, root="/episode/estimate")
+        self._goal_look = EstimateDrawing(
+            server, library, is_named, root="/episode/goal/look", colour=_linear(GOAL), has_light=False
+        )
+        self._goal: dict[str, viser.MeshHandle] = {}
+        self._future = FutureDrawing(server.scene, library, "/episode/plan/future", _linear(PREDICTED))
+        add = self._scene.add_line_segments
+        # Lines that begin in one colour for all would stay white once each has its own.
+        each = np.array([[_linear(CHEAP)] * 2], np.uint8)
+        self._ways = add("/episode/plan/ways", _NOWHERE, each, thickness=_WAY_M, visible=False)
+        self._best = add("/episode/plan/best", _NOWHERE, PREDICTED, thickness=_BEST_M, visible=False)
+
+    @property
+    def shows_light(self) -> bool:
+        """Whether an estimated light is on view."""
+        return self._roots["estimate"].visible and not self._now.is_empty
+
+    def show_part(self, part: Part, is_on: bool) -> None:
+        """Show or hide a part of it, whatever is in there now or later."""
+        with self._lock:
+            self._roots[part].visible = is_on
+
+    def show_goal(self, goal: PoseGoal | None) -> None:
+        """Show where everything should be, in place of what was taken for that before."""
+        with self._lock, self._changes():
+            poses = {} if goal is None else {name: goal.pose(name) for name in goal.names}
+            if set(poses) != set(self._goal):
+                _remove(self._goal)
+                self._goal = {name: self._goal_copy(name) for name in poses}
+            for name, pose in poses.items():
+                self._goal[name].position, self._goal[name].wxyz = pose.position, pose.quaternion
+            self._goal_look.clear()
+
+    def show_look(self, look: Looking) -> None:
+        """Show an estimator at work, on the table or on the goal image."""
+        (self._goal_look if look.look == "goal" else self._now).show(look.step)
+
+    def show_estimate(self, estimate: EstimatedState | None) -> None:
+        """Show where everything is believed to be, and the light."""
+        with self._lock, self._changes():
+            if estimate is None:
+                self._now.clear()
+            else:
+                self._now.follow(estimate)
+            self._goal_look.clear()
+
+    def show_plan(self, sketch: PlanSketch | None) -> None:
+        """Show a round of planning in place of the one before: ways of the pusher, and the best future."""
+        with self._lock, self._changes():
+            self._future.show(None if sketch is None else sketch.best)
+            self._ways.visible = self._best.visible = sketch is not None
+            if sketch is not None:
+                self._draw_ways(sketch)
+
+    def play(self, seconds: float) -> None:
+        """Let the best future be as it is some time after it began; over and over, faster than it would be."""
+        with self._lock:
+            if self._future.steps and self._roots["plan"].visible:
+                with self._changes():
+                    self._future.at(self._future.steps * min(seconds % (PLAY_S + REST_S) / PLAY_S, 1.0))
+
+    def clear(self) -> None:
+        """Remove everything."""
+        with self._lock, self._changes():
+            self.show_goal(None)
+            self.show_estimate(None)
+            self.show_plan(None)
+
+    @contextlib.contextmanager
+    def _changes(self) -> Iterator[None]:
+        """All at once in the browser."""
+        with self._server.atomic():
+            yield
+        self._server.flush()
+
+    def _draw_ways(self, sketch: PlanSketch) -> None:
+        count, moments, _ = sketch.ways.shape
+        heights = np.linspace(_CHEAPEST_Z_M, _DEAREST_Z_M, count)  # or lines that cross would flicker
+        points = np.concatenate([sketch.ways, np.tile(heights[:, None, None], (1, moments, 1))], axis=2)
+        colours = np.repeat(cost_colours(sketch.costs), moments - 1, axis=0)  # one for each segment
+        self._ways.points = _segments(points)
+        self._ways.colors = np.repeat(colours[:, None], 2, axis=1)
+        best = sketch.best.pusher[:1].copy()
+        best[..., 2] = _BEST_Z_M
+        self._best.points = _segments(best)
+
+    def _goal_copy(self, name: str) -> viser.MeshHandle:
+        return self._scene.add_mesh_simple(
+            f"/episode/goal/where/{name}",
+            *mesh_of(self._library, name, _CELLS),
+            color=GOAL,
+            opacity=_GOAL_OPACITY,
+            scale=_GOAL_SCALE,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def cost_colours(costs: Float[np.ndarray, "W"]) -> UInt8[np.ndarray, "W 3"]:
+    """Colours of lines that cost more or less: the cheapest bright green, those of twice the median's surplus dim red.
+
+    The dearest would be no measure: a single sequence that goes badly wrong would paint all others green.
+    """
+    surplus = costs - costs.min()
+    share = np.clip(surplus / max(2 * float(np.median(surplus)), 1e-9), 0, 1)[:, None]
+    return np.round((1 - share) * np.array(_linear(CHEAP)) + share * np.array(_linear(DEAR))).astype(np.uint8)
+
+
+def _linear(colour: Colour) -> Colour:
+    """A colour for batches and for single points of lines: viser's client takes those for linear light."""
+    red, green, blue = (round(255 * (channel / 255) ** _GAMMA) for channel in colour)
+    return red, green, blue
+
+
+def _segments(ways: Float[np.ndarray, "W T1 3"]) -> Float[np.ndarray, "S 2 3"]:
+    return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
+
+
+def _remove(nodes: Mapping[str, viser.SceneNodeHandle]) -> None:
+    for node in nodes.values():
+        node.remove()

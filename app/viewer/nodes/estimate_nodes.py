@@ -1,0 +1,276 @@
+"""The nodes that show an estimate in the 3D view: candidates as ghosts, the guess, the light, and how sure it is."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import viser
+
+from app.viewer.nodes.ghosts import Mesh, box, footprint_m, heading_rad, mesh_of, sector, spread, top_m
+from app.viewer.nodes.scene_nodes import LIGHT_COLOUR, LIGHT_CUBE_M
+from osfcore.errors import OsfError
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.objects.asset_library import AssetLibrary
+
+GHOSTS = 24  # candidates of each object that are drawn
+GUESS = (20, 120, 200)
+_TRIED, _SURE, _DOUBTED = (90, 205, 255), (10, 150, 110), (235, 115, 15)
+_TRIED_LIGHT_M = 0.018
+_SIGMAS = 2.0
+_LEAST_BALL_M, _MOST_BALL_M = 0.006, 0.1
+_LEAST_TURN_RAD, _MOST_TURN_RAD = 0.06, np.pi
+_RING_M = (0.008, 0.035)  # from the object's footprint outwards
+_TABLE_M = 0.0015  # above it, so that it does not flicker
+_LABEL_M = 0.045
+_WIRES, _FAINT_WIRES = 0.9, 0.35  # opacity; things on their way are to be seen through them
+_WIRE_SCALE = 1.01  # or wires and the surface below them would flicker
+_AWAY_M = -0.5  # an object that was not looked at yet is put far below the table
+Colour = tuple[int, int, int]
+
+
+class EstimateDrawing:
+    """Nodes below one of their own. Any thread may call.
+
+    Args:
+        server: to draw in.
+        library: knows the objects' shapes.
+        is_named: tells whether an object is drawn with its name already, since it is on the table.
+        root: the node.
+        colour: of the guess.
+        has_light: whether the light is drawn, too.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        is_named: Callable[[str], bool] = lambda _: True,
+        *,
+        root: str = "/estimate",
+        colour: Colour = GUESS,
+        has_light: bool = True,
+    ) -> None:
+        self._root, self._colour, self._has_light = root, colour, has_light
+        self._server = server
+        self._is_named = is_named
+        self._scene = server.scene
+        self._library = library
+        self._lock = threading.RLock()
+        self._names: tuple[str, ...] = ()
+        self._meshes: dict[str, Mesh] = {}
+        self._tried: dict[str, viser.BatchedMeshHandle] = {}
+        self._guesses: dict[str, viser.BatchedMeshHandle] = {}
+        self._verdicts: list[viser.SceneNodeHandle] = []
+        self._has_candidates = True
+        self._lamp: tuple[viser.BoxHandle, viser.LineSegmentsHandle, viser.LabelHandle] | None = None
+        self._tried_lights = self._copies(
+            f"{root}/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, colour=LIGHT_COLOUR, opacity=0.5
+        )
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is drawn."""
+        return not self._names and self._lamp is None
+
+    def show(self, step: EstimateStep) -> None:
+        """Draw a step in place of the one before; the last one with its verdict."""
+        with self._lock, self._changes():
+            if step.guess.names != self._names:
+                self._begin(step.guess.names)
+            self._clear_verdicts()
+            for n, name in enumerate(self._names):
+                self._show_guess(name, step.guess.poses[n], _WIRES)
+                self._show_tried(name, None if step.candidates is None else step.candidates[:, n])
+            self._show_light(step.guess.light, step.lights, "guessed light")
+            if step.estimate is not None:
+                self._judge(step.estimate)
+
+    def follow(self, estimate: EstimatedState) -> None:
+        """Draw one of many estimates of things on their way: where they are, and which are doubted, without a word."""
+        with self._lock, self._changes():
+            if estimate.state.names != self._names:
+                self._begin(estimate.state.names)
+            self._clear_verdicts()
+            for n, name in enumerate(self._names):
+                self._show_guess(name, estimate.state.poses[n], _FAINT_WIRES)
+                self._show_tried(name, None)
+                self._mark(name, estimate.doubts[n])
+            self._show_light(estimate.state.light, None, "estimated light")
+
+    def show_candidates(self, is_on: bool) -> None:
+        """Show or hide what is tried."""
+        with self._lock:
+            self._has_candidates = is_on
+            for node in (*self._tried.values(), self._tried_lights):
+                node.visible = is_on and node.visible
+
+    def clear(self) -> None:
+        """Remove everything."""
+        with self._lock, self._changes():
+            self._begin(())
+            self._clear_verdicts()
+            for node in self._lamp or ():
+                node.remove()
+            self._lamp, self._tried_lights.visible = None, False
+
+    @contextlib.contextmanager
+    def _changes(self) -> Iterator[None]:
+        """All at once in the browser."""
+        with self._server.atomic():
+            yield
+        self._server.flush()
+
+    def _begin(self, names: tuple[str, ...]) -> None:
+        for node in (*self._tried.values(), *self._guesses.values()):
+            node.remove()
+        self._names = names
+        self._meshes = {name: mesh_of(self._library, name) for name in names}
+        self._tried = {name: self._copies(f"{self._root}/tried/{name}", self._meshes[name], GHOSTS) for name in names}
+        self._guesses = {
+            name: self._copies(
+                f"{self._root}/guess/{name}", self._meshes[name], 1, colour=self._colour, opacity=_WIRES, is_wire=True
+            )
+            for name in names
+        }
+
+    def _label(self, name: str) -> str:
+        try:
+            return self._library.info(name).label
+        except OsfError:
+            return name
+
+    def _copies(
+        self,
+        path: str,
+        mesh: Mesh,
+        count: int,
+        *,
+        colour: Colour = _TRIED,
+        opacity: float = 0.2,
+        is_wire: bool = False,
+    ) -> viser.BatchedMeshHandle:
+        vertices, faces = mesh
+        return self._scene.add_batched_meshes_simple(
+            path,
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            np.tile([0.0, 0.0, -1.0], (count, 1)),
+            batched_scales=np.full(count, _WIRE_SCALE if is_wire else 1.0),
+            batched_colors=colour,
+            wireframe=is_wire,
+            opacity=opacity,
+            lod="off",
+            side="double" if is_wire else "front",
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
+        )
+
+    def _show_guess(self, name: str, pose: Pose, opacity: float) -> None:
+        self._guesses[name].opacity = opacity
+        _put(self._guesses[name], Pose(pose.position[None], pose.quaternion[None]))
+        self._guesses[name].visible = bool(pose.position[2] > _AWAY_M)
+
+    def _show_tried(self, name: str, candidates: Pose | None) -> None:
+        node = self._tried[name]
+        if candidates is not None:
+            _put(node, spread(candidates, GHOSTS))
+        node.visible = candidates is not None and self._has_candidates
+
+    def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
+        if not self._has_light:
+            return
+        cube, ray, label = self._lamp = self._lamp or self._add_lamp()
+        cube.position = label.position = light.position
+        ray.points = np.stack([0.55 * light.position, light.position])[None].astype(np.float32)
+        label.text = text
+        if tried is not None:
+            turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(tried), 1))
+            _put(self._tried_lights, spread(Pose(np.asarray(tried, float), turns), GHOSTS))
+        self._tried_lights.visible = tried is not None and self._has_candidates
+
+    def _add_lamp(self) -> tuple[viser.BoxHandle, viser.LineSegmentsHandle, viser.LabelHandle]:
+        scene, nowhere = self._scene, np.zeros((1, 2, 3), np.float32)
+        return (
+            scene.add_box(
+                f"{self._root}/light",
+                color=LIGHT_COLOUR,
+                dimensions=(LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M),
+                cast_shadow=False,
+                receive_shadow=False,
+            ),
+            scene.add_line_segments(f"{self._root}/light_ray", nowhere, LIGHT_COLOUR, thickness=0.004),
+            scene.add_label(f"{self._root}/light_name", "", font_screen_scale=0.8, anchor="top-center"),
+        )
+
+    # The verdict
+
+    def _judge(self, estimate: EstimatedState) -> None:
+        for n, name in enumerate(estimate.state.names):
+            pose, doubt = estimate.state.poses[n], estimate.doubts[n]
+            self._mark(name, doubt)
+            self._add_verdict(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
+        within = f"± {_told(np.rad2deg(_SIGMAS * estimate.light_std))}°"
+        self._show_light(estimate.state.light, None, f"estimated light {within}")
+
+    def _mark(self, name: str, doubt: str) -> None:
+        self._guesses[name].batched_colors = np.array(_DOUBTED if doubt else _SURE, np.uint8)
+
+    def _add_verdict(self, name: str, pose: Pose, position_std: float, rotation_std: float, doubt: str) -> None:
+        """A ball of two standard deviations on the object's top, a sector of two around its heading, and words."""
+        scene, (vertices, _) = self._scene, self._meshes[name]
+        colour = _DOUBTED if doubt else _SURE
+        top = pose.position + np.array([0.0, 0.0, top_m(vertices, pose.quaternion)])
+        ball_m = float(np.clip(_SIGMAS * position_std, _LEAST_BALL_M, _MOST_BALL_M))
+        turn_rad = float(np.clip(_SIGMAS * rotation_std, _LEAST_TURN_RAD, _MOST_TURN_RAD))
+        reach_m = footprint_m(vertices, pose.quaternion)
+        flat = sector(heading_rad(pose.quaternion), turn_rad, reach_m + _RING_M[0], reach_m + _RING_M[1])
+        text = f"± {_told(1000 * _SIGMAS * position_std)} mm, ± {_told(np.rad2deg(_SIGMAS * rotation_std))}°"
+        text = f"DOUBTFUL: {doubt}" if doubt else text
+        text = text if self._is_named(name) else f"{self._label(name)}: {text}"
+        self._verdicts += [
+            scene.add_icosphere(
+                f"{self._root}/verdict/{name}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False
+            ),
+            scene.add_mesh_simple(
+                f"{self._root}/verdict/{name}/turn",
+                *flat,
+                color=colour,
+                opacity=0.8,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+                position=(pose.position[0], pose.position[1], _TABLE_M),
+            ),
+            scene.add_label(
+                f"{self._root}/verdict/{name}/words",
+                text,
+                position=top + np.array([0.0, 0.0, _LABEL_M + ball_m]),
+                font_screen_scale=0.75,
+                anchor="bottom-center",
+            ),
+        ]
+
+    def _clear_verdicts(self) -> None:
+        for node in self._verdicts:
+            node.remove()
+        self._verdicts = []
+        for guess in self._guesses.values():
+            guess.batched_colors = np.array(self._colour, np.uint8)
+
+
+def _put(node: viser.BatchedMeshHandle, poses: Pose) -> None:
+    node.batched_positions = poses.position.astype(np.float32)
+    node.batched_wxyzs = poses.quaternion.astype(np.float32)
+
+
+def _told(value: float) -> str:
+    """Two digits, or words for what is without bounds."""
+    return f"{value:.2g}" if np.isfinite(value) else "any"

@@ -1,0 +1,134 @@
+"""Shapes of what is only believed: coarse meshes for many copies, sectors for orientations, small cubes for lights."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from osfcore.errors import OsfError
+from osfcore.geometry.poses import Pose, rotate
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.objects.asset_library import AssetLibrary
+
+CELLS = 14  # along the longest side of an object; a ghost has some hundred triangles
+_ARC_STEPS = 24
+_UNKNOWN_M = 0.05
+_MOVED_M, _TURNED = 5e-4, 1e-3
+_log = logging.getLogger(__name__)
+Mesh = tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]
+
+
+def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], cells: int = CELLS) -> Mesh:
+    """A mesh with all vertices of one cell of a grid drawn together; triangles that vanish are left out.
+
+    Args:
+        vertices: of the mesh [m].
+        faces: vertex indices.
+        cells: of the grid along the longest side.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    cell_m = max(float((high - low).max()) / cells, 1e-9)
+    keys = np.minimum((vertices - low) / cell_m, cells - 1e-6).astype(np.int64)
+    _, own = np.unique(keys, axis=0, return_inverse=True)
+    own = own.reshape(-1)
+    count = np.bincount(own)
+    merged = np.stack([np.bincount(own, vertices[:, axis]) / count for axis in range(3)], axis=1)
+    corners = own[faces]
+    kept = corners[
+        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    ]
+    _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
+    return merged.astype(np.float32), kept[np.sort(first)].astype(np.uint32)
+
+
+def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
+    """The coarse mesh of an object.
+
+    What is recognised by its field needs no mesh on this machine, and what is on a table may have been removed since:
+    such an object is a cube.
+    """
+    try:
+        mesh = library.load(name).mesh
+    except OsfError as error:
+        _log.info("%s is drawn as a cube: %s", name, error)
+        return box(_UNKNOWN_M)
+    return coarse(mesh.vertices, mesh.faces, cells)
+
+
+def box(side_m: float) -> Mesh:
+    """A cube around the origin."""
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32) * side_m / 2
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6),
+             (0, 6, 4), (1, 5, 7), (1, 7, 3)]  # fmt: skip
+    return corners, np.array(faces, np.uint32)
+
+
+def sector(heading_rad: float, half_rad: float, inner_m: float, outer_m: float) -> Mesh:
+    """A flat piece of a ring around the origin, seen from above: headings from -half to +half about one.
+
+    Args:
+        heading_rad: of its middle, from +x toward +y.
+        half_rad: half its opening.
+        inner_m: where it begins.
+        outer_m: where it ends.
+    """
+    angles = heading_rad + np.linspace(-half_rad, half_rad, _ARC_STEPS + 1)
+    rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
+    vertices = np.concatenate([inner_m * rim, outer_m * rim]).astype(np.float32)
+    a = np.arange(_ARC_STEPS)
+    b = a + _ARC_STEPS + 1
+    faces = np.concatenate([np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)])
+    return vertices, faces.astype(np.uint32)
+
+
+def spread(poses: Pose, count: int) -> Pose:
+    """`count` of a batch of poses, evenly chosen; some more than once if there are fewer."""
+    rows = np.round(np.linspace(0, len(poses.position) - 1, count)).astype(int)
+    return poses[rows]
+
+
+def moves(poses: Pose) -> bool:
+    """Whether an object on its way goes or turns far enough to be seen."""
+    shift = np.abs(poses.position - poses.position[0]).max()
+    turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
+    return bool(shift > _MOVED_M or turn > _TURNED**2)
+
+
+def way_of(rollouts: Rollouts, number: int) -> Pose:
+    """The poses of an object in the first of some rollouts, one after each action."""
+    return Pose(rollouts.positions[0, :, number], rollouts.quaternions[0, :, number])
+
+
+def between(rows: Float[np.ndarray, "T C"], step: float) -> Float[np.ndarray, "C"]:
+    """A row, or what lies between two; the first and the last one reach beyond the ends."""
+    step = min(max(step, 0.0), len(rows) - 1.0)
+    before = int(step)
+    after = min(before + 1, len(rows) - 1)
+    return rows[before] + (step - before) * (rows[after] - rows[before])
+
+
+def pose_at(poses: Pose, step: float) -> Pose:
+    """Where something is on its way after some steps, which turn it by less than half a turn each."""
+    signs = np.where(np.sum(poses.quaternion[1:] * poses.quaternion[:-1], axis=1) < 0, -1.0, 1.0)
+    aligned = poses.quaternion * np.cumprod(np.concatenate([[1.0], signs]))[:, None]
+    turn = between(aligned, step)
+    return Pose(between(poses.position, step), turn / np.linalg.norm(turn))
+
+
+def top_m(vertices: Float[np.ndarray, "P 3"], quaternion: Float[np.ndarray, "4"]) -> float:
+    """How far a turned mesh reaches above its origin [m]."""
+    return float(rotate(quaternion, vertices)[:, 2].max())
+
+
+def footprint_m(vertices: Float[np.ndarray, "P 3"], quaternion: Float[np.ndarray, "4"]) -> float:
+    """How far a turned mesh reaches sideways from its origin [m]."""
+    return float(np.linalg.norm(rotate(quaternion, vertices)[:, :2], axis=1).max())
+
+
+def heading_rad(quaternion: Float[np.ndarray, "4"]) -> float:
+    """Where that axis of an object points, seen from above, that lies flattest; from +x toward +y."""
+    axes = rotate(quaternion, np.eye(3))
+    x, y, _ = axes[int(np.abs(axes[:, 2]).argmin())]
+    return float(np.arctan2(y, x))

@@ -1,0 +1,319 @@
+"""The nodes that show a scene in the 3D view."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import viser
+
+from app.processes.messages import SceneRecord
+from osfcore.errors import OsfError
+from osfcore.geometry.cameras import Camera, default_cameras
+from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.imaging.optics import TABLE_ALBEDO
+
+VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.95, -0.95, 0.9), (0.0, 0.0, 0.1), 0.8
+TABLE_THICKNESS_M = 0.04
+LIGHT_CUBE_M = 0.06
+LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
+LABEL_GAP_M = 0.01
+AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+_STILL = 1e-6  # poses that differ by less are not sent again
+_log = logging.getLogger(__name__)
+Client = viser.ClientHandle | None
+
+
+class SceneDrawing:
+    """The nodes of one viser scene. Nodes are made once; afterwards only what changes is assigned."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        on_move: Callable[[str, Pose, Client], None],
+        on_light: Callable[[Light, Client], None],
+    ) -> None:
+        self._server = server
+        self._scene = server.scene
+        self._library = library
+        self._on_move = on_move
+        self._on_light = on_light
+        self._on_change: Callable[[], None] = _nothing
+        self._lock = threading.RLock()
+        self._bodies: dict[str, viser.SceneNodeHandle] = {}
+        self._labels: dict[str, viser.SceneNodeHandle] = {}
+        self._gizmos: dict[str, viser.SceneNodeHandle] = {}
+        self._sizes_m: dict[str, np.ndarray] = {}
+        # What someone is dragging follows the hand, not the scene.
+        self._grabbed: dict[str, np.ndarray] = {}
+        self._is_light_held = False
+        self._has_names = True
+        self._has_gizmos = False
+        self._lamp_wishes: dict[str, tuple[bool, str]] = {}
+        self._has_lamp = True
+        self._add_room()
+        self._add_light()
+        self._frustums = {camera.name: self._frustum(camera) for camera in default_cameras()}
+
+    def show(self, record: SceneRecord | None) -> None:
+        """Begin with a scene, or clear the table."""
+        names = () if record is None else record.state.names
+        with self._lock:
+            for name in set(self._bodies) - set(names):
+                for nodes in (self._bodies, self._labels, self._gizmos):
+                    nodes.pop(name).remove()
+            for name in names:
+                if name not in self._bodies:
+                    self._add_object(name)
+            self._grabbed.clear()
+            self._is_light_held = False
+            self._pusher.visible = record is not None
+            self._ray.visible = self._has_lamp and record is not None
+            for frustum in self._frustums.values():
+                frustum.image = None
+            if record is not None:
+                self.place(record.state)
+        self._on_change()
+
+    def watch(self, on_change: Callable[[], None]) -> None:
+        """Call a function, which must be quick, whenever something has moved."""
+        self._on_change = on_change
+
+    def state(self) -> SceneState:
+        """What is on view, hands and all."""
+        with self._lock:
+            names = tuple(self._bodies)
+            positions = np.array([self._bodies[name].position for name in names], float).reshape(-1, 3)
+            quaternions = np.array([self._bodies[name].wxyz for name in names], float).reshape(-1, 4)
+            pusher = np.array(self._pusher.position, float) if self._pusher.visible else None
+            return SceneState(names, Pose(positions, quaternions), Light(np.array(self._lamp.position)), pusher)
+
+    def place(self, state: SceneState) -> None:
+        """Move everything to where it is in a state."""
+        with self._lock, self._changes():
+            for name in state.names:
+                if name in self._bodies and name not in self._grabbed:
+                    self._place_object(name, state.pose(name))
+            if state.pusher is not None:
+                _put(self._pusher, state.pusher)
+            if not self._is_light_held:
+                self._place_light(state.light.position)
+                _put(self._light_gizmo, state.light.position)
+        self._on_change()
+
+    def show_frames(self, names: tuple[str, ...], images: np.ndarray) -> None:
+        """Put live images into the cameras' frustums."""
+        with self._lock:
+            for name, image in zip(names, images, strict=True):
+                if name in self._frustums:
+                    self._frustums[name].image = image
+
+    def has(self, name: str) -> bool:
+        """Whether an object is on the table."""
+        return name in self._bodies
+
+    def show_cameras(self, is_on: bool) -> None:
+        """Show or hide the cameras."""
+        for frustum in self._frustums.values():
+            frustum.visible = is_on
+
+    def show_lamp(self, *, is_on: bool, name: str = "", by: str = "") -> None:
+        """Show or hide the scene's own light; with a name, in another colour, so that it is not taken for a guess.
+
+        Each view that draws guesses has its say: the lamp is as usual once none of them wants it otherwise.
+        """
+        with self._lock:
+            self._lamp_wishes[by] = is_on, name
+            others = [wish for wish in self._lamp_wishes.values() if wish != (True, "")]
+            is_on, name = max(others, default=(True, ""))
+            self._cube.visible = self._light_gizmo.visible = self._has_lamp = is_on
+            self._ray.visible = is_on and self._pusher.visible
+            self._cube.color = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
+            self._ray.colors = np.array(self._cube.color, np.uint8)
+            self._lamp_name.text, self._lamp_name.visible = name, is_on and bool(name)
+
+    def show_names(self, is_on: bool) -> None:
+        """Show or hide the objects' names."""
+        with self._lock:
+            self._has_names = is_on
+            for label in self._labels.values():
+                label.visible = is_on
+
+    def show_gizmos(self, is_on: bool) -> None:
+        """Show or hide the handles for moving objects."""
+        with self._lock:
+            if is_on != self._has_gizmos:
+                self._has_gizmos = is_on
+                for gizmo in self._gizmos.values():
+                    gizmo.visible = is_on
+
+    @contextlib.contextmanager
+    def _changes(self) -> Iterator[None]:
+        """All at once in the browser."""
+        with self._server.atomic():
+            yield
+        self._server.flush()
+
+    def _add_room(self) -> None:
+        scene = self._scene
+        scene.set_up_direction("+z")
+        scene.configure_default_lights(False)
+        scene.configure_environment_map(None)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.up = VIEW_FROM, VIEW_AT, (0.0, 0.0, 1.0)
+        camera.fov = VIEW_FOV_RAD
+        camera.near, camera.far = 0.01, 20.0
+        scene.add_box(
+            "/table",
+            color=_colour(TABLE_ALBEDO),
+            dimensions=(TABLE_SIDE_M, TABLE_SIDE_M, TABLE_THICKNESS_M),
+            position=(0.0, 0.0, -TABLE_THICKNESS_M / 2),
+            cast_shadow=False,
+        )
+        corner = (0.06 - TABLE_SIDE_M / 2, 0.06 - TABLE_SIDE_M / 2, 0.002)
+        scene.add_frame("/axes", position=corner, axes_length=AXES_M, axes_radius=0.004, origin_radius=0.006)
+        for name, offset in (("x", (AXES_M, 0, 0)), ("y", (0, AXES_M, 0))):
+            scene.add_label(f"/axes/{name}", name, position=offset, font_screen_scale=0.8)
+        self._pusher = scene.add_cylinder(
+            "/pusher", radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, color=_colour(PUSHER_ALBEDO), visible=False
+        )
+
+    def _add_light(self) -> None:
+        scene = self._scene
+        start = (0.0, 0.0, 1.0)
+        # three.js divides by pi what Lambert's law does not
+        scene.add_light_ambient("/ambient", intensity=float(np.pi * AMBIENT))
+        self._lamp = scene.add_light_directional(
+            "/lamp", intensity=float(np.pi * DIFFUSE), cast_shadow=True, position=start
+        )
+        cube = (LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M)
+        self._cube = scene.add_box(
+            "/light", color=LIGHT_COLOUR, dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
+        )
+        self._ray = scene.add_line_segments("/light_ray", _ray_from(np.array(start)), LIGHT_COLOUR, thickness=0.004)
+        self._lamp_name = scene.add_label(
+            "/light_name", "", position=start, visible=False, font_screen_scale=0.8, anchor="bottom-center"
+        )
+        self._light_gizmo = scene.add_transform_controls(
+            "/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
+        )
+
+        async def drag(event: viser.TransformControlsEvent) -> None:
+            light = light_toward(np.asarray(event.target.position))
+            if event.phase != "end":
+                self._is_light_held = True
+                if light is not None:
+                    self._place_light(light.position)
+                    self._on_change()
+                return
+            self._is_light_held = False
+            if light is not None:
+                self._place_light(light.position)
+                event.target.position = tuple(light.position)
+                self._on_light(light, event.client)
+
+        self._light_gizmo.on_update(drag)
+
+    def _frustum(self, camera: Camera) -> viser.CameraFrustumHandle:
+        pose = camera.T_world_camera
+        return self._scene.add_camera_frustum(
+            f"/cameras/{camera.name}",
+            fov=camera.fov_y_rad,
+            aspect=camera.width / camera.height,
+            scale=0.06,
+            thickness=0.003,
+            color=(90, 100, 115),
+            wxyz=pose.quaternion,
+            position=pose.position,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _add_object(self, name: str) -> None:
+        try:
+            body = self._scene.add_glb(f"/objects/{name}", self._library.viewer_glb(name))
+            self._sizes_m[name] = self._library.size_m(name)
+            label = self._library.info(name).label
+        except OsfError as error:  # removed or damaged since the scene was made: its name still shows where it is
+            _log.warning("%s is not drawn: %s", name, error)
+            body, label = self._scene.add_frame(f"/objects/{name}", axes_length=0.05, axes_radius=0.002), name
+        self._bodies[name] = body
+        self._labels[name] = self._scene.add_label(
+            f"/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
+        )
+        gizmo = self._scene.add_transform_controls(
+            f"/handles/{name}", scale=0.12, visible=self._has_gizmos, depth_test=False
+        )
+        self._gizmos[name] = gizmo
+
+        async def drag(event: viser.TransformControlsEvent) -> None:
+            body = self._bodies.get(name)
+            if body is None:
+                return
+            # Handles stay along the table's axes: what they turn is added to how the object lay when it was grabbed.
+            turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
+            pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
+            self._follow(name, pose)
+            self._on_change()
+            if event.phase == "end":
+                self._grabbed.pop(name, None)
+                self._on_move(name, pose, event.client)
+
+        gizmo.on_update(drag)
+
+    def _follow(self, name: str, pose: Pose) -> None:
+        body, label = self._bodies.get(name), self._labels.get(name)
+        if body is not None and label is not None:
+            _put(body, pose.position, pose.quaternion)
+            size_m = self._sizes_m.get(name, np.zeros(3))
+            top_m = float(np.abs(quaternion_to_matrix(pose.quaternion)[2]) @ size_m / 2)
+            _put(label, pose.position + np.array([0.0, 0.0, top_m + LABEL_GAP_M]))
+
+    def _place_object(self, name: str, pose: Pose) -> None:
+        self._follow(name, pose)
+        _put(self._gizmos[name], pose.position, NO_TURN)
+
+    def _place_light(self, position: np.ndarray) -> None:
+        _put(self._cube, position)
+        _put(self._lamp, position)
+        _put(self._lamp_name, position)
+        self._ray.points = _ray_from(position)
+
+
+def _nothing() -> None:
+    """For as long as nobody watches."""
+
+
+def _ray_from(position: np.ndarray) -> np.ndarray:
+    """A stretch of the line along which the light falls, which leads the eye to a lamp that is out of view."""
+    return np.stack([0.55 * position, position])[None].astype(np.float32)
+
+
+def light_toward(position: np.ndarray) -> Light | None:
+    """The light in the direction of a point [m], kept above the lowest elevation; None for the table's centre."""
+    if not np.all(np.isfinite(position)) or not np.linalg.norm(position) > 1e-6:
+        return None
+    x, y, z = position / np.linalg.norm(position)
+    lowest_rad = float(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))
+    return Light.from_angles(float(np.arctan2(y, x)), max(float(np.arcsin(np.clip(z, -1, 1))), lowest_rad))
+
+
+def _put(node: viser.SceneNodeHandle, position: np.ndarray, quaternion: np.ndarray | None = None) -> None:
+    if np.abs(np.asarray(node.position) - position).max() > _STILL:
+        node.position = np.asarray(position, float)
+    if quaternion is not None and np.abs(np.asarray(node.wxyz) - quaternion).max() > _STILL:
+        node.wxyz = np.asarray(quaternion, float)
+
+
+def _colour(albedo: tuple[float, float, float]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * channel) for channel in albedo)
+    return red, green, blue

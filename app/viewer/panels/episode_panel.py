@@ -1,0 +1,324 @@
+"""Episodes in the 3D view: the folder in the panel, and the thread that draws the newest of what one tells.
+
+Events come from the jobs' thread and are only noted there; drawing, at most some times a second, happens here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import viser
+
+from app.jobs.job import Job, JobChanged, JobSeen
+from app.processes.messages import CurrentScene, SceneChanged
+from app.processes.plan_summary import PlanSketch
+from app.services.episodes import KIND
+from app.services.goals import DraftChanged
+from app.viewer.drawing_thread import DrawingThread
+from app.viewer.nodes.episode_nodes import EpisodeDrawing, Part
+from app.viewer.nodes.scene_nodes import Client, SceneDrawing
+from app.viewer.panels.status_line import status
+from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.planning.pose_cost import PoseGoal
+
+DRAW_INTERVAL_S = 0.08
+_IDLE = "No episode yet"
+_SHOWN: tuple[tuple[Part, str, str], ...] = (
+    ("goal", "Show goal", "Golden: where everything should be."),
+    ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
+    ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
+)
+Obey = Callable[[Callable[[], object], Client], None]
+
+
+class Orders(Protocol):
+    """What a job can be told."""
+
+    def pause(self, job: str) -> object:
+        """Let it rest."""
+        ...
+
+    def resume(self, job: str) -> object:
+        """Let it go on."""
+        ...
+
+    def step(self, job: str) -> object:
+        """Let it go on to the end of its round."""
+        ...
+
+    def cancel(self, job: str) -> object:
+        """End it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Told:
+    """What an episode has told, as far as it is drawn. Newer news replace older ones of their kind, and no others.
+
+    Attributes:
+        job: that runs it.
+        goal: where everything should be.
+        sight: an estimator at work, or what the last one has found.
+        plan: the last round of planning.
+        left: how far the objects are from the goal.
+        notice: what a person should know.
+        end: how it ended.
+    """
+
+    job: Job | None = None
+    goal: PoseGoal | None = None
+    sight: Looking | EstimatedState | None = None
+    plan: PlanSketch | None = None
+    left: str = ""
+    notice: str = ""
+    end: str = ""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is more to come."""
+        return self.job is not None and not self.job.is_finished
+
+    def of(self, job: Job) -> _Told:
+        """What is known once the job is like this; nothing yet if it is another one."""
+        if self.job is None or self.job.id != job.id:
+            return _Told(job)
+        if not job.is_finished:
+            return replace(self, job=job)
+        return replace(self, job=job, plan=None, sight=None if isinstance(self.sight, Looking) else self.sight)
+
+    def with_seen(self, seen: object) -> _Told:
+        """What is known once something has happened."""
+        match seen:
+            case Looking(look="next", step=EstimateStep(candidates=None)):
+                return self  # over before anybody has seen it
+            case Looking():
+                return replace(self, sight=seen)
+            case GoalFound(goal):
+                return replace(self, goal=goal)
+            case PlanSketch():
+                return replace(self, plan=seen)
+            case Stepped(estimate=estimate):
+                return replace(self, sight=estimate, left=_far(seen))
+            case Noticed(number, _, text):
+                return replace(self, notice=f"Step {number}: {text}")
+            case Finished(text=text):
+                return replace(self, end=text)
+            case _:
+                return self
+
+
+class EpisodeView:
+    """What visitors see and do about episodes; the same for all of them.
+
+    Args:
+        server: whose panel gets the folder.
+        drawings: of the table, whose own lamp tells the truth, and of episodes.
+        orders: to the job that runs one.
+        obey: carries out a command and tells its visitor if it is refused.
+        make_room: called before an episode is drawn, to remove what would be in its way.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        drawings: tuple[SceneDrawing, EpisodeDrawing],
+        orders: Orders,
+        obey: Obey,
+        make_room: Callable[[], object],
+    ) -> None:
+        self._table, self._drawing = drawings
+        self._orders = orders
+        self._obey = obey
+        self._make_room = make_room
+        self._thread = DrawingThread("episode-view", self._draw, DRAW_INTERVAL_S)
+        self._told = _Told()
+        self._current: str | None = None
+        self._drawn = _Told()
+        self._plan_at = 0.0
+        self._add_panel(server.gui)
+
+    def start(self, current: str | None) -> None:
+        """Begin to draw; `current` is the scene on view."""
+        self._current = current
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread. Calling it again does nothing."""
+        self._thread.stop()
+
+    def note(self, event: object) -> None:
+        """Take note of an event; those of other kinds are ignored. Any thread may call."""
+        with self._thread.changed:
+            told = self._told
+            match event:
+                case JobSeen(job, seen) if job.kind == KIND:
+                    self._told = told.of(job).with_seen(seen)
+                case JobChanged(_, job) if job.kind == KIND and self._is_latest(job):
+                    self._told = told.of(job)
+                case CurrentScene(record):
+                    self._current = None if record is None else record.id
+                    if not told.is_live and not self._is_here(told):
+                        self._told = _Told()
+                case DraftChanged(draft) if draft is not None and not told.is_live:
+                    self._told = _Told()  # a new goal begins: the former one would be taken for it
+                case SceneChanged(record) if not told.is_live and self._is_of(told, record.id):
+                    self._told = replace(told, sight=None)  # hands have moved something: nobody believes that now
+                case JobSeen(_, EstimateStep()) if not told.is_live:
+                    self._told = replace(told, sight=None)
+                case _:
+                    return
+            self._thread.wake()
+
+    def _is_here(self, told: _Told) -> bool:
+        """Whether it is about what is on view."""
+        return self._current is not None and self._is_of(told, self._current)
+
+    @staticmethod
+    def _is_of(told: _Told, scene: str) -> bool:
+        return told.job is not None and told.job.params["scene"] == scene
+
+    def _is_latest(self, job: Job) -> bool:
+        """One that waits does not take the view from one that runs."""
+        mine = self._told.job
+        return mine is None or mine.id == job.id or job.state == "running" or not self._told.is_live
+
+    # The panel
+
+    def _add_panel(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("Episode", expand_by_default=False):
+            self._status = gui.add_html(status("episode", _IDLE))
+            self._bar = gui.add_progress_bar(0.0, visible=False)
+            self._notice = gui.add_html("", visible=False)
+            self._pause_button = gui.add_button("Pause", disabled=True)
+            self._step_button = gui.add_button("Step", disabled=True, hint="One more round, then rest again.")
+            self._cancel_button = gui.add_button("Cancel", disabled=True, hint="End it; its steps are kept.")
+            for part, label, hint in _SHOWN:
+                self._add_part(gui, part, label, hint)
+            self._wants_truth = gui.add_checkbox(
+                "Show true light", False, hint="The simulation's own light, which the estimator does not know."
+            )
+            clear = gui.add_button("Clear", hint="Remove what a finished episode has drawn.")
+        self._pause_button.on_click(lambda event: self._obey(self._toggle, event.client))
+        self._step_button.on_click(lambda event: self._obey(self._step, event.client))
+        self._cancel_button.on_click(lambda event: self._obey(self._cancel, event.client))
+        self._wants_truth.on_update(lambda _: self._draw_truth())
+        clear.on_click(lambda _: self._forget())
+
+    def _add_part(self, gui: viser.GuiApi, part: Part, label: str, hint: str) -> None:
+        box = gui.add_checkbox(label, True, hint=hint)
+
+        def show(_: object) -> None:
+            self._drawing.show_part(part, box.value)
+            self._draw_truth()
+
+        box.on_update(show)
+
+    def _toggle(self) -> None:
+        job = self._told.job
+        if job is not None and job.state == "paused":
+            self._orders.resume(job.id)
+        elif job is not None:
+            self._orders.pause(job.id)
+
+    def _step(self) -> None:
+        job = self._told.job
+        if job is not None:
+            self._orders.step(job.id)
+
+    def _cancel(self) -> None:
+        job = self._told.job
+        if job is not None:
+            self._orders.cancel(job.id)
+
+    def _forget(self) -> None:
+        with self._thread.changed:
+            if not self._told.is_live:
+                self._told = _Told()
+                self._thread.wake()
+
+    # The thread
+
+    def _draw(self) -> None:
+        with self._thread.changed:
+            told = self._told if self._is_here(self._told) else _Told()
+        if told is not self._drawn:
+            self._draw_news(told)
+        if told.plan is not None:
+            self._drawing.play(time.monotonic() - self._plan_at)
+            self._thread.wake(DRAW_INTERVAL_S)
+
+    def _draw_news(self, told: _Told) -> None:
+        drawn = self._drawn
+        if _id(told.job) != _id(drawn.job):
+            self._drawing.clear()
+            drawn = _Told(told.job)
+            if told.is_live:
+                self._make_room()
+        if told.sight is not drawn.sight:
+            if isinstance(told.sight, Looking):
+                self._drawing.show_look(told.sight)
+            else:
+                self._drawing.show_estimate(told.sight)
+        if told.goal is not drawn.goal:  # after what was seen while it was looked for
+            self._drawing.show_goal(told.goal)
+        if told.plan is not drawn.plan:
+            self._drawing.show_plan(told.plan)
+            self._plan_at = time.monotonic()
+        self._draw_truth()
+        self._draw_state(told)
+        self._drawn = told
+
+    def _draw_truth(self) -> None:
+        """While an estimate is on view, the green cube is its own; the lamp is shown on demand, in another colour."""
+        if self._drawing.shows_light:
+            self._table.show_lamp(is_on=self._wants_truth.value, name="true light", by=KIND)
+        else:
+            self._table.show_lamp(is_on=True, by=KIND)
+
+    def _draw_state(self, told: _Told) -> None:
+        job = told.job
+        is_paused = job is not None and job.state == "paused"
+        can_pause = job is not None and job.state in ("running", "paused")
+        self._bar.visible = told.is_live
+        if job is not None:
+            self._bar.value = 100.0 * job.done / max(job.total, 1)
+        self._pause_button.label = "Resume" if is_paused else "Pause"
+        self._pause_button.disabled = not can_pause
+        self._step_button.disabled = not is_paused
+        self._cancel_button.disabled = not told.is_live
+        self._status.content = status("episode", _says(told))
+        self._notice.content, self._notice.visible = status("episode", told.notice), bool(told.notice)
+
+
+def _id(job: Job | None) -> str | None:
+    return None if job is None else job.id
+
+
+def _says(told: _Told) -> str:
+    """How it is, for a person."""
+    job = told.job
+    if job is None:
+        return _IDLE
+    match job.state:
+        case "queued":
+            return "Waiting for other jobs"
+        case "cancelled":
+            return "Cancelled"
+        case "done":
+            return told.end or "Done"
+        case "running" | "paused":
+            told_now = [f"Paused: {job.note}" if job.state == "paused" else job.note, told.left]
+            return " · ".join(text for text in told_now if text)
+        case _:
+            return job.error or job.note
+
+
+def _far(stepped: Stepped) -> str:
+    far_mm, turned_deg = 1000 * stepped.offsets_m.max(), np.rad2deg(stepped.offsets_rad.max())
+    return f"at most {far_mm:.0f} mm and {turned_deg:.0f}° to go"

@@ -1,0 +1,280 @@
+"""Composing a goal in the 3D view: golden copies of the objects with handles, and the folder in the panel.
+
+Drafts come from whoever changes them and are only noted; drawing happens in the thread. Hands are answered by the
+simulation, so what they moved is on its way for a moment: until then it stays where it was let go.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from concurrent.futures import Executor
+from typing import Protocol
+
+import numpy as np
+import viser
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from app.processes.messages import CurrentScene
+from app.services.goals import Draft, DraftChanged
+from app.viewer.drawing_thread import DrawingThread
+from app.viewer.nodes.episode_nodes import GOAL
+from app.viewer.nodes.ghosts import mesh_of
+from app.viewer.nodes.scene_nodes import NO_TURN, Client
+from app.viewer.panels.status_line import status
+from osfcore.errors import OsfError
+from osfcore.geometry.poses import Pose, quaternion_multiply
+from osfcore.objects.asset_library import AssetLibrary
+
+WRONG = (225, 30, 35)
+NAME = "Composed"
+_OPACITY, _SCALE = 0.55, 1.015  # or a copy and the object that it lies upon would flicker
+_CELLS = 28
+_GIZMO_M = 0.11
+_WORDS_AT = (0.0, 0.0, 0.3)
+_STILL = 1e-6  # poses that differ by less are not sent again
+_NO_PICTURE = np.full((64, 64, 3), 235, np.uint8)
+_IDLE = "Lay the objects out as they should be, then save."
+_COMPOSING = "Drag the golden copies, or turn them by their rings."
+Obey = Callable[[Callable[[], object], Client], None]
+
+
+class Drafts(Protocol):
+    """The goal that is being composed, one for all visitors."""
+
+    @property
+    def draft(self) -> Draft | None:
+        """As it is now."""
+        ...
+
+    def begin_draft(self) -> object:
+        """Begin with where the objects are."""
+        ...
+
+    def move_draft(self, poses: tuple[tuple[str, Pose], ...]) -> object:
+        """Put objects elsewhere."""
+        ...
+
+    def drop_draft(self) -> None:
+        """End it."""
+        ...
+
+    def draft_image(self) -> bytes:
+        """PNG of what it looks like."""
+        ...
+
+    def keep_draft(self, name: str) -> object:
+        """Keep it as a goal image, and end it."""
+        ...
+
+
+class GoalView:
+    """What visitors see and do while a goal is composed; the same for all of them.
+
+    Args:
+        server: to draw in, and whose panel gets the folder.
+        library: knows the objects' shapes.
+        goals: what is composed.
+        commands: carries out what hands do; viser's loop must not wait for it.
+        obey: carries out a command and tells its visitor if it is refused.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, library: AssetLibrary, goals: Drafts, commands: Executor, obey: Obey
+    ) -> None:
+        self._server = server
+        self._library = library
+        self._goals = goals
+        self._commands = commands
+        self._obey = obey
+        self._thread = DrawingThread("goal-view", self._draw)
+        self._draft: Draft | None = None
+        self._current: str | None = None
+        self._copies: dict[str, _Copy] = {}
+        self._pictured: Draft | None = None
+        self._words = server.scene.add_label(
+            "/goal/problem", "", position=_WORDS_AT, visible=False, font_screen_scale=1.0, anchor="bottom-center"
+        )
+        self._add_panel(server.gui)
+
+    def start(self, current: str | None) -> None:
+        """Begin to draw; `current` is the scene on view."""
+        self._current, self._draft = current, self._goals.draft
+        self._thread.wake()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread. Calling it again does nothing."""
+        self._thread.stop()
+
+    def note(self, event: object) -> None:
+        """Take note of an event; those of other kinds are ignored. Any thread may call."""
+        with self._thread.changed:
+            match event:
+                case DraftChanged(draft):
+                    self._draft = draft
+                case CurrentScene(record):
+                    self._current = None if record is None else record.id
+                case _:
+                    return
+            self._thread.wake()
+
+    @property
+    def is_composing(self) -> bool:
+        """Whether handles of a goal are on view."""
+        with self._thread.changed:
+            return self._draft is not None and self._draft.scene == self._current
+
+    # The panel
+
+    def _add_panel(self, gui: viser.GuiApi) -> None:
+        goals = self._goals
+        with gui.add_folder("Goal", expand_by_default=False):
+            self._status = gui.add_html(status("goal", _IDLE))
+            self._begin_button = gui.add_button("Compose a goal", hint="Begins with where the objects are now.")
+            self._keep_button = gui.add_button("Save as goal image", disabled=True)
+            self._drop_button = gui.add_button("Stop composing", disabled=True, hint="Nothing is kept.")
+            self._image = gui.add_image(_NO_PICTURE, label="As the goal camera sees it", visible=False)
+        self._begin_button.on_click(lambda event: self._obey(goals.begin_draft, event.client))
+        self._keep_button.on_click(lambda event: self._obey(lambda: goals.keep_draft(NAME), event.client))
+        self._drop_button.on_click(lambda event: self._obey(goals.drop_draft, event.client))
+
+    # The thread
+
+    def _draw(self) -> None:
+        with self._thread.changed:
+            draft = self._draft if self.is_composing else None
+        self._draw_draft(draft)
+        self._draw_picture(draft)
+
+    def _draw_draft(self, draft: Draft | None) -> None:
+        poses = {} if draft is None else dict(draft.poses)
+        problem = "" if draft is None else draft.problem
+        with self._server.atomic():
+            for name in set(self._copies) - set(poses):
+                self._copies.pop(name).remove()
+            for name, pose in poses.items():
+                if name not in self._copies:
+                    self._copies[name] = _Copy(self._server.scene, self._library, name, self._let_go)
+                self._copies[name].place(pose)
+                self._copies[name].colour(WRONG if problem else GOAL)
+            self._words.text, self._words.visible = problem, bool(problem)
+        self._server.flush()
+        self._status.content = status("goal", _IDLE if draft is None else problem or _COMPOSING)
+        self._begin_button.disabled = draft is not None
+        self._keep_button.disabled = self._drop_button.disabled = draft is None
+
+    def _draw_picture(self, draft: Draft | None) -> None:
+        if draft is self._pictured:
+            return
+        self._pictured = draft
+        try:
+            pixels = None if draft is None else _pixels(self._goals.draft_image())
+        except OsfError:  # it has ended meanwhile
+            pixels = None
+        if pixels is not None:
+            self._image.image = pixels
+        self._image.visible = pixels is not None
+
+    def _let_go(self, copy: _Copy, grip: int, pose: Pose, client: Client) -> None:
+        """A copy was let go; where that is refused, it goes back. Called on viser's loop."""
+
+        def move() -> None:
+            try:
+                self._goals.move_draft(((copy.name, pose),))
+            finally:
+                copy.release(grip)
+                self._thread.wake()
+
+        self._commands.submit(self._obey, move, client)
+
+
+class _Copy:
+    """A golden copy of an object, with handles to move it over the table and to turn it about the vertical.
+
+    Args:
+        scene: to draw in.
+        library: knows its shape.
+        name: of the object.
+        on_release: called on viser's loop when somebody has let it go, with the number of the grip; must be quick.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        library: AssetLibrary,
+        name: str,
+        on_release: Callable[[_Copy, int, Pose, Client], None],
+    ) -> None:
+        self.name = name
+        self._grip = 0
+        self._is_held = False  # follows the hand, not the draft
+        self._laid = Pose.identity()
+        path = f"/goal/objects/{name}"
+        # The shape hangs on the handles, so that it follows at once in the browser of whoever drags.
+        self._gizmo = scene.add_transform_controls(
+            path, scale=_GIZMO_M, active_axes=(True, True, False), depth_test=False
+        )
+        self._shape = scene.add_mesh_simple(
+            f"{path}/shape",
+            *mesh_of(library, name, _CELLS),
+            color=GOAL,
+            opacity=_OPACITY,
+            scale=_SCALE,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+        async def drag(event: viser.TransformControlsEvent) -> None:
+            self._grip += event.phase == "start"
+            self._is_held = True
+            if event.phase == "end":
+                on_release(self, self._grip, self._pose(), event.client)
+
+        self._gizmo.on_update(drag)
+
+    def release(self, grip: int) -> None:
+        """The draft has taken over what a hand did, unless a hand is at it again."""
+        self._is_held = self._is_held and grip != self._grip
+
+    def place(self, pose: Pose) -> None:
+        """Put it where the draft has it, unless somebody holds it."""
+        if self._is_held:
+            return
+        self._laid = pose
+        for node, part, value in (
+            (self._gizmo, "position", pose.position),
+            (self._gizmo, "wxyz", NO_TURN),
+            (self._shape, "wxyz", pose.quaternion),
+        ):
+            if not np.abs(np.asarray(getattr(node, part)) - value).max() <= _STILL:  # also true for NaN
+                setattr(node, part, np.asarray(value, float))
+
+    def colour(self, colour: tuple[int, int, int]) -> None:
+        """Tint it."""
+        self._shape.color = colour
+
+    def remove(self) -> None:
+        """Remove it with its handles."""
+        self._gizmo.remove()
+
+    def _pose(self) -> Pose:
+        """Where it was dragged to, at the height and with the tilt of the draft; browsers may send anything."""
+        x, y = np.asarray(self._gizmo.position, float)[:2]
+        turn = quaternion_multiply(_about_z(np.asarray(self._gizmo.wxyz, float)), self._laid.quaternion)
+        if not np.all(np.isfinite([x, y])):
+            return self._laid
+        return Pose(np.array([x, y, self._laid.position[2]]), turn)
+
+
+def _about_z(turn: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
+    """The part of a rotation that is about the vertical; none for what is no rotation."""
+    flat = turn * np.array([1.0, 0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(flat))
+    return flat / length if np.isfinite(length) and length > 1e-6 else NO_TURN
+
+
+def _pixels(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    with Image.open(io.BytesIO(png)) as image:
+        return np.asarray(image.convert("RGB"))

@@ -1,0 +1,261 @@
+"""Neural pictures in the 3D view: a switch for each visitor, and a thread that keeps the pictures up to date."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+
+from app.processes.neural_client import Answer, NeuralLink
+from app.processes.neural_messages import DrawnView, DrawView
+from app.processes.render_cameras import view_camera
+from app.viewer.panels.refinement import STEPS, Refinement, Ticket
+from osfcore.errors import OsfError
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.states import SceneState
+
+WARM_UP = "The renderer is loading, which can take half a minute the first time; until then you see meshes."
+_TELL_AFTER_S = 1.0
+_NOTHING_M = 100.0  # depth where a ray meets nothing
+_BEHIND_M = 0.003  # pictures lie that much farther away, so that what stands on the table is not half in it
+_JPEG_QUALITY = {False: 75, True: 92}  # by whether a picture is sharp
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Come:
+    """An answer, with what was asked."""
+
+    ticket: Ticket
+    names: tuple[str, ...]
+    answer: Future[Answer]
+
+
+class Visitor:
+    """One browser: its switch, and what it is shown. All but the switch belongs to the thread of `NeuralViews`."""
+
+    def __init__(self, client: viser.ClientHandle, on_switch: Callable[[], None]) -> None:
+        self.client = client
+        self.refinement = Refinement()
+        self.come: list[_Come] = []
+        self.asked_at: float | None = None  # since when a first picture is waited for
+        self._hidden: dict[str, viser.SceneNodeHandle] = {}
+        self._waiting: viser.NotificationHandle | None = None
+        self._meshes: tuple[str, ...] = ()
+        self._is_clear = True
+        self._switch = client.gui.add_checkbox(
+            "Neural render", False, hint="Show what the trained fields look like from here, instead of the meshes."
+        )
+        self._note = client.gui.add_text("Still meshes", "", multiline=True, disabled=True, visible=False)
+        self._switch.on_update(lambda _: on_switch())
+
+    @property
+    def is_on(self) -> bool:
+        """Whether neural pictures are wanted."""
+        return bool(self._switch.value)
+
+    def due_at(self) -> float | None:
+        """When there is something to do; None if there is nothing."""
+        if not self.is_on:
+            return None if self._is_clear else 0.0
+        if self.come:
+            return 0.0
+        late_at = None if self.asked_at is None or self._waiting else self.asked_at + _TELL_AFTER_S
+        times = [at for at in (self.refinement.due_at(), late_at) if at is not None]
+        return min(times, default=None)
+
+    def camera(self, rows: int) -> Camera | None:
+        """The view now; None while what the browser tells makes no sense."""
+        view = self.client.camera
+        if view.image_height < 1:
+            return None
+        return view_camera(view.position, view.wxyz, view.fov, view.aspect, min(rows, view.image_height))
+
+    def show(self, picture: DrawnView, names: tuple[str, ...]) -> None:
+        """Put a picture behind everything, in place of the meshes of some objects, of the table and of the pusher."""
+        depth, is_sharp = picture.depth, picture.depth is not None
+        if depth is not None:
+            depth = np.where(depth > 0, depth + np.float32(_BEHIND_M), np.float32(_NOTHING_M))
+        quality = _JPEG_QUALITY[is_sharp]
+        self.client.scene.set_background_image(picture.image, "jpeg", jpeg_quality=quality, depth=depth)
+        self._hide({"/table", "/pusher", *(f"/objects/{name}" for name in names)})
+        self._stop_waiting()
+        self._is_clear = False
+
+    def clear(self) -> None:
+        """Back to meshes."""
+        self._hide(set())
+        self.client.scene.set_background_image(None)
+        self._stop_waiting()
+        self.tell_meshes(())
+        self._is_clear = True
+
+    def refuse(self, reason: str) -> None:
+        """Switch off, and say why."""
+        self._switch.value = False
+        self.clear()
+        self.client.add_notification("No neural render", reason, color="orange", auto_close_seconds=10.0)
+
+    def tell_late(self, now: float) -> None:
+        """Say that the renderer takes its time, if it does."""
+        if self.asked_at is not None and self._waiting is None and now >= self.asked_at + _TELL_AFTER_S:
+            self._waiting = self.client.add_notification("Neural render", WARM_UP, loading=True)
+
+    def tell_meshes(self, names: tuple[str, ...]) -> None:
+        """Say which objects have no field."""
+        if names == self._meshes:
+            return
+        self._meshes = names
+        self._note.value, self._note.visible = ", ".join(names), bool(names)
+        if names:
+            text = f"Without a field, so still shown as meshes: {', '.join(names)}. Fields are trained under Fields."
+            self.client.add_notification("Neural render", text, auto_close_seconds=8.0)
+
+    def _stop_waiting(self) -> None:
+        self.asked_at = None
+        if self._waiting is not None:
+            self._waiting.remove()
+            self._waiting = None
+
+    def _hide(self, paths: set[str]) -> None:
+        """Hide nodes from this visitor alone: its own, invisible node of the same name takes their place."""
+        for path in set(self._hidden) - paths:
+            self._hidden.pop(path).remove()
+        for path in paths - set(self._hidden):
+            self._hidden[path] = self.client.scene.add_frame(path, show_axes=False, visible=False)
+
+
+class NeuralViews:
+    """All visitors, and the thread that orders and shows their pictures.
+
+    Args:
+        link: to the renderer.
+        state: what is drawn now.
+        fields: names of the objects that have one.
+    """
+
+    def __init__(
+        self, link: NeuralLink, state: Callable[[], SceneState], fields: Callable[[], Collection[str]]
+    ) -> None:
+        self._link = link
+        self._state = state
+        self._fields = fields
+        self._visitors: dict[int, Visitor] = {}
+        self._changed = threading.Condition()  # guards the visitors, their refinements and what has come for them
+        self._is_stopped = False
+        self._thread = threading.Thread(target=self._run, name="neural-views", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look after visitors."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread. Calling it again does nothing."""
+        with self._changed:
+            self._is_stopped = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def add(self, client: viser.ClientHandle) -> None:
+        """Give a new visitor the switch."""
+        visitor = Visitor(client, lambda: self._moved(visitor))
+        client.camera.on_update(lambda _: self._moved(visitor))
+        with self._changed:
+            self._visitors[client.client_id] = visitor
+
+    def remove(self, client: viser.ClientHandle) -> None:
+        """Forget a visitor who left."""
+        with self._changed:
+            self._visitors.pop(client.client_id, None)
+
+    def scene_moved(self) -> None:
+        """What is drawn has changed. Any thread may call; it never waits for a picture."""
+        with self._changed:
+            self._moved(*self._visitors.values())
+
+    def _moved(self, *visitors: Visitor) -> None:
+        with self._changed:
+            for visitor in visitors:
+                visitor.refinement.moved(time.monotonic())
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                if self._is_stopped:
+                    return
+                now = time.monotonic()
+                due = [(at, visitor) for visitor in self._visitors.values() if (at := visitor.due_at()) is not None]
+                ready = [visitor for at, visitor in due if at <= now]
+                if not ready:
+                    self._changed.wait(min((at - now for at, _ in due), default=None))
+                    continue
+            for visitor in ready:
+                try:
+                    self._look_after(visitor, now)
+                except Exception:  # a defect; the other visitors still get their pictures
+                    _log.exception("a visitor's neural pictures failed")
+                    self.remove(visitor.client)
+
+    def _look_after(self, visitor: Visitor, now: float) -> None:
+        with self._changed:
+            come, visitor.come = visitor.come, []
+        for answer in come:
+            self._take(visitor, answer)
+        if not visitor.is_on:
+            visitor.clear()
+            return
+        visitor.tell_late(now)
+        with self._changed:
+            due_at = visitor.refinement.due_at()
+            ticket = visitor.refinement.order() if due_at is not None and due_at <= now else None
+        if ticket is not None:
+            self._order(visitor, ticket, now)
+
+    def _order(self, visitor: Visitor, ticket: Ticket, now: float) -> None:
+        step = STEPS[ticket.step]
+        camera, (state, others) = visitor.camera(step.rows), self._split(self._state())
+        if camera is None:
+            with self._changed:
+                visitor.refinement.give_up(ticket)
+            return
+        visitor.tell_meshes(others)
+        if not self._link.is_warm and visitor.asked_at is None:
+            visitor.asked_at = now
+        order = DrawView(f"view-{visitor.client.client_id}", state, camera, step.is_sharp)
+        answer = self._link.submit(order)
+        answer.add_done_callback(lambda done: self._came(visitor, _Come(ticket, state.names, done)))
+
+    def _split(self, state: SceneState) -> tuple[SceneState, tuple[str, ...]]:
+        """What can be rendered, and the names of the other objects."""
+        known = self._fields()
+        rows = [row for row, name in enumerate(state.names) if name in known]
+        others = tuple(name for name in state.names if name not in known)
+        names = tuple(state.names[row] for row in rows)
+        return SceneState(names, state.poses[rows], state.light, state.pusher), others
+
+    def _came(self, visitor: Visitor, come: _Come) -> None:
+        with self._changed:
+            visitor.come.append(come)
+            self._changed.notify()
+
+    def _take(self, visitor: Visitor, come: _Come) -> None:
+        error = come.answer.exception()
+        picture = None if error else come.answer.result()
+        with self._changed:
+            is_wanted = visitor.refinement.came(come.ticket, is_there=picture is not None)
+        if not visitor.is_on:
+            return
+        if isinstance(error, OsfError):
+            visitor.refuse(str(error))
+        elif error is not None:
+            raise error
+        elif is_wanted and isinstance(picture, DrawnView):
+            visitor.show(picture, come.names)

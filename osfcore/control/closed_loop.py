@@ -1,0 +1,337 @@
+"""Algorithm 1: estimate, plan, act, look again, as a generator of events over a world.
+
+Deviations from the paper: goal poses are found once, before anything moves, so that pushes can be aimed at them and a
+goal that cannot be explained is told at once; each later estimate begins at what the dynamics model predicted; an
+object that was lost is looked for, a lamp that was moved is estimated again, and where nothing gets better plans are
+drawn anew.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import (
+    Acted,
+    Event,
+    Finished,
+    GoalFound,
+    Look,
+    Looking,
+    Noticed,
+    Observed,
+    Outcome,
+    Planning,
+    Stepped,
+)
+from osfcore.control.goal import GoalImage, alike, settled, unmoved
+from osfcore.control.knowledge import Knowledge
+from osfcore.control.monitor import Patience, carried, lamp_moved, offsets
+from osfcore.control.relocalization import search_lost
+from osfcore.control.world_protocol import World
+from osfcore.errors import InvalidInput
+from osfcore.estimation.first_frame import estimate_first
+from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.tracking import estimate_next, usual_residuals
+from osfcore.geometry.cameras import Camera, goal_camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+from osfcore.planning.image_cost import ImageCost
+from osfcore.planning.mppi import Planner
+from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal
+from osfcore.planning.push_proposals import PushProposals
+from osfcore.render.types import Quality, SceneBatch
+
+StepT = TypeVar("StepT")
+_SHOWN = Quality(samples_per_side=2)
+_LOST_AFTER = 2  # looks at which an object is doubted, one after another
+_SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
+_RETREAT = 2  # actions away from the objects, before a search
+
+
+class Episode:
+    """One table on its way to a goal.
+
+    Whoever drives it takes events one by one: not asking for the next one is a pause, closing the generator is the end.
+
+    Args:
+        world: cameras and pusher.
+        knowledge: of the objects.
+        goal: an image, or poses.
+        settings: may be replaced while the episode runs.
+        rng: draws everything.
+        start: what is known of the first frame already; without it, it is estimated from images with masks.
+    """
+
+    settings: EpisodeSettings
+
+    def __init__(
+        self,
+        world: World,
+        knowledge: Knowledge,
+        goal: GoalImage | PoseGoal,
+        settings: EpisodeSettings,
+        rng: np.random.Generator,
+        start: EstimatedState | None = None,
+    ) -> None:
+        self.settings = settings
+        self._world, self._knowledge, self._wanted, self._rng = world, knowledge, goal, rng
+        self._planner = Planner(knowledge.dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
+        self._start = start
+        self._number = 0
+        self._patience = Patience()
+        self._doubted: dict[str, int] = {}
+        self._searches = 0
+        self._seconds: dict[str, float] = {}
+        self._before: SceneState | None = None  # one action before the estimate
+        self._expected: SceneState | None = None  # what the last action should have led to
+
+    def run(self) -> Iterator[Event]:
+        """Everything, until a `Finished`.
+
+        Raises:
+            InvalidInput: if the world gives no masks for the first frame, or goal and scene hold other objects.
+            UnknownName: if an object is not known.
+        """
+        yield from self._begin()
+        if not (yield from self._find_goal()):
+            return
+        yield self._stepped()
+        while True:
+            outcome = self._outcome()
+            if outcome is not None:
+                yield self._finished(*outcome)
+                return
+            if self.settings.planning:
+                yield from self._plan()
+            if self.settings.acting:
+                yield from self._act()
+            else:
+                self._before = None
+            yield from self._look_again()
+            stepped = self._stepped()
+            yield stepped
+            if self._patience.is_out(float(stepped.offsets_m.sum())):
+                self._planner.forget()
+                yield self._noticed("stalled", "Nothing has come nearer for some time; drawing new plans.")
+
+    # Looking
+
+    def _begin(self) -> Iterator[Event]:
+        observation = self._world.observe(masks=self._start is None)
+        self._check_objects(observation.names)
+        yield Observed(0, observation)
+        if self._start is None:
+            self._estimate = yield from self._looked("first", estimate_first(
+                self._knowledge.models, observation, self._rng))  # fmt: skip
+        else:
+            self._estimate = self._start
+        self._estimate = _with_pusher(self._estimate, observation.pusher)
+        self._usual = usual_residuals(self._knowledge.models, observation, self._estimate.state)
+        self._weak = frozenset(_doubted(self._estimate))
+        if not self._estimate.trusted:
+            yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
+
+    def _check_objects(self, names: tuple[str, ...]) -> None:
+        if isinstance(self._wanted, PoseGoal) and set(self._wanted.names) != set(names):
+            raise InvalidInput("objects of the goal", ", ".join(self._wanted.names), ", ".join(names))
+
+    def _looked(self, look: Look, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # returns the EstimatedState
+        estimate = None
+        for step in self._timed(look if look in ("first", "goal") else "estimate", steps):
+            estimate = step.estimate
+            yield Looking(self._number, look, step)
+        assert estimate is not None, "the last step brings the estimate"
+        return estimate
+
+    def _look_again(self) -> Iterator[Event]:
+        observation = self._world.observe()
+        yield Observed(self._number, observation)
+        before = self._estimate
+        expected = before.state if self._expected is None else self._expected
+        models = self._knowledge.models
+        steps = estimate_next(models, observation, expected, self._rng, usual=self._usual)
+        self._estimate = _with_pusher((yield from self._looked("next", steps)), observation.pusher)
+        yield from self._noticed_changes(before, expected)
+        yield from self._find_lost()
+        self._expected = None
+
+    def _noticed_changes(self, before: EstimatedState, expected: SceneState) -> Iterator[Event]:
+        now = self._estimate.state
+        angle = lamp_moved(before.state.light, now.light)
+        if angle is not None:
+            yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f} deg; its new place is known.")
+        names = carried(expected, now)
+        if names:
+            self._planner.forget()
+            self._before = None
+            yield self._noticed("object", f"Somebody moved {', '.join(names)}; found again.", names)
+
+    def _find_lost(self) -> Iterator[Event]:
+        """Look anew for what has been doubted for some time, once the pusher has made room."""
+        doubted = (name for name in _doubted(self._estimate) if name not in self._weak)
+        self._doubted = {name: self._doubted.get(name, 0) + 1 for name in doubted}
+        lost = tuple(name for name, looks in self._doubted.items() if looks >= _LOST_AFTER)
+        if not lost or self._searches >= _SEARCHES:
+            return
+        self._searches += 1
+        self._doubted = {}
+        yield self._noticed("lost", f"Lost sight of {', '.join(lost)}; looking for it everywhere.", lost)
+        if self.settings.acting:
+            yield from self._retreat()
+        observation = self._world.observe()
+        yield Observed(self._number, observation)
+        steps = search_lost(self._knowledge.models, observation, self._estimate, self._rng)
+        self._estimate = _with_pusher((yield from self._looked("search", steps)), observation.pusher)
+        self._planner.forget()
+        self._before = None
+        if self._estimate.trusted:
+            yield self._noticed("found", f"Found {', '.join(lost)} again.", lost)
+
+    def _retreat(self) -> Iterator[Event]:
+        """Draw the pusher back from the middle of the objects, so that it hides less."""
+        state = self._estimate.state
+        assert state.pusher is not None
+        away = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
+        direction = away / max(float(np.abs(away).max()), 1e-6)
+        for _ in range(min(_RETREAT, self.settings.steps - self._number)):
+            yield self._execute(np.array([*(0.2 * direction), 0.0]))
+
+    # The goal
+
+    def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
+        wanted, state, found, doubts = self._wanted, self._estimate.state, None, ""
+        if isinstance(wanted, GoalImage):
+            steps = estimate_goal(self._knowledge.models, wanted.observed(state.names), state)
+            found = yield from self._looked("goal", steps)
+            found = unmoved(self._knowledge.models, wanted, found, state)
+            goal, light, camera, image = _poses_of(found.state), found.state.light, wanted.camera, wanted.image
+            doubts = found.reason
+        else:
+            goal, light, camera = wanted, state.light, goal_camera()
+            image = self._rendered(replace(state, poses=_in_order(wanted, state.names)), camera, light)
+        self._goal = settled(goal, state, self._knowledge.symmetries)
+        self._light, self._camera, self._image = light, camera, image
+        yield GoalFound(self._goal, image, camera, found)
+        if doubts:
+            yield self._noticed("goal", f"The goal image is not explained well: {doubts}.")
+            if not self.settings.despite_doubts:
+                yield self._stepped()
+                yield self._finished("refused", f"Nothing was moved, for the goal image is doubtful: {doubts}.")
+                return False
+        return True
+
+    # Planning and acting
+
+    def _plan(self) -> Iterator[Event]:
+        left = self.settings.steps - self._number
+        plan = self.settings.plan
+        self._planner.settings = replace(plan, horizon=min(plan.horizon, left))
+        self._goal = alike(self._goal, self._estimate.state, self._knowledge.symmetries)
+        rounds = self._planner.plan(self._estimate.state, self._goal, self._cost(), self._rng, self._before)
+        for one in self._timed("plan", rounds):
+            yield Planning(self._number, one)
+
+    def _cost(self) -> Cost:
+        if self.settings.cost == "pose":
+            return PoseCost(self._goal)
+        return ImageCost(self._knowledge.models.together, self._camera, self._image, self._light)
+
+    def _act(self) -> Iterator[Event]:
+        actions = self._planner.upcoming(min(self.settings.replan_every, self.settings.steps - self._number))
+        state = self._estimate.state
+        futures = self._knowledge.dynamics.rollout(state, actions[None], self._before)
+        for action in actions:
+            yield self._execute(action)
+        self._planner.executed(len(actions))
+        self._before = state if len(actions) == 1 else _future(futures, len(actions) - 1, state)
+        self._expected = _future(futures, len(actions), state)
+
+    def _execute(self, action: Float[np.ndarray, "3"]) -> Acted:
+        with self._watched("act"):
+            self._world.act(action)
+        self._number += 1
+        return Acted(self._number, action)
+
+    # Time: what whoever drives this takes between two events does not count
+
+    @contextmanager
+    def _watched(self, stage: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - began
+
+    def _timed(self, stage: str, steps: Iterator[StepT]) -> Iterator[StepT]:
+        while True:
+            with self._watched(stage):
+                step = next(steps, None)
+            if step is None:
+                return
+            yield step
+
+    # Telling
+
+    def _outcome(self) -> tuple[Outcome, str] | None:
+        far, turned = offsets(self._goal, self._estimate.state)
+        if far.max() <= self.settings.reached_m and turned.max() <= self.settings.reached_rad:
+            text = "The table looks like the goal." if self._number else "The table looks like the goal already."
+            return "reached", text
+        if self._number >= self.settings.steps:
+            return "out of steps", f"{self._number} actions are done; {1000 * far.max():.0f} mm are left at most."
+        return None
+
+    def _stepped(self) -> Stepped:
+        estimate = self._estimate
+        self._goal = alike(self._goal, estimate.state, self._knowledge.symmetries)
+        far, turned = offsets(self._goal, estimate.state)
+        rendered = self._rendered(estimate.state, self._camera, self._light)
+        cost = float(((rendered - self._image) ** 2).mean())
+        seconds, self._seconds = self._seconds, {}
+        return Stepped(self._number, self.settings.steps, estimate, far, turned, cost, rendered, seconds)
+
+    def _rendered(self, state: SceneState, camera: Camera, light: Light) -> Float[np.ndarray, "h w 3"]:
+        """The scene without the pusher, as the goal image would show it."""
+        batch = SceneBatch.of(replace(state, light=light, pusher=None))
+        return self._knowledge.models.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
+
+    def _noticed(self, matter: str, text: str, names: tuple[str, ...] = ()) -> Noticed:
+        return Noticed(self._number, matter, text, names)  # pyright: ignore[reportArgumentType]
+
+    def _finished(self, outcome: Outcome, text: str) -> Finished:
+        return Finished(self._number, outcome, text, self._estimate.state)
+
+
+def _doubted(estimate: EstimatedState) -> list[str]:
+    return [name for name, doubt in zip(estimate.state.names, estimate.doubts, strict=True) if doubt]
+
+
+def _with_pusher(estimate: EstimatedState, pusher: Float[np.ndarray, "3"] | None) -> EstimatedState:
+    """The robot knows its hand."""
+    return replace(estimate, state=replace(estimate.state, pusher=pusher))
+
+
+def _poses_of(state: SceneState) -> PoseGoal:
+    return PoseGoal(state.names, state.poses)
+
+
+def _in_order(goal: PoseGoal, names: tuple[str, ...]) -> Pose:
+    return goal.poses[[goal.names.index(name) for name in names]]
+
+
+def _future(futures: Rollouts, step: int, state: SceneState) -> SceneState:
+    """The predicted state after some actions; the pusher where it is then, for nothing has been pushed since."""
+    poses = Pose(futures.positions[0, step], futures.quaternions[0, step])
+    return replace(state, poses=poses, pusher=futures.pusher[0, step])

@@ -1,0 +1,113 @@
+"""What the table should become: from an image or from poses, the way it counts for these objects here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import InvalidInput
+from osfcore.estimation.hypotheses.orientation_hypotheses import with_pose
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
+from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.objective.photometric_loss import loss_of
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.objects.asset import Symmetry
+from osfcore.planning.pose_cost import PoseGoal
+
+_NO_WORSE = 1.01  # times the loss, by which an object may explain the goal image worse where it is now
+_STAYS_M, _STAYS_RAD = 0.006, 0.12  # a goal this close to where an object is, is where it is
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GoalImage:
+    """A photo of how the table should look, without the pusher.
+
+    Attributes:
+        camera: that took it.
+        image: linear RGB in [0, 1].
+    """
+
+    camera: Camera
+    image: Float[np.ndarray, "h w 3"]
+
+    def __post_init__(self) -> None:
+        """Check that the camera fits.
+
+        Raises:
+            InvalidInput: if the image has another size than the camera's, or is not finite.
+        """
+        size = (self.camera.height, self.camera.width, 3)
+        if self.image.shape != size:
+            raise InvalidInput("shape of the goal image", self.image.shape, f"{size}, as its camera tells")
+        if not np.all(np.isfinite(self.image)):
+            raise InvalidInput("goal image", "not finite", "radiance in [0, 1]")
+
+    def observed(self, names: tuple[str, ...]) -> Observation:
+        """The image as an estimator takes it."""
+        return Observation((self.camera,), self.image[None], names, None, None, 0.0)
+
+
+def unmoved(models: ObjectModels, goal: GoalImage, found: EstimatedState, now: SceneState) -> EstimatedState:
+    """The estimate of a goal image, with objects where they are now if the image shows nothing against it.
+
+    What hides behind something, or lies beyond the image's border, would else be taken to wherever it hid best.
+
+    Args:
+        models: fields of the objects and the table.
+        goal: the image.
+        found: what it was taken for.
+        now: the scene.
+    """
+    views = views_of(goal.observed(found.state.names), FINE_SIDE, samples=2)
+    guess = SceneParameters.of(found.state, None)
+    least, doubts = loss_of(models, views, guess), list(found.doubts)
+    for n, name in enumerate(found.state.names):
+        here = with_pose(guess, n, now.pose(name))
+        loss = loss_of(models, views, here)
+        if loss <= _NO_WORSE * least:
+            guess, least, doubts[n] = here, min(loss, least), ""
+    reasons = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
+    return replace(found, state=guess.state(), doubts=tuple(doubts), reason="; ".join(reasons))
+
+
+def settled(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
+    """The goal, with objects that are there already (but for what estimates err) left exactly where they are."""
+    goal = alike(goal, state, symmetries)
+    stay = {}
+    for name in state.names:
+        here, there = state.pose(name), goal.pose(name)
+        shift = float(np.linalg.norm((there.position - here.position)[:2]))
+        if shift <= _STAYS_M and rotation_angle(here.quaternion, there.quaternion) <= _STAYS_RAD:
+            stay[name] = here
+    return goal.replaced(stay)
+
+
+def alike(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
+    """The goal with each orientation the one that looks the same and is nearest to the object's own."""
+    turned = {}
+    for name, symmetry in symmetries.items():
+        if name in goal.names and symmetry.kind != "none":
+            pose = goal.pose(name)
+            turned[name] = Pose(pose.position, _nearest(symmetry, pose.quaternion, state.pose(name).quaternion))
+    return goal.replaced(turned)
+
+
+def _nearest(
+    symmetry: Symmetry, wanted: Float[np.ndarray, "4"], here: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "4"]:
+    turns = [np.array([1.0, 0, 0, 0]), *map(np.asarray, symmetry.rotations)]
+    if symmetry.kind == "continuous":
+        # q turned by t about the axis, times the other's conjugate, has scalar part a cos(t/2) + b sin(t/2).
+        quarter = quaternion_multiply(wanted, np.array([0.0, *np.asarray(symmetry.axis)]))
+        angle = 2 * np.arctan2(quarter @ here, wanted @ here)
+        turns = [quaternion_exp(angle * np.asarray(symmetry.axis))]
+    return min(
+        (quaternion_multiply(wanted, turn) for turn in turns), key=lambda other: float(rotation_angle(other, here))
+    )

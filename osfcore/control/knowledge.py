@@ -1,0 +1,49 @@
+"""What an episode knows of its objects before the first image: fields, push model, shapes, symmetries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.dynamics.rollout import PushModel
+from osfcore.dynamics.shapes.object_shapes import ObjectShape
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.objects.asset import Symmetry
+from osfcore.objects.asset_library import AssetLibrary
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """What is known before anything is seen.
+
+    Attributes:
+        models: how objects and table look.
+        dynamics: what pushes do.
+        shapes: of the objects, by name.
+        symmetries: which of their orientations look the same; none for those left out.
+    """
+
+    models: ObjectModels
+    dynamics: PushModel
+    shapes: Mapping[str, ObjectShape]
+    symmetries: Mapping[str, Symmetry]
+
+
+def knowledge_of(
+    names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary, data_dir: Path | None, device: str = "cpu"
+) -> Knowledge:
+    """What is known of some objects.
+
+    Raises:
+        UnknownName: if one has no field.
+        CorruptFile: if a file is broken.
+    """
+    return Knowledge(
+        ObjectModels({name: fields.load(name) for name in names}, fields.load_table(), device=device),
+        load_push_model(data_dir, fields, names, device),
+        load_shapes(data_dir, fields, names),
+        {name: assets.info(name).symmetry for name in names},
+    )

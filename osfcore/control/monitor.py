@@ -1,0 +1,61 @@
+"""What a loop must notice: that everything arrived, that nothing gets better, that somebody moved something."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import rotation_angle
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import PUSHER_RADIUS_M
+from osfcore.planning.pose_cost import PoseGoal
+
+_PATIENCE = 8  # actions without progress
+_PROGRESS_M = 0.003
+_LAMP_RAD = np.deg2rad(4.0)
+_CARRIED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
+_REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perhaps by way of another object
+
+
+def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """How far each object is from where it should be: on the table's plane [m], and turned [rad]."""
+    wanted = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
+    turned = rotation_angle(state.poses.quaternion, wanted)
+    return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
+
+
+class Patience:
+    """Whether the distance to the goal still shrinks."""
+
+    def __init__(self) -> None:
+        self._least, self._since = np.inf, 0
+
+    def is_out(self, distance_m: float) -> bool:
+        """Tell the distance after each action; true when it has not shrunk for long, and then it begins anew."""
+        if distance_m < self._least - _PROGRESS_M:
+            self._least, self._since = distance_m, 0
+            return False
+        self._since += 1
+        if self._since < _PATIENCE:
+            return False
+        self._least, self._since = distance_m, 0
+        return True
+
+
+def lamp_moved(before: Light, now: Light) -> float | None:
+    """By which angle the lamp was moved [rad]; None if it was not."""
+    angle = float(np.arccos(np.clip(before.direction @ now.direction, -1, 1)))
+    return angle if angle > _LAMP_RAD else None
+
+
+def carried(expected: SceneState, now: SceneState) -> tuple[str, ...]:
+    """Objects that no push can have brought where they are."""
+    assert now.pusher is not None
+    shift = np.linalg.norm(now.poses.position - expected.poses.position, axis=1)
+    ends = [now.pusher] if expected.pusher is None else [now.pusher, expected.pusher]
+    away = np.min(
+        [np.linalg.norm(expected.poses.position[:, :2] - end[:2], axis=1) for end in ends], axis=0
+    )  # fmt: skip
+    is_carried = (shift > _CARRIED_M) & (away > _REACH_M + PUSHER_RADIUS_M)
+    return tuple(name for name, flag in zip(now.names, is_carried, strict=True) if flag)

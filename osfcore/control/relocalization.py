@@ -1,0 +1,55 @@
+"""Finding again what a tracker lost, without masks: looked for all over one camera's image, then in all images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.tracking import estimate_next
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import Observation, SceneState
+
+
+def search_lost(
+    models: ObjectModels, observation: Observation, last: EstimatedState, rng: np.random.Generator
+) -> Iterator[EstimateStep]:
+    """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: all views, at best without anything in front.
+        last: the estimate whose doubted objects are looked for.
+        rng: of the search.
+    """
+    state = last.state
+    lost = [n for n, doubt in enumerate(last.doubts) if doubt]
+    view = int(rng.integers(len(observation.cameras)))
+    alone = Observation(
+        observation.cameras[view : view + 1], observation.images[view : view + 1], observation.names, None, None,
+        observation.time_s,
+    )  # fmt: skip
+    seen = None
+    for step in estimate_goal(models, alone, state):
+        seen = step.estimate
+        yield replace(step, estimate=None)
+    assert seen is not None, "the last step brings the estimate"
+    expected = replace(_with(state, seen.state, lost), pusher=observation.pusher)
+    for step in estimate_next(models, observation, expected, rng):
+        found = step.estimate
+        is_worse = found is not None and sum(map(bool, found.doubts)) > len(lost)
+        yield replace(step, estimate=last) if is_worse else step
+
+
+def _with(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:
+    """The state with some of its objects where another one has them."""
+    positions, quaternions = state.poses.position.copy(), state.poses.quaternion.copy()
+    for n in numbers:
+        pose = other.pose(state.names[n])
+        positions[n], quaternions[n] = pose.position, pose.quaternion
+    return replace(state, poses=Pose(positions, quaternions))

@@ -1,0 +1,1 @@
+"""Shapes of objects as dynamics needs them, read off their fields."""

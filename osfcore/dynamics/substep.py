@@ -1,0 +1,73 @@
+"""One substep of many scenes: graph, features, network, and what physics allows of its answer."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from osfcore.dynamics.contact_graph import build_graph
+from osfcore.dynamics.features import SHIFT_M, TURN_RAD, corrections, inputs, mirrored
+from osfcore.dynamics.motion import Motion, Sweep, lowest_point
+from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.recorded_states import SLEEP_M, SLEEP_RAD
+from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.geometry import torch_rotations as turns
+
+
+def advance(
+    network: PropagationNetwork,
+    table: ShapeTable,
+    number: Int[Tensor, "B N"],
+    motion: Motion,
+    sweep: Sweep,
+    mirror: Bool[Tensor, "B"] | None = None,
+) -> Motion:
+    """The scenes one substep later.
+
+    Args:
+        network: predicts the motion of what can move.
+        table: shapes of the objects.
+        number: which of them each object is.
+        motion: the scenes.
+        sweep: what the pusher does.
+        mirror: scenes to be seen in a mirror along the heading, in training.
+    """
+    pusher = motion.pusher + sweep.shift
+    graph = build_graph(table, number, motion, sweep)
+    rest = motion._replace(
+        linear=torch.zeros_like(motion.linear), angular=torch.zeros_like(motion.angular), pusher=pusher
+    )
+    if not len(graph.scene):
+        return rest
+    seen = inputs(table, graph)
+    if mirror is None:
+        answer = network(seen.nodes, seen.edges, seen.receiver, seen.sender)
+    else:
+        flags = mirror[graph.scene]
+        nodes, edges = mirrored(seen.nodes, flags, "node"), mirrored(seen.edges, flags[seen.receiver], "edge")
+        answer = mirrored(network(nodes, edges, seen.receiver, seen.sender), flags, "motion")
+    answer = answer + corrections(seen)
+    scale = answer.new_tensor([SHIFT_M] * 3 + [TURN_RAD] * 3)
+    vectors = (answer * scale).view(-1, 2, 3) @ seen.frame
+    linear, angular = vectors.unbind(1)
+    awake = (linear.norm(dim=1) > SLEEP_M) | (angular.norm(dim=1) > SLEEP_RAD)
+    linear, angular = linear * awake[:, None], angular * awake[:, None]
+    place = (graph.scene, graph.slot)
+    quaternion = motion.quaternion[place]
+    quaternion = torch.where(
+        awake[:, None], turns.unit(turns.multiply(turns.exponential(angular), quaternion)), quaternion
+    )
+    centre = motion.centre[place] + linear
+    sunk = motion.floor[place] - lowest_point(table, graph.number, centre, quaternion)
+    lift = sunk.clamp(min=0) * awake
+    linear = linear + torch.nn.functional.pad(lift[:, None], (2, 0))
+    centre = motion.centre[place] + linear
+    return Motion(
+        centre=motion.centre.index_put(place, centre),
+        quaternion=motion.quaternion.index_put(place, quaternion),
+        linear=rest.linear.index_put(place, linear),
+        angular=rest.angular.index_put(place, angular),
+        pusher=pusher,
+        floor=motion.floor,
+    )

@@ -1,0 +1,1 @@
+"""Pose hypotheses: other orientations, motions, template matches, and scenes assembled from them."""

@@ -1,0 +1,143 @@
+"""Scenes put together from sightings: which of them explain an image together, its light being unknown.
+
+Objects and light depend on each other: under a wrong light a wrong scene may look right. So it is begun under lights
+all over the hemisphere, on rough images, and the best of these scenes are sorted out on finer ones. Last, objects are
+replaced two at a time: one that stands in another's place keeps it from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from osfcore.estimation.hypotheses.orientation_hypotheses import pose_losses, with_pose
+from osfcore.estimation.hypotheses.template_matching import TemplateMatches
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective.observed_views import ObservedViews
+from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.objective.photometric_loss import loss_of
+from osfcore.estimation.search.light_search import hemisphere, search_light
+from osfcore.geometry.poses import Pose
+
+AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
+_LIGHTS = 40  # over the whole sphere, to begin with
+_KEPT_ROUGH, _KEPT = 8, 3  # of the scenes found under them, for another round, and for one on finer images
+_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, sightings for the second
+
+
+def assembled(
+    models: ObjectModels,
+    rough: ObservedViews,
+    coarse: ObservedViews,
+    start: SceneParameters,
+    sightings: list[TemplateMatches],
+) -> Iterator[tuple[SceneParameters, float]]:
+    """Put scenes together; yields the best so far and its loss, each time one more was tried.
+
+    Args:
+        models: fields.
+        rough: images for all lights.
+        coarse: images for the best of them.
+        start: one scene to begin with; the others begin with no object.
+        sightings: of each object.
+    """
+    yield from _Assembly(models, rough, coarse, sightings).scenes(start)
+
+
+def reseated(
+    models: ObjectModels, views: ObservedViews, guess: SceneParameters, sightings: list[TemplateMatches]
+) -> SceneParameters:
+    """In turn each object at the sighting that explains whole images better than its pose does; the same if none."""
+    for n, found in enumerate(sightings):
+        guess, _ = placed(models, views, guess, n, found)
+    return guess
+
+
+def placed(
+    models: ObjectModels, views: ObservedViews, guess: SceneParameters, n: int, found: TemplateMatches
+) -> tuple[SceneParameters, float]:
+    """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
+    own, losses = loss_of(models, views, guess), _losses(models, views, guess, n, found)
+    if losses.min(initial=np.inf) >= own:
+        return guess, own
+    return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
+
+
+def _losses(
+    models: ObjectModels, views: ObservedViews, guess: SceneParameters, n: int, found: TemplateMatches
+) -> Float[np.ndarray, "K"]:
+    """Loss of the guess with an object at each of its sightings."""
+    return pose_losses(models, views, guess, n, found.poses) if len(found.scores) else np.zeros(0)
+
+
+def count_of_scenes(objects: int) -> int:
+    """How many steps it takes."""
+    return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
+
+
+def without(guess: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
+    """The guess with some objects away."""
+    for n in numbers:
+        guess = with_pose(guess, n, AWAY)
+    return guess
+
+
+class _Assembly:
+    def __init__(
+        self, models: ObjectModels, rough: ObservedViews, coarse: ObservedViews, sightings: list[TemplateMatches]
+    ) -> None:
+        self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, sightings
+
+    def scenes(self, start: SceneParameters) -> Iterator[tuple[SceneParameters, float]]:
+        empty = without(start, range(len(self._sightings)))
+        scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
+        for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
+            found: list[tuple[SceneParameters, float]] = []
+            for guess in scenes[:kept]:
+                found.append(self._alternated(guess, views))
+                found.sort(key=lambda pair: pair[1])
+                yield found[0]
+            scenes = [guess for guess, _ in found]
+        guess, loss = found[0]
+        for pair in combinations(range(len(self._sightings)), 2):
+            guess, loss = self._replaced(guess, loss, pair)
+            yield guess, loss
+        yield self._alternated(guess, self._coarse)
+
+    def _alternated(self, guess: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
+        """In turn each object at its best sighting, and the light."""
+        for n, found in enumerate(self._sightings):
+            guess, _ = placed(self._models, views, guess, n, found)
+        guess = replace(guess, light=search_light(self._models, self._rough, views, guess))
+        return guess, loss_of(self._models, views, guess)
+
+    def _replaced(self, guess: SceneParameters, loss: float, pair: tuple[int, int]) -> tuple[SceneParameters, float]:
+        """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
+        best, least = guess, loss
+        first, second = pair
+        rest = without(guess, pair)
+        others = self._sightings[second]
+        others = others.chosen(self._ranking(rest, second)[:_SECOND])
+        for k in self._best_places(rest, first):
+            one = with_pose(rest, first, self._sightings[first].pose(k))
+            both, loss = placed(self._models, self._coarse, one, second, others)
+            if loss < least:
+                best, least = both, loss
+        return best, least
+
+    def _best_places(self, guess: SceneParameters, n: int) -> list[int]:
+        """Numbers of the sightings of an object that explain the image best, each in a place of its own."""
+        positions, kept = self._sightings[n].positions, []
+        for k in self._ranking(guess, n).tolist():
+            if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:
+                kept.append(k)
+            if len(kept) == _PLACES:
+                break
+        return kept
+
+    def _ranking(self, guess: SceneParameters, n: int) -> Int[np.ndarray, "K"]:
+        return np.argsort(_losses(self._models, self._coarse, guess, n, self._sightings[n]))

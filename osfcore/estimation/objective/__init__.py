@@ -1,0 +1,1 @@
+"""What estimation minimises: parameters, observed views, photometric and masked losses."""

@@ -1,0 +1,169 @@
+"""Observations at the resolutions the estimator works at, and the parts of them that show one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
+from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.geometry.cameras import MIN_IMAGE_SIDE, Camera
+from osfcore.geometry.poses import rotate
+from osfcore.geometry.states import Observation
+from osfcore.render.types import Quality, SceneBatch
+
+FINE_SIDE = 128  # more pixels would cost time and tell little
+_BESIDE_PX = 3  # of its silhouette that an object may come to cover in one step
+_MARGIN_PX = 3  # around an object's sphere
+_OTHER_SHARE = 0.3  # of a pixel that others may cover before it tells nothing about an object
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObservedViews:
+    """An observation at one resolution.
+
+    Attributes:
+        cameras: V cameras.
+        images: linear RGB.
+        masks: share of each pixel that shows each object, or None.
+        pusher: centre of the pusher [m], or None.
+        quality: of what is rendered to compare with.
+        only: pixels that count, where not all do.
+    """
+
+    cameras: tuple[Camera, ...]
+    images: Float32[np.ndarray, "V h w 3"]
+    masks: Float32[np.ndarray, "V N h w"] | None
+    pusher: Float[np.ndarray, "3"] | None
+    quality: Quality = QUALITY
+    only: Bool[np.ndarray, "V h w"] | None = None
+
+
+def views_of(observation: Observation, side: int, *, samples: int = 1) -> ObservedViews:
+    """An observation of at most `side` pixels a side, to be compared with `samples` squared rays a pixel."""
+    height, width = observation.images.shape[1:3]
+    scale = min(1.0, side / max(height, width))
+    size = (max(MIN_IMAGE_SIDE, round(width * scale)), max(MIN_IMAGE_SIDE, round(height * scale)))
+    cameras = tuple(camera.resized(*size) for camera in observation.cameras)
+    images = np.stack([_resized(image, size) for image in observation.images])
+    masks = observation.masks
+    if masks is not None:
+        masks = np.stack([[_resized(mask, size) for mask in view] for view in masks.astype(np.float32)])
+        masks = masks.reshape(len(cameras), len(observation.names), size[1], size[0])
+    return ObservedViews(cameras, images, masks, observation.pusher, replace(QUALITY, samples_per_side=samples))
+
+
+def _resized(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:
+    image = np.ascontiguousarray(image, np.float32)
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectView:
+    """The windows of V views around one object; all of one size.
+
+    Attributes:
+        cameras: that see the windows alone.
+        rgb: the object over black (paper eq. 5: image times mask).
+        mask: share of each pixel that shows it.
+        valid: pixels in which no other object hides it.
+        area: of the mask [px]; at least 1.
+        quality: of what is rendered to compare with.
+    """
+
+    cameras: tuple[Camera, ...]
+    rgb: Float32[np.ndarray, "V h w 3"]
+    mask: Float32[np.ndarray, "V h w"]
+    valid: Bool[np.ndarray, "V h w"]
+    area: Float32[np.ndarray, "V"]
+    quality: Quality
+
+
+def part_of(views: ObservedViews, number: int, *, margin: int = 3) -> ObjectView:
+    """The part that shows object `number` by its masks, and `margin` pixels around it.
+
+    Views in which its mask is empty are left out; at least one must not be.
+    """
+    assert views.masks is not None
+    shown = [v for v, mask in enumerate(views.masks[:, number]) if mask.max() > 0.5]
+    own = views.masks[shown, number]
+    others = np.delete(views.masks[shown], number, axis=1)
+    covered = others.max(axis=1) if others.shape[1] else np.zeros_like(own)
+    corners, (width, height) = _windows(own > 0.5, margin)
+
+    def cut(array: np.ndarray) -> np.ndarray:
+        return np.stack([a[y : y + height, x : x + width] for a, (x, y) in zip(array, corners, strict=True)])
+
+    cameras = tuple(window(views.cameras[v], x, y, width, height) for v, (x, y) in zip(shown, corners, strict=True))
+    mask, valid = cut(own), cut(covered) < _OTHER_SHARE
+    area = np.maximum((mask * valid).sum(axis=(1, 2)), 1)
+    return ObjectView(cameras, cut(views.images[shown]) * mask[..., None], mask, valid, area, views.quality)
+
+
+def around(
+    views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int, *, reach: float = 0.0
+) -> ObservedViews:
+    """The windows around one object of a guess, and `reach` [m] more, without masks.
+
+    Whole images where it shows in none of them.
+    """
+    resting = models.resting(guess.names[number])
+    centre = guess.positions[number] + rotate(guess.quaternions[number], resting.centre)
+    height, width = views.images.shape[1:3]
+    boxes = []
+    for view, camera in enumerate(views.cameras):
+        depth = float(camera.T_world_camera.inverse().apply(centre)[2])
+        if depth < resting.radius:
+            continue
+        x, y = camera.project(centre)
+        half = camera.intrinsics[0, 0] / depth * (resting.radius + reach) + _MARGIN_PX
+        if -half < x < width + half and -half < y < height + half:
+            boxes.append((view, x, y, half))
+    if not boxes:
+        return replace(views, masks=None)
+    side = int(np.ceil(2 * max(half for *_, half in boxes)))
+    w, h = min(max(side, MIN_IMAGE_SIDE), width), min(max(side, MIN_IMAGE_SIDE), height)
+    corners = [(int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))) for _, x, y, _ in boxes]
+    cameras = tuple(window(views.cameras[v], x, y, w, h) for (v, *_), (x, y) in zip(boxes, corners, strict=True))
+    images = [views.images[v, y : y + h, x : x + w] for (v, *_), (x, y) in zip(boxes, corners, strict=True)]
+    return ObservedViews(cameras, np.stack(images), None, views.pusher, views.quality)
+
+
+def near(views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int) -> ObservedViews:
+    """The windows around one object of a guess, of which only pixels in or just beside its silhouette count."""
+    own = around(views, models, guess, number)
+    alone = SceneBatch((guess.names[number],), guess.positions[None, [number]], guess.quaternions[None, [number]],
+                       guess.light[None], None)  # fmt: skip
+    rendered = models.alone.render(alone, own.cameras, quality=QUALITY, outputs={"opacity"})
+    assert rendered.opacity is not None
+    silhouettes = (rendered.opacity[0, :, 0] > 0).astype(np.uint8)
+    kernel = np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)
+    only = np.stack([cv2.dilate(silhouette, kernel) for silhouette in silhouettes]).astype(bool)
+    return replace(own, images=own.images * only[..., None], only=only) if only.any() else own
+
+
+def window(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """The camera that sees a window of another's image, whose corner is at pixel (x, y)."""
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[:2, 2] -= x, y
+    return replace(camera, intrinsics=intrinsics, width=width, height=height)
+
+
+def _windows(masks: Bool[np.ndarray, "V h w"], margin: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """Corners (x, y) of windows around masks, none of them empty, and their common width and height [px]."""
+    height, width = masks.shape[1:]
+    boxes = []
+    for mask in masks:
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        boxes.append((columns[0], columns[-1] + 1, rows[0], rows[-1] + 1))
+    x0, x1, y0, y1 = np.array(boxes).T
+    size = (
+        int(np.clip((x1 - x0).max() + 2 * margin, min(MIN_IMAGE_SIDE, width), width)),
+        int(np.clip((y1 - y0).max() + 2 * margin, min(MIN_IMAGE_SIDE, height), height)),
+    )
+    x = np.clip((x0 + x1 - size[0]) // 2, 0, width - size[0])
+    y = np.clip((y0 + y1 - size[1]) // 2, 0, height - size[1])
+    return list(zip(x.tolist(), y.tolist(), strict=True)), size

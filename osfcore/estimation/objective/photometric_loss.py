@@ -1,0 +1,30 @@
+"""The loss of whole scenes: objects, pusher, table and shadows against the images (paper eq. 6)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective.observed_views import ObservedViews
+from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.render.types import SceneBatch
+
+HUBER = 0.1  # radiance from which errors count linearly instead of squared
+
+
+def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> Float32[np.ndarray, "B V h w 3"]:
+    """Rendered minus observed; 0 where pixels do not count."""
+    rendered = models.together.render(batch, views.cameras, quality=views.quality, only=views.only)
+    return rendered.rgb - views.images
+
+
+def photometric_loss(errors: Float32[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B"]:
+    """Mean over all numbers of Huber's loss. Deviation from paper eq. 6: it is the square for small errors only."""
+    size = np.abs(errors.reshape(len(errors), -1))
+    return np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER)).mean(axis=1, dtype=float)
+
+
+def loss_of(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
+    """Loss of one scene."""
+    return float(photometric_loss(residuals(models, views, guess.moved(np.zeros((1, guess.size)))))[0])

@@ -1,0 +1,1 @@
+"""Optimisers of the losses: CMA-ES, Gauss-Newton, the light search, and where they start."""

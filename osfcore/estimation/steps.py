@@ -1,0 +1,43 @@
+"""What an estimator yields while it works."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
+from osfcore.progress import Progress
+
+Stage = Literal["orientations", "light", "objects", "together", "polish", "done"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EstimateStep:
+    """One iteration.
+
+    Attributes:
+        progress: how far the work is.
+        stage: which part of the method is at work.
+        guess: the best scene so far.
+        candidates: poses that were tried, C for each of N objects; (C, N) batches.
+        lights: directions toward the light that were tried, C x 3; None while it is held.
+        sigma: the search's overall step, 1 when a stage begins.
+        losses: of each object, in the units of the stage.
+        loss: of the whole, likewise.
+        estimate: the result; only in the last step.
+    """
+
+    progress: Progress
+    stage: Stage
+    guess: SceneState
+    candidates: Pose | None = None
+    lights: Float[np.ndarray, "C 3"] | None = None
+    sigma: float = 1.0
+    losses: tuple[float, ...] = ()
+    loss: float = float("nan")
+    estimate: EstimatedState | None = None

@@ -1,0 +1,173 @@
+"""How good estimators are: first frames, tracking without masks, goals, ablations and spoiled inputs.
+
+Each task is a random scene of the ten default objects under a hidden light that stands 10 degrees or higher. First
+frames show it to four cameras with masks. Tracks follow 20 steps of pushes without masks, each estimate starting from
+the last one. Goals show some objects elsewhere under another light to the goal camera. Nothing of the truth ever
+reaches an estimator. Each finished part of a task is kept, so that an evaluation can be killed, resumed and run in
+pieces; pictures and report.json lie beside the kept results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from osfcore.errors import InvalidInput, MissingAssets
+from osfcore.experiments.estimation.parts import PARTS, VIEWS, EvaluateEstimate, TaskRunner
+from osfcore.experiments.estimation.plots import bad_failure, frame_failure, track_failure, write_gallery, write_plots
+from osfcore.experiments.estimation.report import EstimateReport
+from osfcore.experiments.estimation.scores import FrameScore, TrackScore
+from osfcore.experiments.estimation.spoiled_inputs import BadScore
+from osfcore.experiments.fields.evaluation import MAX_SEED, MAX_TASKS
+from osfcore.experiments.task_cache import TaskResult
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import image_side
+from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.io.files import write_json
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.objects.catalogue import DEFAULT_NAMES
+
+REPORT_FILE = "report.json"
+_Results = dict[str, list[TaskResult]]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EstimateEvaluationStep:
+    """How far an evaluation is.
+
+    Attributes:
+        done: parts of tasks finished.
+        total: parts of tasks in all.
+        note: what is being done.
+        report: with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    report: EstimateReport | None = None
+
+
+def evaluate_estimate(
+    config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary
+) -> Iterator[EstimateEvaluationStep]:
+    """Measure every part that is asked for, task by task; pictures and report.json go to `config.folder`.
+
+    Raises:
+        UnknownName, MissingAssets: if an object lacks a field or a mesh.
+        InvalidInput: if a number is out of range.
+        CorruptFile, CannotWrite: as files are.
+    """
+    runner = TaskRunner(config, _checked(config, fields, assets), fields, assets)
+    kept: _Results = {}
+    jobs = _jobs(config, runner, kept)
+    total, done = sum(count for _, count, _ in jobs.values()), 0
+    for key, (title, count, work) in jobs.items():
+        kept[key] = []
+        for number in range(count):
+            yield EstimateEvaluationStep(done, total, f"{title} ({number + 1} of {count})")
+            kept[key].append(work(number))
+            done += 1
+    report = _report(kept)
+    write_plots(config.folder, report)
+    _galleries(config, kept)
+    write_json(config.folder / REPORT_FILE, report.to_json())
+    yield EstimateEvaluationStep(total, total, "Everything is measured", report)
+
+
+_Job = tuple[str, int, Callable[[int], TaskResult]]  # what it is called, how many, and one of them
+
+
+def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[str, _Job]:
+    """What there is to do, in order; tracks and goals begin with the first frames in `kept`."""
+    tasks = config.tasks
+    jobs: dict[str, _Job] = {"first": ("First frames", tasks, runner.first)}
+    if "track" in config.parts:
+        jobs["track"] = "Tracks", tasks, lambda number: runner.track(number, kept["first"][number])
+    if "goal" in config.parts:
+        jobs["goal"] = "Goals", tasks, lambda number: runner.goal(number, kept["first"][number])
+    if "ablations" in config.parts:
+        jobs["fixed_light"] = "Light held overhead", tasks, runner.fixed_light
+        for views in VIEWS:
+            jobs[f"views_{views}"] = f"{views} of 4 views", tasks, _few_views(runner, views)
+    if config.bad:
+        jobs["bad"] = "Bad cases", config.bad, runner.bad
+    return jobs
+
+
+def _few_views(runner: TaskRunner, views: int) -> Callable[[int], TaskResult]:
+    return lambda number: runner.few_views(number, views)
+
+
+def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """The objects to draw from, after everything asked for was found possible."""
+    limits = {
+        "number of tasks": (config.tasks, 1, MAX_TASKS),
+        "number of bad cases": (config.bad, 0, MAX_TASKS),
+        "objects in a scene": (config.objects, 1, MAX_OBJECTS),
+        "seed": (config.seed, 0, MAX_SEED),
+    }
+    for what, (value, low, high) in limits.items():
+        if not low <= value <= high:
+            raise InvalidInput(what, value, f"between {low} and {high}")
+    for part in config.parts:
+        if part not in PARTS:
+            raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
+    image_side(config.size)
+    names = tuple(dict.fromkeys(DEFAULT_NAMES if config.names is None else config.names))
+    for name in names:
+        fields.info(name)  # raises UnknownName
+    missing = [name for name in names if not assets.has(name)]
+    if missing:
+        assets.info(missing[0])
+        raise MissingAssets(missing)
+    least = config.objects + (1 if config.bad else 0)  # a bad case calls an object by another's name
+    if len(names) < least:
+        raise InvalidInput("number of names", len(names), f"{least} or more for {config.objects} objects in a scene")
+    if config.bad and config.objects < 2:
+        raise InvalidInput("objects in a scene", config.objects, "2 or more with bad cases, which swap masks")
+    return names
+
+
+def _report(kept: _Results) -> EstimateReport:
+    def frames(key: str) -> tuple[FrameScore, ...]:
+        return tuple(FrameScore.from_json(result.figures["score"]) for result in kept[key])
+
+    tracks = kept.get("track")
+    bad = kept.get("bad")
+    return EstimateReport(
+        first=frames("first"),
+        tracks=None if tracks is None else tuple(TrackScore.from_json(result.figures["score"]) for result in tracks),
+        goals=tuple(map(_goal_scores, kept["goal"])) if "goal" in kept else None,
+        fixed_light=frames("fixed_light") if "fixed_light" in kept else None,
+        views={views: frames(f"views_{views}") for views in VIEWS} if "fixed_light" in kept else None,
+        bad=None if bad is None else tuple(BadScore.from_json(result.figures["score"]) for result in bad),
+    )
+
+
+def _goal_scores(result: TaskResult) -> tuple[FrameScore, ...]:
+    return tuple(FrameScore.from_json(score) for score in result.figures["scores"])
+
+
+def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
+    """What went wrong, each part in a picture of its own."""
+    folder = config.folder
+    for key in ("first", "fixed_light", *(f"views_{views}" for views in VIEWS)):
+        if key in kept:
+            scores = [FrameScore.from_json(result.figures["score"]) for result in kept[key]]
+            found = [frame_failure(f"task {n}", score, kept[key][n].shown) for n, score in enumerate(scores)]
+            write_gallery(folder / f"failures_{key}.png", found)
+    if "track" in kept:
+        tracks = [TrackScore.from_json(result.figures["score"]) for result in kept["track"]]
+        found = [track_failure(f"task {n}", score, kept["track"][n].shown) for n, score in enumerate(tracks)]
+        write_gallery(folder / "failures_track.png", found)
+    if "goal" in kept:
+        found = []
+        for n, result in enumerate(kept["goal"]):
+            for m, (score, shown) in enumerate(zip(_goal_scores(result), result.shown, strict=True)):
+                found.append(frame_failure(f"task {n}, goal with {m + 1} moved", score, (shown,)))
+        write_gallery(folder / "failures_goal.png", found)
+    if "bad" in kept:
+        bad = [BadScore.from_json(result.figures["score"]) for result in kept["bad"]]
+        found = [bad_failure(f"bad case {n}", score, kept["bad"][n].shown) for n, score in enumerate(bad)]
+        write_gallery(folder / "failures_bad.png", found)

@@ -1,0 +1,354 @@
+"""The parts of the evaluation of estimators, one task at a time, each kept on disk when it is done.
+
+Times are of estimates alone: fields are loaded and unpacked, code is compiled and the ways in which objects can lie are
+found in a warm-up on a scene that no figure uses, because all that is done once in a program's life. They are kept with
+the rest, so times mean something only where the machine had nothing else to do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import osfcore.estimation
+import osfcore.render
+from osfcore.errors import OsfError
+from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
+from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.tracking import TrackingConfig, estimate_next
+from osfcore.experiments.estimation.scores import (
+    FrameScore,
+    TrackScore,
+    flags,
+    pose_errors,
+    refused_frame,
+    score_frame,
+)
+from osfcore.experiments.estimation.scores import is_right as is_right_pose
+from osfcore.experiments.estimation.spoiled_inputs import FIRST_SCENE, BadCase, BadScore, bad_case
+from osfcore.experiments.estimation.tasks import STEPS, Frame, episode, first_frame, goals
+from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
+from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
+from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.inspection.contact_sheet import Comparison
+from osfcore.io.image_file import to_uint8
+from osfcore.io.state_file import estimated_from_json, estimated_to_json
+from osfcore.objects.asset import ObjectAsset
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.render.types import Quality, SceneBatch
+
+FORMAT = 1  # of the kept results; rises when figures come to mean something else
+Part = Literal["first", "track", "goal", "ablations"]
+PARTS: tuple[Part, ...] = ("first", "track", "goal", "ablations")
+VIEWS: dict[int, tuple[int, ...]] = {1: (0,), 2: (0, 2)}  # cameras that an ablation keeps: two face each other
+_SHOWN_QUALITY = Quality(samples_per_side=2)
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateEstimate:
+    """Evaluate the estimators against the simulator.
+
+    Attributes:
+        out: folder for results; those of an earlier run with the same weights, meshes and settings are taken over.
+            Changes to the estimators' code do not show in these: measure them in a new folder.
+        tasks: number of scenes, each with its own objects, arrangement and light.
+        objects: in each scene.
+        seed: of scenes and searches.
+        parts: what to measure; first frames are measured in any case, since everything else begins with them.
+        bad: number of spoiled inputs.
+        names: objects to draw from, or None for the ten default ones.
+        steps: of an episode.
+        size: side of the images [px].
+        effort: of first frames.
+        track: of later frames.
+        goal: of goals.
+    """
+
+    out: Path
+    tasks: int = 20
+    objects: int = 3
+    seed: int = 0
+    parts: tuple[Part, ...] = PARTS
+    bad: int = 0
+    names: tuple[str, ...] | None = None
+    steps: int = STEPS
+    size: int = DEFAULT_IMAGE_SIDE
+    effort: FirstFrameConfig = field(default_factory=FirstFrameConfig)
+    track: TrackingConfig = field(default_factory=TrackingConfig)
+    goal: GoalImageConfig = field(default_factory=GoalImageConfig)
+
+    @property
+    def folder(self) -> Path:
+        """Where the results for this number of objects and this seed are."""
+        return self.out / "estimate" / f"{self.objects}-objects-seed-{self.seed}"
+
+
+class TaskRunner:
+    """What the parts need: fields ready for use, meshes, and results of earlier runs.
+
+    Args:
+        config: what to measure.
+        names: objects to draw from.
+        fields: of these objects and the table.
+        assets: their meshes.
+    """
+
+    def __init__(
+        self, config: EvaluateEstimate, names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary
+    ) -> None:
+        self._config, self._names, self._fields, self._library = config, names, fields, assets
+        self._cameras = default_cameras(config.size)
+        self._assets: dict[str, ObjectAsset] = {}
+
+    # Parts
+
+    def first(self, number: int) -> TaskResult:
+        """The first frame of a task; its figures hold the score and the estimated state."""
+        return self._first("first", number, self._config.effort, range(len(self._cameras)))
+
+    def fixed_light(self, number: int) -> TaskResult:
+        """The first frame with the light held overhead."""
+        effort = replace(self._config.effort, light="overhead")
+        return self._first("fixed_light", number, effort, range(len(self._cameras)))
+
+    def few_views(self, number: int, views: int) -> TaskResult:
+        """The first frame from one or two cameras."""
+        return self._first(f"views_{views}", number, self._config.effort, VIEWS[views])
+
+    def track(self, number: int, first: TaskResult) -> TaskResult:
+        """Later frames of a task, from its first estimate on."""
+        draw, effort = self._draw(number), self._config.track
+        given = {
+            **self._circumstances(draw, asdict(effort)),
+            "first": digest(first.figures),
+            "steps": self._config.steps,
+        }
+        cache = TaskCache(self._config.folder / "track")
+        kept = cache.read(_file(number), given)
+        if kept is None:
+            kept = self._tracked(draw, state_of(first), FrameScore.from_json(first.figures["score"]), effort)
+            cache.write(_file(number), given, kept)
+        return kept
+
+    def goal(self, number: int, first: TaskResult) -> TaskResult:
+        """The goals of a task, told how the objects lie by its first estimate."""
+        draw, effort = self._draw(number), self._config.goal
+        given = {**self._circumstances(draw, asdict(effort)), "first": digest(first.figures)}
+        cache = TaskCache(self._config.folder / "goal")
+        kept = cache.read(_file(number), given)
+        if kept is None:
+            kept = self._goals(draw, state_of(first), effort)
+            cache.write(_file(number), given, kept)
+        return kept
+
+    def bad(self, number: int) -> TaskResult:
+        """A spoiled input."""
+        config = self._config
+        draw = self._draw(FIRST_SCENE + number)
+        given = self._circumstances(draw, {"first": asdict(config.effort), "goal": asdict(config.goal)})
+        # A case may call up an object that its scene does not hold.
+        given["all"] = {name: [self._weights[name], self._library.digest(name)] for name in self._names}
+        cache = TaskCache(config.folder / "bad")
+        kept = cache.read(_file(number), given)
+        if kept is None:
+            case = bad_case(self._names, config.objects, config.seed, number, self._library, config.size)
+            kept = self._spoiled(case, draw.seed)
+            cache.write(_file(number), given, kept)
+        return kept
+
+    # How they are measured
+
+    def _first(self, part: str, number: int, effort: FirstFrameConfig, views: Sequence[int]) -> TaskResult:
+        draw = self._draw(number)
+        given = {**self._circumstances(draw, asdict(effort)), "views": list(views)}
+        cache = TaskCache(self._config.folder / part)
+        kept = cache.read(_file(number), given)
+        if kept is None:
+            models = self._models
+            frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views))
+            steps = estimate_first(models, frame.observation, np.random.default_rng([draw.seed, 4]), effort)
+            score, estimate = self._timed(steps, frame)
+            state = None if estimate is None else estimated_to_json(estimate)
+            figures = {"score": score.to_json(), "state": state}
+            shown = self._compared(frame.observation, None if estimate is None else estimate.state)
+            kept = TaskResult(figures, shown)
+            cache.write(_file(number), given, kept)
+        return kept
+
+    def _tracked(self, draw: Draw, start: SceneState | None, first: FrameScore, effort: TrackingConfig) -> TaskResult:
+        pushes = episode(draw, self._library, self._cameras, steps=self._config.steps)
+        if start is None:
+            score = TrackScore(
+                draw.names, (False,) * len(draw.names), (), (), (), (), (), pushes.moved_m, first.refused
+            )
+            return TaskResult({"score": score.to_json()}, self._compared(pushes.frames[-1].observation, None))
+        models, assets, expected, rng = (
+            self._models,
+            self._meshes(draw.names),
+            start,
+            np.random.default_rng([draw.seed, 5]),
+        )
+        rows: dict[str, Any] = {key: [] for key in ("position_mm", "rotation_deg", "doubted", "seconds")}
+        states = []
+        for frame in pushes.frames:
+            began = time.perf_counter()
+            estimate = last_estimate(estimate_next(models, frame.observation, expected, rng, effort))
+            rows["seconds"].append(time.perf_counter() - began)
+            expected = estimate.state
+            position, rotation = pose_errors(expected, frame.truth, assets)
+            rows["position_mm"].append(tuple(position.tolist()))
+            rows["rotation_deg"].append(tuple(rotation.tolist()))
+            rows["doubted"].append(flags(estimate))
+            states.append(expected)
+        score = TrackScore(
+            draw.names,
+            tuple(one.is_right for one in first.objects),
+            tuple(rows["position_mm"]),
+            tuple(rows["rotation_deg"]),
+            tuple(frame.absent for frame in pushes.frames),
+            tuple(rows["doubted"]),
+            tuple(rows["seconds"]),
+            pushes.moved_m,
+        )
+        lost = [step for step in score.lost_at if step is not None]
+        step = min(lost, default=len(states) - 1)  # where it went wrong, or how it ended
+        shown = self._compared(pushes.frames[step].observation, states[step])
+        return TaskResult({"score": score.to_json(), "shown_step": step, "redrawn": pushes.redrawn}, shown)
+
+    def _goals(self, draw: Draw, prior: SceneState | None, effort: GoalImageConfig) -> TaskResult:
+        scores, shown, moved, models = [], [], [], self._models
+        for goal in goals(draw, self._library, goal_camera(self._config.size)):
+            frame, estimate = goal.frame, None
+            if prior is None:
+                score = refused_frame(draw.names, "The first frame was refused.", 0.0)
+            else:
+                score, estimate = self._timed(estimate_goal(models, frame.observation, prior, effort), frame)
+            scores.append(score.to_json())
+            moved.append(list(goal.moved))
+            shown += self._compared(frame.observation, None if estimate is None else estimate.state)
+        return TaskResult({"scores": scores, "moved": moved}, tuple(shown))
+
+    def _spoiled(self, case: BadCase, seed: int) -> TaskResult:
+        models, config, rng = self._models, self._config, np.random.default_rng([seed, 4])
+        began, estimate, refused = time.perf_counter(), None, ""
+        try:
+            if case.start is None:
+                estimate = last_estimate(estimate_first(models, case.observation, rng, config.effort))
+            else:
+                prior = last_estimate(estimate_first(models, case.start, rng, config.effort)).state
+                began = time.perf_counter()
+                estimate = last_estimate(estimate_goal(models, case.observation, prior, config.goal))
+        except OsfError as error:
+            refused = str(error)
+        seconds = time.perf_counter() - began
+        state = None if estimate is None else estimate.state
+        shown = self._compared(case.observation, state)
+        score = BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
+        if estimate is not None:
+            score = replace(self._judged(estimate, case), seconds=seconds)
+        return TaskResult({"score": score.to_json()}, shown)
+
+    def _judged(self, estimate: EstimatedState, case: BadCase) -> BadScore:
+        """Errors of objects that are there; an answer that names one that is not there is wrong."""
+        there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
+        names = tuple(estimate.state.names[n] for n in there)
+        state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
+        position, rotation = pose_errors(state, case.truth, self._meshes(names))
+        is_right = len(names) == len(estimate.state.names) and all(map(is_right_pose, position, rotation))
+        return BadScore(
+            case.kind, "", estimate.reason, is_right, tuple(position.tolist()), tuple(rotation.tolist())
+        )  # fmt: skip
+
+    def _timed(self, steps: Iterator[EstimateStep], frame: Frame) -> tuple[FrameScore, EstimatedState | None]:
+        """Run an estimate; a refusal is a result too."""
+        began = time.perf_counter()
+        try:
+            estimate = last_estimate(steps)
+        except OsfError as error:
+            return refused_frame(frame.truth.names, str(error), time.perf_counter() - began), None
+        seconds = time.perf_counter() - began
+        meshes = self._meshes(frame.truth.names)
+        return score_frame(estimate, frame.truth, meshes, seconds, frame.absent), estimate
+
+    def _compared(self, observation: Observation, state: SceneState | None) -> tuple[Comparison, ...]:
+        """Each view, observed and rendered from the estimate; black where there is none."""
+        ours = np.zeros_like(observation.images)
+        if state is not None:
+            batch = SceneBatch.of(state)
+            ours = self._models.together.render(batch, observation.cameras, quality=_SHOWN_QUALITY).rgb[0]
+        rows = zip(observation.cameras, observation.images, ours, strict=True)
+        return tuple(Comparison(f"camera {camera.name}", to_uint8(a), to_uint8(b)) for camera, a, b in rows)
+
+    # What they depend on
+
+    @cached_property
+    def _models(self) -> ObjectModels:
+        """Loaded when the first estimate is asked for: all may be known from earlier runs."""
+        config = self._config
+        goal = "goal" in config.parts or config.bad > 0
+        draw = self._draw(WARM_SCENE)
+        return warm_models(self._names, self._fields, self._library, draw, config.size, goal=goal)
+
+    @cached_property
+    def _weights(self) -> dict[str, str]:
+        return {name: file_sha256(self._fields.info(name).path) for name in self._names}
+
+    @cached_property
+    def _code(self) -> str:
+        return code_sha256(osfcore.estimation, osfcore.render)
+
+    @cached_property
+    def _table(self) -> str:
+        return table_sha256(self._fields.load_table())
+
+    def _circumstances(self, draw: Draw, effort: dict[str, Any]) -> dict[str, Any]:
+        """Everything that a result depends on."""
+        return {
+            "format": FORMAT,
+            "code": self._code,
+            "weights": {name: self._weights[name] for name in draw.names},
+            "assets": {name: self._library.digest(name) for name in draw.names},
+            "table": self._table,
+            "arrangement": draw.seed,
+            "light": draw.light.direction.tolist(),
+            "size": self._config.size,
+            "effort": effort,
+        }
+
+    def _draw(self, number: int) -> Draw:
+        return draw_scene(self._names, self._config.objects, self._config.seed, number)
+
+    def _meshes(self, names: Sequence[str]) -> dict[str, ObjectAsset]:
+        for name in names:
+            if name not in self._assets:
+                self._assets[name] = self._library.load(name)
+        return {name: self._assets[name] for name in names}
+
+
+def state_of(first: TaskResult) -> SceneState | None:
+    """What was estimated of a first frame, as it was kept."""
+    state = first.figures["state"]
+    return None if state is None else estimated_from_json(state).state
+
+
+def digest(figures: dict[str, Any]) -> str:
+    """Of a first estimate, which others begin with."""
+    return hashlib.sha256(json.dumps(figures["state"], sort_keys=True).encode()).hexdigest()
+
+
+def _file(number: int) -> str:
+    return f"{number:04d}"

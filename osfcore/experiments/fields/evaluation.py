@@ -1,0 +1,359 @@
+"""How good trained fields are: each object alone, and scenes of several on the table; nothing here was trained on.
+
+A figure of an object is the mean over its images; the mean over objects is the mean of those. For scenes, every image
+of every scene counts once. Each finished object and scene is kept in the output folder, so that an evaluation can be
+killed, resumed and run in pieces.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets
+from osfcore.experiments.fields.composite_scenes import (
+    SCENE_QUALITY,
+    compare_scene,
+    draw_scene,
+    figures_of,
+    mean_of,
+    render_scene,
+    simulate,
+)
+from osfcore.experiments.fields.view_figures import VIEW_QUALITY, compare_views
+from osfcore.experiments.task_cache import TaskCache, TaskResult, file_sha256, table_sha256
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.fields.field_weights import read_field
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, image_side
+from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.inspection.contact_sheet import Comparison, contact_sheet
+from osfcore.io.image_file import write_png
+from osfcore.io.image_set import read_image_set
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.world.collection.collect_images import MIN_IMAGES, CollectObject, collect_object
+
+FORMAT = 1  # of the kept results; rises when figures come to mean something else
+SET_SEED = 760_000  # image sets with this seed and the next ones are for evaluation: never train on them
+MAX_TASKS = 10_000
+MAX_SEED = 1_000_000
+_DIGEST_CHARACTERS = 12  # of an object's digest in the name of its set
+_SHOWN = 8  # images of an object on its sheet
+_ResultT = TypeVar("_ResultT")
+_Notes = Generator[str, None, _ResultT]  # work that tells what it is doing, and returns its result
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateFields:
+    """Evaluate fields against the simulator.
+
+    Attributes:
+        out: folder for results; those of an earlier run of the same fields are taken over.
+        names: which objects, at least one, or None for all that have a field and a mesh.
+        tasks: number of scenes, each with its own objects, arrangement and harsh light.
+        objects: in each scene.
+        seed: of views, lights and scenes.
+        size: side of the images [px].
+    """
+
+    out: Path
+    names: tuple[str, ...] | None = None
+    tasks: int = 20
+    objects: int = 3
+    seed: int = 0
+    size: int = DEFAULT_IMAGE_SIDE
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateSet:
+    """Evaluate one field on the test images of a set in the OSF format.
+
+    Attributes:
+        data: folder with test/anno.json.
+        weights: field to evaluate; its metrics lie beside it as .json.
+        out: folder for results.
+    """
+
+    data: Path
+    weights: Path
+    out: Path
+
+
+@dataclass(frozen=True, slots=True)
+class FieldFigures:
+    """One field on unseen views under unseen lights; means over the images.
+
+    Attributes:
+        psnr_full: over whole images, over black [dB].
+        psnr_mask: inside the silhouettes, dilated by 2 px [dB].
+        ssim: over whole images.
+        images: how many.
+        file_mb: size of the weights [MB].
+        minutes: training time, or None if that is not known.
+    """
+
+    psnr_full: float
+    psnr_mask: float
+    ssim: float
+    images: int
+    file_mb: float
+    minutes: float | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FieldsReport:
+    """What was measured.
+
+    Attributes:
+        objects: by name.
+        scene_psnr: mean over all images of all scenes, whole images [dB]; None without scenes.
+        scene_psnr_object: the same over pixels that show an object.
+        scene_psnr_shadow: the same over table pixels in shadow.
+        scenes: how many.
+    """
+
+    objects: Mapping[str, FieldFigures]
+    scene_psnr: float | None = None
+    scene_psnr_object: float | None = None
+    scene_psnr_shadow: float | None = None
+    scenes: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as plain numbers, with means over the objects."""
+        figures = list(self.objects.values())
+        return {
+            "psnr_full_mean": float(np.mean([f.psnr_full for f in figures])),
+            "psnr_mask_mean": float(np.mean([f.psnr_mask for f in figures])),
+            "ssim_mean": float(np.mean([f.ssim for f in figures])),
+            "scene_psnr_mean": self.scene_psnr,
+            "scene_psnr_object_mean": self.scene_psnr_object,
+            "scene_psnr_shadow_mean": self.scene_psnr_shadow,
+            "max_file_mb": max(f.file_mb for f in figures),
+            "objects": {name: asdict(f) for name, f in self.objects.items()},
+            "scenes": self.scenes,
+        }
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EvaluationStep:
+    """How far an evaluation is.
+
+    Attributes:
+        done: objects and scenes finished.
+        total: objects and scenes in all.
+        note: what is being done.
+        report: with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    report: FieldsReport | None = None
+
+
+def evaluate_fields(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[EvaluationStep]:
+    """Measure every object, then scenes of them; contact sheets go to objects.png, scenes.png and folders beside them.
+
+    Raises:
+        UnknownName, MissingAssets: if an object lacks a field or a mesh.
+        InvalidInput: if a number is out of range.
+        CorruptFile, CannotWrite: as files are.
+    """
+    names = _checked(config, fields, assets)
+    tasks = config.tasks if len(names) >= config.objects else 0  # too few objects make no scene
+    total = len(names) + tasks
+    objects: dict[str, TaskResult] = {}
+    for name in names:
+        objects[name] = yield from _told(_object_alone(config, name, fields, assets), len(objects), total)
+    _write_sheet(config.out / "objects.png", [_titled(result, 0, name) for name, result in objects.items()])
+    figures = {name: _field_figures(result, fields.info(name).path) for name, result in objects.items()}
+    scenes: list[TaskResult] = []
+    run = _Scenes(config, names, fields, assets)
+    for number in range(tasks):
+        yield EvaluationStep(len(names) + number, total, f"Scenes ({number + 1} of {tasks})")
+        scenes.append(run.result(number))
+    if scenes:  # one view of each: the next camera every time
+        shown = [_titled(scene, i % len(scene.shown), f"scene {i}") for i, scene in enumerate(scenes)]
+        _write_sheet(config.out / "scenes.png", shown)
+    means = (mean_of([scene.figures for scene in scenes], key) for key in ("psnr", "psnr_object", "psnr_shadow"))
+    yield EvaluationStep(total, total, "Everything is measured", FieldsReport(figures, *means, scenes=tasks))
+
+
+def evaluate_set(config: EvaluateSet) -> Iterator[EvaluationStep]:
+    """Measure one field on the test images of a set; the contact sheet goes to objects.png.
+
+    Raises:
+        CorruptFile: if the set or the weights are not sound.
+        CannotWrite: if the disk refuses.
+    """
+    name = config.data.resolve().name
+    result = yield from _told(_measured(name, config.weights, config.data), 0, 1)
+    _write_sheet(config.out / "objects.png", result.shown)
+    report = FieldsReport({name: _field_figures(result, config.weights)})
+    yield EvaluationStep(1, 1, "Everything is measured", report)
+
+
+def measurable(fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """The objects with both a field and a mesh.
+
+    Raises:
+        InvalidInput: if there is no field at all.
+        MissingAssets: if there are fields, but no mesh for any.
+    """
+    known = fields.names()
+    if not known:
+        raise InvalidInput("number of trained fields", 0, "1 or more: train one with 'osf train field'")
+    names = tuple(name for name in known if assets.has(name))
+    if not names:
+        raise MissingAssets(known)
+    return names
+
+
+def _checked(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """The objects to measure, after everything asked for was found possible."""
+    limits = {
+        "number of scenes": (config.tasks, 0, MAX_TASKS),
+        "objects in a scene": (config.objects, 1, MAX_OBJECTS),
+        "seed": (config.seed, 0, MAX_SEED),
+    }
+    for what, (value, low, high) in limits.items():
+        if not low <= value <= high:
+            raise InvalidInput(what, value, f"between {low} and {high}")
+    image_side(config.size)
+    if config.names is None:
+        return measurable(fields, assets)
+    if not config.names:
+        raise InvalidInput("number of names", 0, "1 or more, or --names left out for all")
+    for name in config.names:
+        fields.info(name)  # raises UnknownName
+        if not assets.has(name):
+            assets.info(name)
+            raise MissingAssets([name])
+    return tuple(dict.fromkeys(config.names))
+
+
+def _object_alone(config: EvaluateFields, name: str, fields: FieldLibrary, assets: AssetLibrary) -> _Notes[TaskResult]:
+    """One object on a fresh set of images."""
+    cache = TaskCache(config.out / "objects")
+    weights = fields.info(name).path
+    asset = assets.digest(name)
+    data = config.out / "sets" / f"{name}-{asset[:_DIGEST_CHARACTERS]}-{config.size}px-{config.seed}"
+    circumstances = {
+        "format": FORMAT,
+        "weights": file_sha256(weights),
+        "asset": asset,
+        "set": data.name,
+        "quality": asdict(VIEW_QUALITY),
+    }
+    kept = cache.read(name, circumstances)
+    if kept is not None:
+        return kept
+    if not (data / "test" / "anno.json").is_file():  # sets appear whole
+        for step in collect_object(CollectObject(name, data, MIN_IMAGES, config.size, SET_SEED + config.seed), assets):
+            yield f"{name} (taking picture {step.done} of {step.total})"
+    result = yield from _measured(name, weights, data)
+    _write_sheet(config.out / "objects" / f"{name}.png", result.shown)
+    cache.write(name, circumstances, result)
+    return result
+
+
+def _measured(name: str, weights: Path, data: Path) -> _Notes[TaskResult]:
+    """A field on the test images of a set."""
+    field, images = read_field(weights), read_image_set(data, "test")
+    if images.is_opaque:
+        raise CorruptFile(data, "its images are opaque all over; an object before a transparent background is expected")
+    count = len(images.cameras)
+    views = []
+    for view in compare_views(field, images):
+        views.append(view)
+        yield f"{name} (image {len(views)} of {count})"
+    figures = {key: float(np.mean([getattr(v, key) for v in views])) for key in ("psnr_full", "psnr_mask", "ssim")}
+    chosen = np.unique(np.linspace(0, count - 1, _SHOWN).astype(int)).tolist()
+    return TaskResult({**figures, "images": count}, tuple(views[i].comparison for i in chosen))
+
+
+class _Scenes:
+    """Composite scenes, one after another."""
+
+    def __init__(
+        self, config: EvaluateFields, names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary
+    ) -> None:
+        self._config, self._names, self._fields, self._assets = config, names, fields, assets
+        self._cache = TaskCache(config.out / "scenes")
+        self._hashes: dict[str, str] = {}
+        self._loaded: dict[str, KiloOSF] = {}
+
+    def result(self, number: int) -> TaskResult:
+        """Figures and images of one scene, measured or taken over."""
+        config, table = self._config, self._fields.load_table()
+        draw = draw_scene(self._names, config.objects, config.seed, number)
+        circumstances = {
+            "format": FORMAT,
+            "weights": {name: self._hash(name) for name in draw.names},
+            "assets": {name: self._assets.digest(name) for name in draw.names},
+            "table": table_sha256(table),
+            "arrangement": draw.seed,
+            "light": draw.light.direction.tolist(),
+            "size": config.size,
+            "quality": asdict(SCENE_QUALITY),
+        }
+        name = f"{number:04d}"
+        kept = self._cache.read(name, circumstances)
+        if kept is not None:
+            return kept
+        truth = simulate(draw, self._assets, default_cameras(config.size))
+        renderer = SceneRenderer({object_name: self._load(object_name) for object_name in draw.names}, table)
+        views = compare_scene(truth, render_scene(renderer, truth))
+        result = TaskResult(figures_of(views), tuple(view.comparison for view in views))
+        _write_sheet(config.out / "scenes" / f"{name}.png", result.shown)
+        self._cache.write(name, circumstances, result)
+        return result
+
+    def _hash(self, name: str) -> str:
+        if name not in self._hashes:
+            self._hashes[name] = file_sha256(self._fields.info(name).path)
+        return self._hashes[name]
+
+    def _load(self, name: str) -> KiloOSF:
+        if name not in self._loaded:
+            self._loaded[name] = self._fields.load(name)
+        return self._loaded[name]
+
+
+def _told(notes: _Notes[_ResultT], done: int, total: int) -> Generator[EvaluationStep, None, _ResultT]:
+    """The notes as steps."""
+    while True:
+        try:
+            yield EvaluationStep(done, total, next(notes))
+        except StopIteration as stop:
+            return stop.value
+
+
+def _field_figures(result: TaskResult, weights: Path) -> FieldFigures:
+    """Figures with size and training time, which are read anew each time."""
+    try:
+        minutes = float(json.loads(weights.with_suffix(".json").read_text())["minutes"])
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        OverflowError,
+        RecursionError,
+    ):  # weights may come without metrics
+        minutes = None
+    return FieldFigures(**result.figures, file_mb=weights.stat().st_size / 1e6, minutes=minutes)
+
+
+def _titled(result: TaskResult, number: int, label: str) -> Comparison:
+    return replace(result.shown[number], label=label)
+
+
+def _write_sheet(path: Path, shown: Sequence[Comparison]) -> None:
+    write_png(path, contact_sheet(shown))

@@ -1,0 +1,1 @@
+"""Evaluation of rearrangement from goal images (paper, section 5.4)."""

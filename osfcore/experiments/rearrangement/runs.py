@@ -1,0 +1,119 @@
+"""One task of planning, done: by us from images, and by the same planner that is told the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.closed_loop import Episode
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import Event
+from osfcore.control.goal import GoalImage, alike
+from osfcore.control.knowledge import Knowledge
+from osfcore.control.monitor import offsets
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.states import SceneState
+from osfcore.metrics.success import RearrangementTask
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.planning.mppi import Planner
+from osfcore.planning.pose_cost import PoseCost, PoseGoal
+from osfcore.planning.push_proposals import PushProposals
+from osfcore.world.simulated_dynamics import SimulatedPushes
+from osfcore.world.tabletop import Tabletop
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Ended:
+    """A table that planning has left.
+
+    Attributes:
+        state: the truth.
+        image: as the goal camera sees it, without the pusher.
+        goal: the goal image.
+    """
+
+    state: SceneState
+    image: Float[np.ndarray, "h w 3"]
+    goal: Float[np.ndarray, "h w 3"]
+
+
+def run_from_images(
+    task: RearrangementTask,
+    assets: AssetLibrary,
+    knowledge: Knowledge,
+    settings: EpisodeSettings,
+    rng: np.random.Generator,
+) -> Iterator[Event | Ended]:
+    """The whole loop; the last step is how it ended."""
+    world = Tabletop(assets)
+    try:
+        goal = _goal_image(world, task)
+        world.restore(task.start)
+        yield from Episode(world, knowledge, goal, settings, rng).run()
+        yield _ended(world, goal)
+    finally:
+        world.close()
+
+
+def run_told_the_truth(
+    task: RearrangementTask,
+    assets: AssetLibrary,
+    knowledge: Knowledge,
+    settings: EpisodeSettings,
+    rng: np.random.Generator,
+) -> Ended:
+    """The same planner with true poses, and with the simulator as its dynamics."""
+    world, dynamics = Tabletop(assets), SimulatedPushes({name: assets.load(name) for name in task.start.names})
+    try:
+        image = _goal_image(world, task)
+        world.restore(task.start)
+        _push_there(world, dynamics, task, knowledge, settings, rng)
+        return _ended(world, image)
+    finally:
+        dynamics.close()
+        world.close()
+
+
+def _push_there(
+    world: Tabletop,
+    dynamics: SimulatedPushes,
+    task: RearrangementTask,
+    knowledge: Knowledge,
+    settings: EpisodeSettings,
+    rng: np.random.Generator,
+) -> None:
+    planner = Planner(dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
+    goal, number = _moved_goal(task), 0
+    while number < settings.steps:
+        state = world.truth()
+        goal = alike(goal, state, knowledge.symmetries)
+        far, turned = offsets(goal, state)
+        if far.max() <= settings.reached_m and turned.max() <= settings.reached_rad:
+            return
+        left = settings.steps - number
+        planner.settings = replace(settings.plan, horizon=min(settings.plan.horizon, left))
+        for _ in planner.plan(state, goal, PoseCost(goal), rng):
+            pass
+        actions = planner.upcoming(min(settings.replan_every, left))
+        for action in actions:
+            world.act(action)
+        planner.executed(len(actions))
+        number += len(actions)
+
+
+def _moved_goal(task: RearrangementTask) -> PoseGoal:
+    return PoseGoal.of(task.start, {name: task.goal.pose(name) for name in task.moved})
+
+
+def _goal_image(world: Tabletop, task: RearrangementTask) -> GoalImage:
+    world.restore(task.goal)
+    camera = goal_camera()
+    return GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
+
+
+def _ended(world: Tabletop, goal: GoalImage) -> Ended:
+    image = world.render((goal.camera,), with_pusher=False).images[0]
+    return Ended(world.truth(), image, goal.image)

@@ -1,0 +1,147 @@
+"""Which fields there are: those that ship with the package, and those trained on this machine, which come first."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+from osfcore.errors import CorruptFile, UnknownName
+from osfcore.fields.field_weights import read_field
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.table_field import TableField, read_table
+
+TABLE_NAME = "table"
+FIELD_FILE = "field.safetensors"
+METRICS_FILE = "field.json"
+_SUFFIX = ".safetensors"
+_NUMBERS = (
+    "psnr_full",
+    "psnr_mask",
+    "psnr",
+    "test_images",
+    "train_images",
+    "bytes",
+    "minutes",
+    "iterations",
+    "seed",
+    "threads",
+)
+_WORDS = ("device", "data", "command", "machine")
+_LARGEST = 2**63
+_MOST_CHARACTERS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class FieldInfo:
+    """One field.
+
+    Attributes:
+        name: of its object.
+        source: "shipped" with the package or "trained" on this machine.
+        path: of its weights.
+        bytes: size of its weights.
+        metrics: what was measured when it was trained, as plain numbers and words; empty if that is not known.
+    """
+
+    name: str
+    source: Literal["shipped", "trained"]
+    path: Path
+    bytes: int
+    metrics: Mapping[str, Any]
+
+
+class FieldLibrary:
+    """The fields of the package and of DATA_DIR/fields/NAME."""
+
+    def __init__(self, data_dir: Path | None, *, shipped: Path | None = None) -> None:
+        """Look into a data directory, or at the shipped fields only.
+
+        Args:
+            data_dir: holds fields/NAME/field.safetensors and field.json; need not exist.
+            shipped: folder with NAME.safetensors and NAME.json; the package's by default.
+        """
+        self._trained = None if data_dir is None else data_dir / "fields"
+        self._shipped = shipped or Path(str(files("osfcore.fields") / "shipped"))
+
+    def folder(self, name: str) -> Path:
+        """Where a trained field of that name belongs.
+
+        Raises:
+            UnknownName: if this library has no data directory.
+        """
+        if self._trained is None:
+            raise UnknownName("folder for field", name, ())
+        return self._trained / name
+
+    def names(self) -> tuple[str, ...]:
+        """All objects with a field, in order of name."""
+        shipped = {path.stem for path in self._shipped.glob(f"*{_SUFFIX}")} - {TABLE_NAME}
+        trained = set()
+        if self._trained is not None and self._trained.is_dir():
+            trained = {path.parent.name for path in self._trained.glob(f"*/{FIELD_FILE}")} - {TABLE_NAME}
+        return tuple(sorted(name for name in shipped | trained if name.isprintable()))
+
+    def has(self, name: str) -> bool:
+        """Whether an object has a field."""
+        return name in self.names()
+
+    def info(self, name: str) -> FieldInfo:
+        """What is known of a field without loading it.
+
+        Raises:
+            UnknownName: if there is none of that name.
+        """
+        if not self.has(name):
+            raise UnknownName("field", name, self.names())
+        return self._info(name)
+
+    def _info(self, name: str) -> FieldInfo:
+        trained = None if self._trained is None else self._trained / name / FIELD_FILE
+        if trained is not None and trained.is_file():
+            return FieldInfo(
+                name, "trained", trained, trained.stat().st_size, _metrics(trained.with_name(METRICS_FILE))
+            )
+        path = self._shipped / f"{name}{_SUFFIX}"
+        return FieldInfo(name, "shipped", path, path.stat().st_size, _metrics(path.with_suffix(".json")))
+
+    def load(self, name: str) -> KiloOSF:
+        """Read a field.
+
+        Raises:
+            UnknownName: if there is none of that name.
+            CorruptFile: if its file is broken.
+        """
+        return read_field(self.info(name).path)
+
+    def load_table(self) -> TableField:
+        """Read the table: one placed in DATA_DIR/fields/table comes before the shipped one.
+
+        Raises:
+            CorruptFile: if its file is broken.
+        """
+        try:
+            path = self._info(TABLE_NAME).path
+        except OSError as error:
+            raise CorruptFile(self._shipped / f"{TABLE_NAME}{_SUFFIX}", "the package lacks its table") from error
+        return read_table(path)
+
+
+def _metrics(path: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return {key: value for key, value in content.items() if _is_metric(key, value)} if isinstance(content, dict) else {}
+
+
+def _is_metric(key: str, value: object) -> bool:
+    """Whether it is a figure or a word that we know, and that can be told further as it is."""
+    if key in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
+        return -_LARGEST <= value < _LARGEST  # not for NaN either
+    if key in _WORDS and isinstance(value, str):
+        return value.isprintable() and len(value) <= _MOST_CHARACTERS
+    return key == "hollow" and isinstance(value, bool)

@@ -1,0 +1,1 @@
+"""Poses, rotations, cameras, light, scene states, convex parts: the vocabulary of all other packages."""

@@ -1,0 +1,168 @@
+"""Rigid poses and unit quaternions (w, x, y, z) on numpy arrays with any leading batch shape.
+
+`T_world_object` maps object coordinates to world coordinates; poses compose by matching subscripts:
+`T_world_camera @ T_camera_object`. Conversions from matrices and rotation vectors are scipy's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from osfcore.errors import InvalidInput
+
+QUATERNION_NORM_TOLERANCE = 1e-3
+
+
+def quaternion_multiply(
+    a: Float[np.ndarray, "*batch 4"], b: Float[np.ndarray, "*batch 4"]
+) -> Float[np.ndarray, "*out 4"]:
+    """Hamilton product a b: the rotation b followed by the rotation a. Batches broadcast."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_conjugate(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
+    """The inverse rotation of a unit quaternion."""
+    return np.asarray(q) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def rotate(q: Float[np.ndarray, "*batch 4"], v: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*out 3"]:
+    """Rotate vectors by unit quaternions. Batches broadcast."""
+    q, v = np.asarray(q), np.asarray(v)
+    u = q[..., 1:]
+    t = 2.0 * np.cross(u, v)
+    return v + q[..., :1] * t + np.cross(u, t)
+
+
+def quaternion_to_matrix(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation matrices of quaternions of any length but 0. Written out: rendering asks for them all the time."""
+    q = np.asarray(q, float)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    s = 2 / (q * q).sum(axis=-1)
+    matrix = np.empty((*q.shape[:-1], 3, 3))
+    matrix[..., 0, 0], matrix[..., 1, 1] = 1 - s * (y * y + z * z), 1 - s * (x * x + z * z)
+    matrix[..., 2, 2] = 1 - s * (x * x + y * y)
+    matrix[..., 0, 1], matrix[..., 1, 0] = s * (x * y - w * z), s * (x * y + w * z)
+    matrix[..., 0, 2], matrix[..., 2, 0] = s * (x * z + w * y), s * (x * z - w * y)
+    matrix[..., 1, 2], matrix[..., 2, 1] = s * (y * z - w * x), s * (y * z + w * x)
+    return matrix
+
+
+def quaternion_from_matrix(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Unit quaternions with w >= 0 of rotation matrices."""
+    m = np.array(matrix, float)
+    q = Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(canonical=True, scalar_first=True)
+    return q.reshape(*m.shape[:-2], 4)
+
+
+def quaternion_exp(rotation_vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Unit quaternions of rotation vectors (axis times angle) [rad]."""
+    r = np.array(rotation_vector, float)
+    return Rotation.from_rotvec(r.reshape(-1, 3)).as_quat(scalar_first=True).reshape(*r.shape[:-1], 4)
+
+
+def quaternion_log(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3"]:
+    """Rotation vectors [rad] with an angle of at most pi; the inverse of `quaternion_exp`."""
+    q = np.array(q, float)
+    return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_rotvec().reshape(*q.shape[:-1], 3)
+
+
+def rotation_angle(a: Float[np.ndarray, "*batch 4"], b: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+    """Angle of the rotation between two orientations [rad], in [0, pi]; q and -q are the same orientation."""
+    difference = quaternion_multiply(quaternion_conjugate(a), b)
+    return 2.0 * np.arctan2(np.linalg.norm(difference[..., 1:], axis=-1), np.abs(difference[..., 0]))
+
+
+def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") -> Float[np.ndarray, "*batch 4"]:
+    """The same quaternions with norm exactly 1.
+
+    Raises:
+        InvalidInput: if a norm is off by more than 1e-3: such a quaternion is a mistake, not a rounding error.
+    """
+    q = np.asarray(q, float)
+    if q.shape[-1:] != (4,):
+        raise InvalidInput(what, f"an array of shape {q.shape}", "four numbers (w, x, y, z)")
+    norms = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.all(np.abs(norms - 1.0) < QUATERNION_NORM_TOLERANCE):  # also false for NaN
+        raise InvalidInput(what, q.tolist(), "a unit quaternion (w, x, y, z)")
+    return q / norms
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pose:
+    """A rigid pose, or a batch of them; `T_a_b` maps coordinates in b to coordinates in a.
+
+    Attributes:
+        position: origin of b in a [m].
+        quaternion: rotation from b to a, unit, (w, x, y, z).
+    """
+
+    position: Float[np.ndarray, "*batch 3"]
+    quaternion: Float[np.ndarray, "*batch 4"]
+
+    @staticmethod
+    def identity(*batch: int) -> Pose:
+        """The pose that changes nothing."""
+        quaternion = np.zeros((*batch, 4))
+        quaternion[..., 0] = 1.0
+        return Pose(np.zeros((*batch, 3)), quaternion)
+
+    @staticmethod
+    def joined(*batches: Pose) -> Pose:
+        """One batch of several, along the first axis."""
+        return Pose(np.concatenate([b.position for b in batches]), np.concatenate([b.quaternion for b in batches]))
+
+    @staticmethod
+    def from_matrix(matrix: Float[np.ndarray, "*batch 4 4"]) -> Pose:
+        """The pose of homogeneous 4 x 4 matrices whose upper left block is a rotation."""
+        matrix = np.asarray(matrix, float)
+        return Pose(matrix[..., :3, 3].copy(), quaternion_from_matrix(matrix[..., :3, :3]))
+
+    def matrix(self) -> Float[np.ndarray, "*batch 4 4"]:
+        """Homogeneous 4 x 4 matrices."""
+        matrix = np.zeros((*self.position.shape[:-1], 4, 4))
+        matrix[..., :3, :3] = quaternion_to_matrix(self.quaternion)
+        matrix[..., :3, 3] = self.position
+        matrix[..., 3, 3] = 1.0
+        return matrix
+
+    def inverse(self) -> Pose:
+        """`T_b_a` of `T_a_b`."""
+        quaternion = quaternion_conjugate(self.quaternion)
+        return Pose(-rotate(quaternion, self.position), quaternion)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """`T_a_b @ T_b_c` is `T_a_c`. Batches broadcast."""
+        return Pose(
+            self.position + rotate(self.quaternion, other.position),
+            quaternion_multiply(self.quaternion, other.quaternion),
+        )
+
+    def apply(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, "*out 3"]:
+        """Map points from b to a [m]. One pose maps any array of points; a batch broadcasts against them."""
+        return rotate(self.quaternion, points) + self.position
+
+    def __getitem__(self, index: object) -> Pose:
+        """Poses of a batch."""
+        return Pose(self.position[index], self.quaternion[index])  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def orthogonal_basis(direction: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Two unit vectors that stand on a unit vector and on each other."""
+    helper = np.array([1.0, 0.0, 0.0]) if abs(direction[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    first = np.cross(direction, helper)
+    first /= np.linalg.norm(first)
+    return first, np.cross(direction, first)

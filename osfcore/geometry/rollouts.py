@@ -1,0 +1,63 @@
+"""Sequences of actions, and the futures that are predicted from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import InvalidInput, shown
+from osfcore.geometry.workspace import ACTION_ALLOWED, MAX_SPEED_M_S
+
+MAX_HORIZON = 200
+MAX_SEQUENCES = 20_000
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rollouts:
+    """Predicted futures of one scene: K action sequences of T steps.
+
+    Attributes:
+        names: of the N objects.
+        positions: of the objects, before the first and after each action [m].
+        quaternions: likewise, (w, x, y, z).
+        pusher: centre of the pusher, likewise [m].
+    """
+
+    names: tuple[str, ...]
+    positions: Float[np.ndarray, "K T1 N 3"]
+    quaternions: Float[np.ndarray, "K T1 N 4"]
+    pusher: Float[np.ndarray, "K T1 3"]
+
+    def __getitem__(self, sequence: int) -> Rollouts:
+        """One sequence alone, K = 1."""
+        k = slice(sequence, sequence + 1)
+        return Rollouts(self.names, self.positions[k], self.quaternions[k], self.pusher[k])
+
+
+def check_actions(actions: object) -> Float[np.ndarray, "K T 3"]:
+    """Sequences of actions that can be rolled out.
+
+    Raises:
+        InvalidInput: if they are not K x T x 3 finite numbers within the limits; the message names the first one.
+    """
+    allowed = f"K x T x 3 numbers, K up to {MAX_SEQUENCES} and T from 1 to {MAX_HORIZON}"
+    try:
+        array = np.array(actions, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidInput("actions [m/s]", shown(actions), allowed) from None
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise InvalidInput("shape of the actions", array.shape, allowed)
+    count, horizon = array.shape[:2]
+    if not 1 <= horizon <= MAX_HORIZON:
+        raise InvalidInput("horizon [actions]", horizon, f"between 1 and {MAX_HORIZON}")
+    if not 1 <= count <= MAX_SEQUENCES:
+        raise InvalidInput("number of action sequences", count, f"between 1 and {MAX_SEQUENCES}")
+    is_sane = (
+        np.isfinite(array).all(axis=2) & (np.abs(array) <= MAX_SPEED_M_S + 1e-9).all(axis=2) & (array[..., 2] == 0)
+    )
+    if not is_sane.all():
+        k, t = np.argwhere(~is_sane)[0]
+        raise InvalidInput(f"action {t} of sequence {k} [m/s]", array[k, t].tolist(), ACTION_ALLOWED)
+    return array

@@ -1,0 +1,74 @@
+"""Scene states and observations: frozen dataclasses of numpy arrays, checked when they are built.
+
+Letters: V views, N objects, h w pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from osfcore.errors import InvalidInput, finite_vector
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, unit_quaternion
+
+MAX_OBJECTS = 8
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneState:
+    """Where everything is: objects, light, pusher.
+
+    Attributes:
+        names: catalogue names of the objects, all different.
+        poses: `T_world_object`, a batch of N.
+        light: the one light.
+        pusher: centre of the pusher [m], or None where there is none (goal images).
+    """
+
+    names: tuple[str, ...]
+    poses: Pose
+    light: Light
+    pusher: Float[np.ndarray, "3"] | None
+
+    def __post_init__(self) -> None:
+        """Check counts, shapes and numbers."""
+        count = len(self.names)
+        if count > MAX_OBJECTS:
+            raise InvalidInput("number of objects", count, f"at most {MAX_OBJECTS}")
+        if len(set(self.names)) != count:
+            raise InvalidInput("list of objects", ", ".join(self.names), "without repetition")
+        if self.poses.position.shape != (count, 3) or not np.all(np.isfinite(self.poses.position)):
+            raise InvalidInput("object positions [m]", self.poses.position.tolist(), f"{count} x 3 finite numbers")
+        quaternion = unit_quaternion(self.poses.quaternion, "object quaternions")
+        object.__setattr__(self, "poses", Pose(self.poses.position, quaternion))
+        if self.pusher is not None:
+            object.__setattr__(self, "pusher", finite_vector(self.pusher, 3, "pusher position [m]"))
+
+    def pose(self, name: str) -> Pose:
+        """`T_world_object` of one object."""
+        return self.poses[self.names.index(name)]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Observation:
+    """What the cameras and the robot report at one instant; no depth, no poses.
+
+    Attributes:
+        cameras: V cameras of one image size.
+        images: linear RGB in [0, 1].
+        names: names of the N objects in the scene.
+        masks: visible pixels of each object, or None.
+        pusher: centre of the pusher [m]; the robot knows its hand.
+        time_s: since the last reset [s].
+    """
+
+    cameras: tuple[Camera, ...]
+    images: Float[np.ndarray, "V h w 3"]
+    names: tuple[str, ...]
+    masks: Bool[np.ndarray, "V N h w"] | None
+    pusher: Float[np.ndarray, "3"] | None
+    time_s: float

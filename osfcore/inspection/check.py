@@ -1,0 +1,195 @@
+"""Validation of files that people bring, with the reason in words and pictures of what was understood."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from osfcore.errors import CorruptFile, InvalidInput, shown
+from osfcore.fields.field_weights import FORMAT as FIELD_FORMAT
+from osfcore.fields.field_weights import read_field, tensor_format
+from osfcore.fields.table_field import TABLE_FORMAT, read_table
+from osfcore.fields.training.visual_hull import carve, silhouette_box
+from osfcore.inspection.image_set_overlay import overlay_sheet
+from osfcore.inspection.observation_overlay import observation_sheet
+from osfcore.io.archives import unpack_set
+from osfcore.io.files import read_json, write_atomically
+from osfcore.io.image_set import read_image_set, read_splits
+from osfcore.io.observation_file import OBSERVATION_FILE, is_observation, read_observation
+from osfcore.io.output_paths import check_place
+from osfcore.io.rollout_file import actions_from_json
+from osfcore.io.scene_file import scene_from_json
+from osfcore.io.state_file import estimated_from_json, is_estimated
+
+_REASON_CHARACTERS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a file turned out to be.
+
+    Attributes:
+        kind: "scene", "state", "observation", "image set", "push file",
+            "actions", "field" or "dynamics".
+        summary: its contents in words.
+        facts: its contents in numbers.
+    """
+
+    kind: str
+    summary: str
+    facts: Mapping[str, Any]
+
+
+def check_path(path: Path) -> Report:
+    """Find out what a file or folder is and whether it is sound.
+
+    Raises:
+        CorruptFile: if it is of no known kind or broken; the message says where.
+    """
+    if is_observation(path):
+        return _check_observation(path)
+    if path.is_dir() or path.suffix.lower() == ".zip":
+        with _unpacked(path) as folder:
+            return _check_image_set(folder)
+    if path.suffix.lower() == ".json":
+        if path.name == OBSERVATION_FILE:
+            raise CorruptFile(path, "it is one file of an observation; check the folder that holds it")
+        return read_json(path, _any_json)
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        return _check_pushes(path)
+    if path.suffix.lower() == ".safetensors":
+        return _check_field(path)
+    kinds = (
+        "a .json scene, state or actions, a .h5 push file, a .safetensors field or network, "
+        "nor the folder of an observation or image set"
+    )
+    raise CorruptFile(path, f"it is neither {kinds}")
+
+
+def _any_json(data: object) -> Report:
+    if isinstance(data, dict) and "actions" in data and "objects" not in data:
+        count, steps = actions_from_json(data).shape[:2]
+        return Report("actions", f"{count} sequences of {steps} actions", {"sequences": count, "steps": steps})
+    if not is_estimated(data):
+        scene = scene_from_json(data)
+        counts = {"objects": len(scene.state.names), "cameras": len(scene.cameras)}
+        return Report("scene", f"{counts['objects']} objects, {counts['cameras']} cameras", counts)
+    estimate = estimated_from_json(data)
+    count = len(estimate.state.names)
+    facts = {"objects": count, "trusted": estimate.trusted, "reason": estimate.reason}
+    trust = "trusted" if estimate.trusted else f"not trusted: {shown(estimate.reason, _REASON_CHARACTERS)}"
+    return Report("state", f"{count} objects, {trust}", facts)
+
+
+def _check_observation(folder: Path) -> Report:
+    observation = read_observation(folder)
+    height, width = observation.images.shape[1:3]
+    facts = {"cameras": len(observation.cameras), "objects": len(observation.names), "width": width, "height": height}
+    facts["masks"] = 0 if observation.masks is None else int(observation.masks.any(axis=(2, 3)).sum())
+    views = f"{facts['cameras']} view{'s' * (facts['cameras'] != 1)} of {width} x {height} px"
+    return Report("observation", f"{views}, {facts['objects']} objects, {facts['masks']} masks", facts)
+
+
+def _check_field(path: Path) -> Report:
+    kind = tensor_format(path)
+    if kind == TABLE_FORMAT:
+        table = read_table(path)
+        return Report("field", "the table", {"half_side": table.half_side})
+    if kind is not None and kind != FIELD_FORMAT:
+        from osfcore.dynamics.network_weights import FORMAT, read_network
+
+        if kind == FORMAT:
+            network = read_network(path)
+            facts = {"hidden": network.hidden, "steps": network.steps}
+            return Report("dynamics", f"a network of pushes, {network.hidden} wide, {network.steps} rounds", facts)
+    field = read_field(path)
+    size = " x ".join(f"{side:.3g}" for side in field.extent[1] - field.extent[0])
+    facts = {"corners": len(field.rows) - 1, "networks": len(field.networks)}
+    return Report(
+        "field", f"an object of {size}, {facts['corners']} voxel corners, {facts['networks']} networks", facts
+    )
+
+
+def _check_pushes(path: Path) -> Report:
+    from osfcore.io.push_file import read_sound_pushes
+
+    episodes = read_sound_pushes(path)
+    facts = {"episodes": len(episodes), "steps": sum(len(e.actions) for e in episodes)}
+    return Report("push file", f"{facts['episodes']} episodes, {facts['steps']} steps", facts)
+
+
+def _check_image_set(folder: Path) -> Report:
+    train, test = read_splits(folder)
+    facts = {"train": len(train.cameras), "test": len(test.cameras)}
+    what = "the bare table"
+    if not train.is_opaque:
+        box = silhouette_box(train, test, where=folder)
+        what = "an object of " + " x ".join(f"{side:.3g}" for side in box[1] - box[0])
+    return Report("image set", f"{facts['train']} train and {facts['test']} test images of {what}", facts)
+
+
+@contextlib.contextmanager
+def _unpacked(path: Path) -> Iterator[Path]:
+    """The folder of an image set, or of a zipped one for as long as it is looked at."""
+    if path.is_dir() or path.suffix.lower() != ".zip":
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="osf-check-") as place:
+        try:
+            yield unpack_set(path, Path(place) / path.stem)
+        except CorruptFile as error:
+            if str(error).startswith(str(path)):
+                raise
+            inside = str(error).replace(f"{place}/", "").rstrip(".")
+            raise CorruptFile(path, inside) from error
+
+
+def draw_overlay(path: Path, out: Path) -> None:
+    """Draw what was understood of a set or an observation into its images, as one PNG.
+
+    For some images of a set that is the world's axes (x red, y green, z blue), the direction of the light (yellow) and
+    the box that holds every silhouette (magenta). Where cameras and silhouettes contradict each other there is no such
+    box; one of about the object's size is drawn where most cameras look, and lies beside the silhouettes. For an
+    observation see `observation_sheet`.
+
+    Args:
+        path: folder of an observation, or folder or zip of an image set; it may be a set in which `check_path` found
+            contradicting silhouettes.
+        out: PNG to write.
+
+    Raises:
+        CorruptFile: if it is neither.
+        InvalidInput: if the PNG would have another suffix.
+        CannotWrite: if it cannot be written.
+    """
+    check_overlay_place(out)
+    sheet = observation_sheet(read_observation(path)) if is_observation(path) else _set_sheet(path)
+    _, data = cv2.imencode(".png", sheet)
+    write_atomically(out, data.tobytes())
+
+
+def _set_sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    with _unpacked(path) as folder:
+        sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))
+    has_box = not any(images.is_opaque for images in sets)
+    return overlay_sheet(sets, carve(*sets).box if has_box else None)
+
+
+def check_overlay_place(out: Path) -> None:
+    """Refuse a place for an overlay that cannot take it.
+
+    Raises:
+        InvalidInput: if it has another suffix than .png.
+        CannotWrite: if it cannot be written.
+    """
+    if out.suffix.lower() != ".png":
+        raise InvalidInput("overlay file", out, "a path that ends in .png")
+    check_place(out)

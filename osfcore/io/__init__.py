@@ -1,0 +1,1 @@
+"""File formats with their checks: scenes, states, observations, image sets, pushes, rollouts, images."""

@@ -1,0 +1,196 @@
+"""Unpacking a zip that somebody uploaded as an image set or observation, without trusting anything in it."""
+
+from __future__ import annotations
+
+import lzma
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
+from osfcore.io.files import folder_at_once
+
+MAX_BYTES = 2 << 30
+MAX_FILES = 20_000
+MAX_RATIO = 100  # unpacked to packed: PNGs do not shrink, and lists of numbers shrink to a fifth
+_SMALL_BYTES = 10_000_000  # below this no ratio hurts
+_MAX_NAME_BYTES = 200
+_MAX_DEPTH = 8
+_CHUNK_BYTES = 1 << 20
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, struct.error, ValueError, OverflowError)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """What an archive may hold.
+
+    Attributes:
+        what: it is called.
+        marker: a file that tells where in the archive it lies.
+        kept: the folders that belong to it; all that lies beside the marker if empty.
+        expected: what was to be sent, for people.
+    """
+
+    what: str
+    marker: PurePosixPath
+    kept: tuple[str, ...]
+    expected: str
+
+
+_IMAGE_SET = _Kind(
+    "image set", PurePosixPath("train/anno.json"), ("train", "test"), "a zipped image set with train and test"
+)
+_OBSERVATION = _Kind(
+    "observation", PurePosixPath("observation.json"), (), "a zipped observation folder with the images that it names"
+)
+
+
+def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
+    """Unpack the train and test folders of an image set as `out`/train and `out`/test; in the zip they may lie deeper.
+
+    Everything is looked at before anything is written, and `out` appears only when all is there. The set itself is not
+    judged: `read_splits` does that.
+
+    Args:
+        archive: a .zip file.
+        out: folder to write; must not exist or be empty.
+        max_bytes: of the unpacked archive.
+        max_files: in the archive, folders and what is left packed included.
+
+    Returns:
+        `out`, the folder that holds train/anno.json.
+
+    Raises:
+        CorruptFile: if it is no zip, damaged, locked, a bomb, holds no set, or has names that lead elsewhere or links.
+        InvalidInput: if `out` is there and not empty.
+        CannotWrite: if the disk is full or cannot be written.
+    """
+    return _unpack(archive, out, _IMAGE_SET, max_bytes, max_files)
+
+
+def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
+    """Unpack an observation folder, under the same guards; `osfcore.io.observation_file` judges it.
+
+    Args:
+        archive: a .zip file.
+        out: folder to write; must not exist or be empty.
+        max_bytes: of the unpacked archive.
+        max_files: in the archive.
+
+    Returns:
+        `out`, the folder that holds observation.json.
+
+    Raises:
+        CorruptFile: if it is no zip, damaged, locked, a bomb, holds no observation, or leads elsewhere.
+        InvalidInput: if `out` is there and not empty.
+        CannotWrite: if the disk is full or cannot be written.
+    """
+    return _unpack(archive, out, _OBSERVATION, max_bytes, max_files)
+
+
+def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: int) -> Path:
+    archive, out = Path(archive), Path(out).absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InvalidInput("output folder", out, "new or empty")
+    try:
+        with zipfile.ZipFile(archive) as file:
+            members = _members(archive, file, max_bytes, max_files)
+            wanted = _wanted(archive, members, kind)
+            _write(archive, file, wanted, out)
+    except _DAMAGE as error:
+        if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
+            raise
+        raise CorruptFile(archive, "it is no zip archive or a damaged one") from error
+    except (RuntimeError, NotImplementedError) as error:
+        raise CorruptFile(archive, "it is packed in a way that cannot be read; a plain zip is expected") from error
+    return out
+
+
+def _members(
+    archive: Path, file: zipfile.ZipFile, max_bytes: int, max_files: int
+) -> dict[PurePosixPath, zipfile.ZipInfo]:
+    """The plain files of an archive by their path, all of which lead inside."""
+    infos = file.infolist()
+    if len(infos) > max_files:
+        raise CorruptFile(archive, f"it holds {len(infos)} files; at most {max_files} are unpacked")
+    size = sum(info.file_size for info in infos)
+    if size > max_bytes:
+        raise CorruptFile(archive, f"it unpacks to {size / 1e6:.0f} MB; at most {max_bytes / 1e6:.0f} MB are unpacked")
+    packed = archive.stat().st_size
+    if size > _SMALL_BYTES and size > MAX_RATIO * packed:
+        expected = f"more than {MAX_RATIO} times its size, which no images do"
+        raise CorruptFile(archive, f"{packed / 1e6:.1f} MB unpack to {size / 1e6:.0f} MB, {expected}")
+    members: dict[PurePosixPath, zipfile.ZipInfo] = {}
+    for info in infos:
+        path = _safe_path(archive, info)
+        if info.is_dir():
+            continue
+        if path in members:
+            raise CorruptFile(archive, f"it holds {info.filename[:100]!r} twice")
+        members[path] = info
+    if any(parent in members for path in members for parent in path.parents):
+        raise CorruptFile(archive, "it holds a file and a folder of the same name")
+    return members
+
+
+def _safe_path(archive: Path, info: zipfile.ZipInfo) -> PurePosixPath:
+    name = info.filename.replace("\\", "/")  # some Windows tools write backslashes
+    place = f"it holds {info.filename[:100]!r}"
+    path, windows = PurePosixPath(name), PureWindowsPath(name)
+    if path.is_absolute() or windows.drive or windows.root or ".." in path.parts:
+        raise CorruptFile(archive, f"{place}, a name that leads out of the archive")
+    is_long = any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts)
+    if is_long or not 1 <= len(path.parts) <= _MAX_DEPTH or not name.isprintable():
+        raise CorruptFile(archive, f"{place}, a name that is too long, too deep or not printable")
+    kind = stat.S_IFMT(info.external_attr >> 16)
+    if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        raise CorruptFile(archive, f"{place}, a link or device; plain files and folders are expected")
+    if info.flag_bits & 1:
+        raise CorruptFile(archive, f"{place}, which is locked with a password")
+    return path
+
+
+def _wanted(
+    archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: _Kind
+) -> dict[PurePosixPath, zipfile.ZipInfo]:
+    """What lies beside the file that marks the place and is to be kept, by its path from there."""
+    depth = len(kind.marker.parts)
+    roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == kind.marker]
+    if not roots:
+        raise CorruptFile(archive, f"it holds no {kind.marker}; {kind.expected} is expected")
+    roots.sort(key=lambda root: len(root.parts))
+    if len(roots) > 1 and len(roots[0].parts) == len(roots[1].parts):
+        raise CorruptFile(archive, f"it holds several {kind.what}s, {roots[0]} and {roots[1]}; one is expected")
+    root = roots[0]
+    inside = {path.relative_to(root): info for path, info in members.items() if path.is_relative_to(root)}
+    return {path: info for path, info in inside.items() if not kind.kept or path.parts[0] in kind.kept}
+
+
+def _write(archive: Path, file: zipfile.ZipFile, wanted: Mapping[PurePosixPath, zipfile.ZipInfo], out: Path) -> None:
+    """Write the files, all or none."""
+    with folder_at_once(out) as partial:
+        for path, info in wanted.items():
+            _extract(archive, file, info, partial / path, out)
+
+
+def _extract(archive: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, out: Path) -> None:
+    size = 0
+    with file.open(info) as source:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            sink = target.open("xb")
+        except OSError as error:
+            raise CannotWrite(out, error.strerror or str(error)) from error
+        with sink:
+            while chunk := source.read(_CHUNK_BYTES):
+                size += len(chunk)
+                if size > info.file_size:  # sizes in the directory of an archive are mere claims
+                    raise CorruptFile(archive, f"{info.filename[:100]!r} is larger than it claims to be")
+                try:
+                    sink.write(chunk)
+                except OSError as error:
+                    raise CannotWrite(out, error.strerror or str(error)) from error

@@ -1,0 +1,243 @@
+"""Observation folders: what cameras and robot report at one instant, as files that anybody can write.
+
+Layout: DIR/observation.json beside 8-bit PNGs.
+
+    {"cameras": [as in scene.json], "images": {camera: file}, "objects": [names],
+     "masks": {camera: {object: file}}, "pusher": {"position": [3]} or null, "time_s": 0}
+
+Images are RGB, linear radiance as value / 255. Masks have a single channel, in which more than 127 is the object.
+`masks`, `pusher` and `time_s` may be missing; where there are masks, an object without one is not visible in that view.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from PIL import Image
+
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName, finite_vector, shown
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.states import MAX_OBJECTS, Observation
+from osfcore.io.files import (
+    as_mapping,
+    entry_of,
+    is_text,
+    list_of,
+    read_json,
+    reading_png,
+    write_atomically,
+    write_json,
+)
+from osfcore.io.scene_file import camera_from_json, camera_to_json
+
+OBSERVATION_FILE = "observation.json"
+MAX_CAMERAS = 32  # keeps a whole observation below a gigabyte
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_GREY, _RGB, _RGBA = 0, 2, 6  # colour types of PNG
+_MASK_LEVEL = 127
+
+
+def is_observation(path: Path) -> bool:
+    """Whether a path is a folder with an observation in it."""
+    return (path / OBSERVATION_FILE).exists()
+
+
+def read_observation(folder: Path) -> Observation:
+    """The observation in a folder.
+
+    Raises:
+        CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
+    """
+    folder = Path(folder)
+    path = folder / OBSERVATION_FILE
+    if not path.is_file():
+        raise CorruptFile(folder, f"it is no folder with an {OBSERVATION_FILE}")
+    return read_json(path, lambda data: _observation(folder, data))
+
+
+def write_observation(folder: Path, observation: Observation) -> None:
+    """Write an observation; the folder counts as one only when everything is there.
+
+    Raises:
+        InvalidInput: if arrays, cameras and names do not fit each other.
+        CannotWrite: if the disk refuses.
+    """
+    _check(observation)
+    folder, path = Path(folder), Path(folder) / OBSERVATION_FILE
+    try:
+        path.unlink(missing_ok=True)  # an older one would describe a mixture
+    except OSError as error:
+        raise CannotWrite(path, error.strerror or str(error)) from error
+    content: dict[str, Any] = {
+        "cameras": [camera_to_json(camera) for camera in observation.cameras],
+        "images": {},
+        "objects": list(observation.names),
+        "pusher": None if observation.pusher is None else {"position": observation.pusher.tolist()},
+        "time_s": float(observation.time_s),
+    }
+    for view, camera in enumerate(observation.cameras):
+        content["images"][camera.name] = f"image_{view}.png"
+        pixels = np.round(np.clip(observation.images[view], 0, 1) * 255).astype(np.uint8)
+        _write_png(folder / f"image_{view}.png", pixels)
+    if observation.masks is not None:
+        content["masks"] = _write_masks(folder, observation, observation.masks)
+    write_json(path, content)
+
+
+def _write_masks(
+    folder: Path, observation: Observation, masks: Bool[np.ndarray, "V N h w"]
+) -> dict[str, dict[str, str]]:
+    """Write what is not empty; return the names of the files."""
+    files: dict[str, dict[str, str]] = {}
+    for view, camera in enumerate(observation.cameras):
+        seen = [number for number in range(len(observation.names)) if masks[view, number].any()]
+        files[camera.name] = {observation.names[number]: f"mask_{view}_{number}.png" for number in seen}
+        for number in seen:
+            _write_png(folder / f"mask_{view}_{number}.png", masks[view, number].astype(np.uint8) * 255)
+    return files
+
+
+def _write_png(path: Path, pixels: UInt8[np.ndarray, "h w *c"]) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    write_atomically(path, buffer.getvalue())
+
+
+def _check(observation: Observation) -> None:
+    _check_cameras(observation.cameras)
+    _check_objects(observation.names)
+    camera, views, count = observation.cameras[0], len(observation.cameras), len(observation.names)
+    shapes = {"images": (views, camera.height, camera.width, 3)}
+    if observation.masks is not None:
+        shapes["masks"] = (views, count, camera.height, camera.width)
+    for name, shape in shapes.items():
+        array = getattr(observation, name)
+        if array.shape != shape or not np.all(np.isfinite(array)):
+            raise InvalidInput(f"shape of the {name}", array.shape, f"{shape}, with finite numbers")
+    if observation.pusher is not None:
+        finite_vector(observation.pusher, 3, "pusher position [m]")
+    _time(float(observation.time_s))
+
+
+def _observation(folder: Path, data: object) -> Observation:
+    root = as_mapping(data, "observation")
+    cameras = tuple(camera_from_json(entry) for entry in list_of(root, "cameras", "observation"))
+    _check_cameras(cameras)
+    names = tuple(list_of(root, "objects", "observation"))
+    _check_objects(names)
+    files = as_mapping(entry_of(root, "images", "observation"), "images")
+    _check_known("camera", files, {camera.name for camera in cameras})
+    taken = [str(entry_of(files, camera.name, "images")) for camera in cameras]
+    if len(set(taken)) != len(taken):
+        raise InvalidInput("files of the images", ", ".join(taken), "all different")
+    images = np.stack([_read_image(folder, files[camera.name], camera) for camera in cameras])
+    masks = None if root.get("masks") is None else _read_masks(folder, root["masks"], cameras, names)
+    pusher = None
+    if root.get("pusher") is not None:
+        position = entry_of(as_mapping(root["pusher"], "pusher"), "position", "pusher")
+        pusher = finite_vector(position, 3, "pusher position [m]")
+    return Observation(cameras, images, names, masks, pusher, _time(root.get("time_s", 0.0)))
+
+
+def _check_cameras(cameras: tuple[Camera, ...]) -> None:
+    if not 1 <= len(cameras) <= MAX_CAMERAS:
+        raise InvalidInput("number of cameras", len(cameras), f"between 1 and {MAX_CAMERAS}")
+    names = [camera.name for camera in cameras]
+    if len(set(names)) != len(names):
+        raise InvalidInput("names of the cameras", ", ".join(names), "all different")
+    sizes = [f"{camera.width} x {camera.height}" for camera in cameras]
+    if len(set(sizes)) != 1:
+        raise InvalidInput("sizes of the cameras [px]", ", ".join(sizes), "the same")
+
+
+def _check_objects(names: tuple[Any, ...]) -> None:
+    if not 1 <= len(names) <= MAX_OBJECTS:
+        raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
+    if not all(isinstance(name, str) and name for name in names):
+        raise InvalidInput("objects", list(names), "a list of names")
+    if len(set(names)) != len(names):
+        raise InvalidInput("list of objects", ", ".join(names), "without repetition")
+
+
+def _check_known(kind: str, given: Mapping[str, Any], known: set[str]) -> None:
+    for name in given:
+        if name not in known:
+            raise UnknownName(kind, name, known)
+
+
+def _time(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e300:  # also for NaN
+        raise InvalidInput("time_s", shown(repr(value)), "a finite number of at least 0")
+    return float(value)
+
+
+def _read_image(folder: Path, file: object, camera: Camera) -> Float32[np.ndarray, "h w 3"]:
+    path = _inside(folder, file, f"image of camera {shown(camera.name)}")
+    pixels = _read_png(path, camera, {_RGB: (8,), _RGBA: (8,)}, "8-bit RGB")
+    if pixels.shape[2:] == (4,) and pixels[..., 3].min() < 255:
+        raise CorruptFile(path, "it is partly transparent; 8-bit RGB is expected")
+    return pixels[..., :3].astype(np.float32) / 255
+
+
+def _read_masks(
+    folder: Path, data: object, cameras: tuple[Camera, ...], names: tuple[str, ...]
+) -> Bool[np.ndarray, "V N h w"]:
+    by_camera = as_mapping(data, "masks")
+    _check_known("camera", by_camera, {camera.name for camera in cameras})
+    masks = np.zeros((len(cameras), len(names), cameras[0].height, cameras[0].width), bool)
+    for view, camera in enumerate(cameras):
+        files = as_mapping(by_camera.get(camera.name, {}), f"masks of camera {shown(camera.name)}")
+        _check_known("object", files, set(names))
+        for name, file in files.items():
+            path = _inside(folder, file, f"mask of {shown(name)} for camera {shown(camera.name)}")
+            pixels = _read_png(path, camera, {_GREY: (1, 8)}, "8-bit grey, a single channel without transparency,")
+            masks[view, names.index(name)] = pixels > _MASK_LEVEL
+    return masks
+
+
+def _inside(folder: Path, file: object, what: str) -> Path:
+    """Where a file that observation.json names lies: inside the folder, whatever the name says."""
+    allowed = "a file name without '..', relative to the folder"
+    if not isinstance(file, str) or not file or "\0" in file or not is_text(file):
+        raise InvalidInput(what, shown(repr(file)), allowed)
+    if Path(file).is_absolute() or ".." in Path(file).parts or "\\" in file:
+        raise InvalidInput(what, shown(repr(file)), allowed)
+    path = folder / file
+    try:
+        is_inside = path.resolve().is_relative_to(folder.resolve())
+        is_there = path.is_file()
+    except (OSError, RuntimeError):  # loops of links, names that are too long
+        is_inside, is_there = True, False
+    if not is_inside:
+        raise InvalidInput(what, shown(repr(file)), "inside the folder, not a link that leads out of it")
+    if not is_there:
+        raise CorruptFile(folder / shown(file), f"there is no such file, but {OBSERVATION_FILE} names it as {what}")
+    return path
+
+
+def _read_png(
+    path: Path, camera: Camera, kinds: Mapping[int, tuple[int, ...]], expected: str
+) -> UInt8[np.ndarray, "h w *c"]:
+    """The pixels of a PNG; its header is judged before anything is decoded.
+
+    Pillow would turn 16 bits into 8 and hand out a palette's indices without a word, so the header itself is asked.
+    """
+    with reading_png(path, "it is no readable PNG: truncated or damaged"):
+        with path.open("rb") as file:
+            head = file.read(26)
+        if len(head) < 26 or not head.startswith(_PNG_SIGNATURE) or head[12:16] != b"IHDR":
+            raise CorruptFile(path, "it is no PNG")
+        width, height, depth, colour = struct.unpack(">IIBB", head[16:])
+        if (width, height) != (camera.width, camera.height):
+            wanted = f"{camera.width} x {camera.height} px as camera {shown(camera.name)}"
+            raise CorruptFile(path, f"it is {width} x {height} px; {wanted} is expected")
+        if depth not in kinds.get(colour, ()):
+            raise CorruptFile(path, f"it has {depth} bits and colour type {colour} of PNG; {expected} is expected")
+        with Image.open(path, formats=["PNG"]) as image:
+            return np.array(image.convert("L") if colour == _GREY else image, np.uint8)

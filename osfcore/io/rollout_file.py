@@ -1,0 +1,58 @@
+"""actions.json and rollouts.json: what to try, and what would come of it.
+
+actions.json   {"actions": K x T x 3 [m/s], "step_s": 0.2}
+rollouts.json  {"names": [N], "positions": K x (T+1) x N x 3 [m], "quaternions": K x (T+1) x N x 4,
+"pusher": K x (T+1) x 3 [m], "step_s": 0.2}
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import InvalidInput, shown
+from osfcore.geometry.rollouts import Rollouts, check_actions
+from osfcore.geometry.workspace import STEP_S
+from osfcore.io.files import as_mapping, entry_of, read_json, write_json
+
+_DIGITS = 9  # nanometres
+
+
+def actions_from_json(data: object) -> Float[np.ndarray, "K T 3"]:
+    """The sequences of actions of parsed JSON [m/s].
+
+    Raises:
+        InvalidInput: if something is missing or out of range; the message names it.
+    """
+    root = as_mapping(data, "actions file")
+    step = root.get("step_s", STEP_S)
+    if isinstance(step, bool) or step != STEP_S:
+        raise InvalidInput("step_s", shown(repr(step)), f"{STEP_S}: every action is held that long")
+    return check_actions(entry_of(root, "actions", "the actions file"))
+
+
+def read_actions(path: Path) -> Float[np.ndarray, "K T 3"]:
+    """The sequences of actions in a file [m/s].
+
+    Raises:
+        CorruptFile: if it cannot be read or holds no actions within the limits; the message says why.
+    """
+    return read_json(path, actions_from_json)
+
+
+def rollouts_to_json(rollouts: Rollouts) -> dict[str, Any]:
+    """Rollouts as plain lists and numbers."""
+    arrays = {key: np.round(getattr(rollouts, key), _DIGITS).tolist() for key in ("positions", "quaternions", "pusher")}
+    return {"names": list(rollouts.names), **arrays, "step_s": STEP_S}
+
+
+def write_rollouts(path: Path, rollouts: Rollouts) -> None:
+    """Write rollouts; the file appears only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_json(path, rollouts_to_json(rollouts))

@@ -1,0 +1,79 @@
+"""Errors of images: PSNR and SSIM, over whole images or masks.
+
+Images hold linear radiance in [0, 1]; a mean over images is the mean of each image's figure, never of pooled pixels.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from osfcore.errors import InvalidInput
+
+MASK_MARGIN_PX = 2
+MOST_DB = 100.0
+_SSIM_SIDE, _SSIM_SIGMA = 11, 1.5
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+
+
+def psnr(
+    truth: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """Peak signal-to-noise ratio for values in [0, 1]: -10 log10(MSE) [dB].
+
+    The MSE is the mean over the pixels of the mask and the three colours. A difference of d everywhere gives
+    -20 log10(d). Equal images would give infinity; they get 100 dB, so that means stay finite.
+
+    Raises:
+        InvalidInput: if shapes differ, or the mask has no pixel.
+    """
+    _same_shape(truth, image)
+    error = (truth.astype(np.float64) - image) ** 2
+    if mask is not None:
+        if mask.shape != truth.shape[:2] or not mask.any():
+            raise InvalidInput(
+                "mask", f"of shape {mask.shape} with {int(mask.sum())} pixels", "as the image, not empty"
+            )
+        error = error[mask]
+    return float(-10 * np.log10(max(float(error.mean()), 10 ** (-MOST_DB / 10))))
+
+
+def ssim(truth: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"]) -> float:
+    """Structural similarity (Wang et al., 2004), 1 for equal images.
+
+    As in the paper: Gaussian window of 11 x 11 px with sigma 1.5 px, K1 = 0.01, K2 = 0.03, values in [0, 1]; the mean
+    over the colours and all windows that lie inside the image.
+
+    Raises:
+        InvalidInput: if shapes differ, or a side is shorter than 11 px.
+    """
+    _same_shape(truth, image)
+    if min(truth.shape[:2]) < _SSIM_SIDE:
+        raise InvalidInput("sides of the images [px]", truth.shape[:2], f"at least {_SSIM_SIDE}")
+    x, y = truth.astype(np.float64), image.astype(np.float64)
+    mean_x, mean_y = _window_mean(x), _window_mean(y)
+    var_x = _window_mean(x * x) - mean_x**2
+    var_y = _window_mean(y * y) - mean_y**2
+    covariance = _window_mean(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + _SSIM_C1) / (mean_x**2 + mean_y**2 + _SSIM_C1)
+    structure = (2 * covariance + _SSIM_C2) / (var_x + var_y + _SSIM_C2)
+    return float((luminance * structure).mean())
+
+
+def dilated(mask: Bool[np.ndarray, "h w"], margin_px: int = MASK_MARGIN_PX) -> Bool[np.ndarray, "h w"]:
+    """The mask, grown by some pixels in every direction, diagonals included."""
+    kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
+    return cv2.dilate(mask.astype(np.uint8), kernel) > 0
+
+
+def _same_shape(truth: np.ndarray, image: np.ndarray) -> None:
+    if truth.shape != image.shape or truth.ndim != 3:
+        raise InvalidInput("shape of the image", image.shape, f"that of the truth, {truth.shape}")
+
+
+def _window_mean(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "y x 3"]:
+    """Weighted means over the windows that lie inside the image."""
+    blurred = cv2.GaussianBlur(image, (_SSIM_SIDE, _SSIM_SIDE), _SSIM_SIGMA)
+    edge = _SSIM_SIDE // 2
+    return blurred[edge:-edge, edge:-edge]

@@ -1,0 +1,130 @@
+"""Ways of the pusher over the table that touch nothing.
+
+The far side of an object is behind it: a pusher that can only go straight would push it the wrong way first. Ways are
+shortest paths on a grid around the objects' outlines (minimum cost paths of scikit-image), straightened where the sight
+is free. Where there is no free way, the one through the fewest cells too close to something is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from skimage.draw import line
+
+from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
+
+CELL_M = 0.005
+CLEARANCE_M = 0.006  # between the pusher's rim and what it goes around
+_SIDE = round(2 * PUSHER_REACH_M / CELL_M) + 1
+_BLOCKED = 200.0  # cost of a cell too close to something, for a start in contact must be possible
+
+
+class FreeSpace:
+    """Where the pusher's centre can be without touching anything.
+
+    Attributes:
+        clearance: between the pusher's rim and the nearest outline, for its centre on each cell of the grid [m].
+    """
+
+    clearance: Float[np.ndarray, "S S"]
+
+    def __init__(self, outlines: Sequence[Float[np.ndarray, "K 2"]]) -> None:
+        """Draw the objects.
+
+        Args:
+            outlines: of their convex parts, seen from above [m].
+        """
+        solid = np.zeros((_SIDE, _SIDE), np.uint8)
+        for outline in outlines:
+            cv2.fillConvexPoly(solid, _cells(outline)[:, ::-1].astype(np.int32), 1)
+        distance = ndimage.distance_transform_edt(solid == 0) if solid.any() else np.full(solid.shape, float(_SIDE))
+        self.clearance = CELL_M * np.asarray(distance) - PUSHER_RADIUS_M
+        self._free = self.clearance >= CLEARANCE_M
+
+    def is_free(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Whether the pusher clears everything at some places within its reach."""
+        cells = _cells(points)
+        within = np.all((cells >= 0) & (cells < _SIDE), axis=1)
+        rows = cells.clip(0, _SIDE - 1)
+        return within & self._free[rows[:, 0], rows[:, 1]]
+
+    def ways_from(self, start: Float[np.ndarray, "2"]) -> ShortestPaths:
+        """All shortest ways from a place within reach [m]."""
+        return ShortestPaths(self, start)
+
+    def cost(self) -> Float[np.ndarray, "S S"]:
+        """Of each cell of a way."""
+        return np.where(self._free, 1.0, _BLOCKED)
+
+    def sees(self, a: Int[np.ndarray, "2"], b: Int[np.ndarray, "2"]) -> bool:
+        """Whether the straight way between two cells is free, but for its ends."""
+        rows, columns = line(*a, *b)
+        return bool(self._free[rows[1:-1], columns[1:-1]].all())
+
+
+class ShortestPaths:
+    """Shortest ways from one place.
+
+    Args:
+        space: that they lead through.
+        start: where they begin [m].
+    """
+
+    def __init__(self, space: FreeSpace, start: Float[np.ndarray, "2"]) -> None:
+        from skimage.graph import MCP_Geometric
+
+        self._space, self._start = space, start
+        self._search = MCP_Geometric(space.cost())
+        self._search.find_costs(_cells(start[None]).clip(0, _SIDE - 1).tolist())
+
+    def to(self, end: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
+        """The way to a place within reach, corner by corner [m]."""
+        cells = np.array(self._search.traceback(_cells(end[None]).clip(0, _SIDE - 1)[0].tolist()))
+        corners = cells[self._corners(cells)] * CELL_M - PUSHER_REACH_M
+        return np.concatenate([self._start[None], corners[1:-1], end[None]])
+
+    def _corners(self, cells: Int[np.ndarray, "n 2"]) -> list[int]:
+        """Fewer corners: each leads to the farthest one in free sight."""
+        kept, at = [0], 0
+        while at < len(cells) - 1:
+            later = len(cells) - 1
+            while later > at + 1 and not self._space.sees(cells[at], cells[later]):
+                later = at + max((later - at) * 3 // 4, 1)
+            at = later
+            kept.append(at)
+        return kept
+
+
+def _cells(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    return np.rint((points + PUSHER_REACH_M) / CELL_M).astype(int)
+
+
+def actions_along(
+    way: Float[np.ndarray, "n 2"], horizon: int, speeds: Float[np.ndarray, "n-1"] | None = None
+) -> Float[np.ndarray, "T 3"]:
+    """Velocities that lead along a way, each leg at its share of the highest speed; at rest after its end [m/s].
+
+    Args:
+        way: corners, the first where the pusher is [m].
+        horizon: number of actions.
+        speeds: share of the highest speed on each leg, above 0; all 1 by default.
+    """
+    times = np.concatenate([[0.0], np.cumsum(_legs_s(way, speeds))])
+    moments = STEP_S * np.arange(horizon + 1)
+    places = np.stack([np.interp(moments, times, way[:, axis]) for axis in range(2)], axis=1)
+    velocity = np.diff(places, axis=0) / STEP_S
+    return np.pad(velocity, ((0, 0), (0, 1)))
+
+
+def duration_s(way: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:
+    """How long a way takes [s], each leg at its share of the highest speed."""
+    return float(_legs_s(way, speeds).sum())
+
+
+def _legs_s(way: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None) -> Float[np.ndarray, "n-1"]:
+    legs = np.abs(np.diff(way, axis=0)).max(axis=1)  # speeds are limited along each axis
+    return legs / (MAX_SPEED_M_S * (np.ones(len(legs)) if speeds is None else speeds))

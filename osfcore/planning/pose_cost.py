@@ -1,0 +1,90 @@
+"""Where objects should be, and what it costs that they are not there yet: costs by poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.poses import Pose, rotation_angle
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+
+ARM_M = 0.03  # a rotation by an angle counts as the angle times this
+_END = 2.0  # what the last state counts, against the mean over all
+
+
+class Cost(Protocol):
+    """What futures cost."""
+
+    def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
+        """The cost of each sequence; less is better."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PoseGoal:
+    """Where each object should be.
+
+    Attributes:
+        names: of the N objects.
+        poses: theirs.
+    """
+
+    names: tuple[str, ...]
+    poses: Pose
+
+    @staticmethod
+    def of(state: SceneState, moved: Mapping[str, Pose]) -> PoseGoal:
+        """Some objects elsewhere, the others where they are.
+
+        Raises:
+            InvalidInput: if an object is not in the scene.
+        """
+        for name in moved:
+            if name not in state.names:
+                raise InvalidInput("object of the goal", name, f"one of {', '.join(state.names)}")
+        return PoseGoal(state.names, state.poses).replaced(moved)
+
+    def pose(self, name: str) -> Pose:
+        """Where one object should be."""
+        return self.poses[self.names.index(name)]
+
+    def replaced(self, poses: Mapping[str, Pose]) -> PoseGoal:
+        """The goal with some objects elsewhere."""
+        every = [poses.get(name) or self.pose(name) for name in self.names]
+        positions, quaternions = ([getattr(pose, part) for pose in every] for part in ("position", "quaternion"))
+        return PoseGoal(self.names, Pose(np.array(positions), np.array(quaternions)))
+
+    def offsets_m(self, state: SceneState) -> Float[np.ndarray, "N 2"]:
+        """How far each object has to go, horizontally, in the order of the state [m]."""
+        order = [self.names.index(name) for name in state.names]
+        return self.poses.position[order, :2] - state.poses.position[:, :2]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PoseCost:
+    """Distances of all objects from where they should be, on the way and at the end [m].
+
+    Attributes:
+        goal: where that is.
+        arm_m: what a rotation by 1 rad counts [m]; 0 to leave rotations out.
+    """
+
+    goal: PoseGoal
+    arm_m: float = ARM_M
+
+    def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
+        """Sums over objects, means over time, the last moment counted more."""
+        order = [self.goal.names.index(name) for name in rollouts.names]
+        shift = rollouts.positions[:, 1:, :, :2] - self.goal.poses.position[order, :2]
+        cost = np.linalg.norm(shift, axis=-1)
+        if self.arm_m > 0:
+            target = np.broadcast_to(self.goal.poses.quaternion[order], rollouts.quaternions[:, 1:].shape)
+            cost = cost + self.arm_m * rotation_angle(rollouts.quaternions[:, 1:], target)
+        each = cost.sum(axis=2)
+        return each.mean(axis=1) + _END * each[:, -1]

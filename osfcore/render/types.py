@@ -1,0 +1,154 @@
+"""What the renderers share: scenes in, images out, the quality between them, and checks of requests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import QUATERNION_NORM_TOLERANCE, Pose, quaternion_to_matrix
+from osfcore.geometry.states import SceneState
+
+OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
+MASK_OPACITY = 0.5
+MOST_OBJECTS = 23  # and the pusher
+_FARTHEST_M = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """How carefully rays are followed.
+
+    Attributes:
+        step_voxels: distance between samples [voxels of the field].
+        min_weight: samples that show less are not coloured.
+        stop: a ray ends where less of what lies behind would show.
+        one_shadow: ask once per ray and object whether the light arrives, not at every sample.
+        shadow_voxels: distance between samples of shadow rays [voxels].
+        samples_per_side: rays per pixel, squared.
+    """
+
+    step_voxels: float = 0.5
+    min_weight: float = 1e-5
+    stop: float = 1e-4
+    one_shadow: bool = False
+    shadow_voxels: float = 0.5
+    samples_per_side: int = 1
+
+
+EXACT = Quality()
+PLANNING = Quality(step_voxels=1.0, min_weight=0.1, stop=0.03, one_shadow=True, shadow_voxels=1.5)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneBatch:
+    """B scenes with the same objects.
+
+    Attributes:
+        names: of the N objects; each one's field is looked up under this name.
+        positions: of the objects [m].
+        quaternions: (w, x, y, z), unit.
+        lights: unit vectors toward the light.
+        pusher: its centre [m]; None where there is none.
+    """
+
+    names: tuple[str, ...]
+    positions: Float[np.ndarray, "B N 3"]
+    quaternions: Float[np.ndarray, "B N 4"]
+    lights: Float[np.ndarray, "B 3"]
+    pusher: Float[np.ndarray, "B 3"] | None
+
+    def __post_init__(self) -> None:
+        """Check shapes and numbers."""
+        count, scenes = len(self.names), len(self.lights)
+        wanted = {"positions": (scenes, count, 3), "quaternions": (scenes, count, 4), "lights": (scenes, 3)}
+        if self.pusher is not None:
+            wanted["pusher"] = (scenes, 3)
+        for name, shape in wanted.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise InvalidInput(f"{name} of a batch", f"shape {array.shape}", f"finite numbers of shape {shape}")
+            if not np.all(np.abs(array) < _FARTHEST_M):  # also false for NaN
+                largest = f"{np.abs(array).max():g}"  # NaN where there is one
+                raise InvalidInput(
+                    f"largest of the {name} of a batch", largest, f"finite and below {_FARTHEST_M:g} in size"
+                )
+        for name in ("quaternions", "lights"):
+            norms = np.linalg.norm(getattr(self, name), axis=-1)
+            if not np.all(np.abs(norms - 1) < QUATERNION_NORM_TOLERANCE):
+                raise InvalidInput(f"norms of the {name} of a batch", f"{norms.min():g} to {norms.max():g}", "1")
+        if count > MOST_OBJECTS:
+            raise InvalidInput("number of objects", count, f"at most {MOST_OBJECTS}")
+
+    @staticmethod
+    def of(state: SceneState) -> SceneBatch:
+        """One scene as a batch."""
+        pusher = None if state.pusher is None else state.pusher[None]
+        return SceneBatch(
+            state.names,
+            state.poses.position[None],
+            state.poses.quaternion[None],
+            state.light.direction[None],
+            pusher,
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rendered:
+    """Images of B scenes from V cameras; what was not asked for is None.
+
+    Attributes:
+        rgb: linear radiance in [0, 1].
+        opacity: how much of each pixel shows each object.
+        masks: pixels of which an object covers half or more.
+        depth: expected distance along the camera's z axis [m]; 0 where there is nothing.
+    """
+
+    rgb: Float32[np.ndarray, "B V h w 3"]
+    opacity: Float32[np.ndarray, "B V N h w"] | None = None
+    masks: Bool[np.ndarray, "B V N h w"] | None = None
+    depth: Float32[np.ndarray, "B V h w"] | None = None
+
+
+def check_request(
+    fields: Mapping[str, KiloOSF], batch: SceneBatch, cameras: Sequence[Camera], outputs: frozenset[str] | set[str]
+) -> tuple[int, int]:
+    """Height and width of the images [px], after everything asked for was found possible.
+
+    Raises:
+        UnknownName: if an object has no field.
+        InvalidInput: if there is no camera, cameras differ in size, or an output is unknown.
+    """
+    for name in batch.names:
+        if name not in fields:
+            raise UnknownName("field", name, sorted(fields))
+    unknown = set(outputs) - OUTPUTS
+    if unknown:
+        raise InvalidInput("outputs", ", ".join(sorted(unknown)), ", ".join(sorted(OUTPUTS)))
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise InvalidInput("image sizes of the cameras", sorted(sizes), "one size for all cameras")
+    return sizes.pop()
+
+
+def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations from the world into each object's frame (B, N, 3, 3) and positions (B, N, 3), the pusher last."""
+    rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions), -1, -2)
+    positions = batch.positions
+    if batch.pusher is not None:
+        upright = np.broadcast_to(np.eye(3), (len(rotations), 1, 3, 3))
+        rotations = np.concatenate([rotations, upright], axis=1)
+        positions = np.concatenate([positions, batch.pusher[:, None]], axis=1)
+    return rotations, positions
+
+
+def camera_numbers(camera: Camera) -> Float[np.ndarray, "12"]:
+    """Position and the matrix from pixel coordinates to directions in the world."""
+    pose: Pose = camera.T_world_camera
+    matrix = quaternion_to_matrix(pose.quaternion) @ np.linalg.inv(camera.intrinsics)
+    return np.concatenate([pose.position, matrix.reshape(-1)])

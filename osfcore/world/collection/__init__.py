@@ -1,0 +1,1 @@
+"""Data collected from the simulated tabletop: image sets, observations, pushes."""

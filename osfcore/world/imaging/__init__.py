@@ -1,0 +1,1 @@
+"""Pictures of the simulated tabletop: ray tracing by Embree, and TinyRenderer."""

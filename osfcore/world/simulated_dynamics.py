@@ -1,0 +1,88 @@
+"""The simulator as a dynamics model: what the best possible predictions would be worth to a planner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts, check_actions
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
+from osfcore.objects.asset import ObjectAsset
+from osfcore.world.physics import SUBSTEPS, Physics, body_model
+from osfcore.world.placing import is_calm
+
+_SPARE_M = 0.003  # beyond its way, in which the pusher must meet nothing for an action to be skipped
+
+
+class SimulatedPushes:
+    """Predicts pushes by simulating them, one sequence after another.
+
+    While everything is at rest and the pusher only walks past, nothing is simulated. The engine remembers contacts when
+    bodies are put back, so that a sequence may end a millimetre or two from where it ends alone.
+
+    Args:
+        assets: of the objects, by name.
+    """
+
+    def __init__(self, assets: Mapping[str, ObjectAsset]) -> None:
+        self._physics = Physics({name: body_model(asset) for name, asset in assets.items()})
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self._physics.close()
+
+    def rollout(
+        self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
+    ) -> Rollouts:
+        """Where K sequences of T actions lead from a state, in which everything is at rest.
+
+        Args:
+            state: of exactly these objects, with its pusher.
+            actions: velocities of the pusher [m/s].
+            before: plays no part.
+
+        Raises:
+            InvalidInput: if actions are beyond their limits.
+        """
+        actions = check_actions(actions)
+        told = [self._follow(state, sequence) for sequence in actions]
+        positions, quaternions, pusher = (np.stack(parts) for parts in zip(*told, strict=True))
+        return Rollouts(state.names, positions, quaternions, pusher)
+
+    def _follow(
+        self, state: SceneState, actions: Float[np.ndarray, "T 3"]
+    ) -> tuple[Float[np.ndarray, "T1 N 3"], Float[np.ndarray, "T1 N 4"], Float[np.ndarray, "T1 3"]]:
+        assert state.pusher is not None
+        for n, name in enumerate(state.names):
+            self._physics.place(name, state.poses[n])
+        self._physics.place_pusher(state.pusher)
+        poses, pusher = [state.poses], [state.pusher]
+        for action in actions:
+            if self._walks_past(state.names, action):
+                poses.append(poses[-1])
+            else:
+                for _ in range(SUBSTEPS):
+                    self._physics.step(action)
+                now = [self._physics.pose(name) for name in state.names]
+                poses.append(Pose(np.array([p.position for p in now]), np.array([p.quaternion for p in now])))
+            pusher.append(self._physics.pusher)
+        return np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses]), np.stack(pusher)
+
+    def _walks_past(self, names: tuple[str, ...], action: Float[np.ndarray, "3"]) -> bool:
+        """Move the pusher if this moves nothing else; whether it was so."""
+        physics = self._physics
+        if not is_calm(physics, names):
+            return False
+        way = STEP_S * action
+        far = float(np.linalg.norm(way)) + _SPARE_M
+        if any(physics.distance(name, None, far + _SPARE_M) < far for name in names):
+            return False
+        reach = np.maximum(PUSHER_REACH_M, np.abs(physics.pusher[:2]))
+        place = physics.pusher + way
+        place[:2] = np.clip(place[:2], -reach, reach)
+        physics.place_pusher(place)
+        return True

@@ -1,0 +1,183 @@
+"""Uploading a set, training from it and from a mesh, and what the list says: with the real training, a few seconds."""
+
+import io
+import json
+import shutil
+
+import pytest
+from PIL import Image
+
+from tests.app.api.routes.test_jobs import LONG, finished
+from tests.app.api.test_problems import is_problem
+from tests.app.conftest import running, until
+from tests.app.services.test_image_sets import zipped
+from tests.core.fields.sets import write_set
+
+GELATIN = "009_gelatin_box"
+ZIP = {"Content-Type": "application/zip"}
+MINUTES = 0.1
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    return zipped(write_set(tmp_path_factory.mktemp("upload") / "mug"))
+
+
+def upload(service, data, name="mug.zip"):
+    return service.post("/api/fields/sets", params={"file_name": name}, content=data, headers=ZIP)
+
+
+def train(service, name, source, **params):
+    body = {"kind": "train_field", "params": {"name": name, "source": source, "minutes": MINUTES, **params}}
+    return service.post("/api/jobs", json=body)
+
+
+def test_an_uploaded_set_is_listed_shown_and_deleted(service, archive):
+    answer = upload(service, archive)
+    assert answer.status_code == 201
+    made = answer.json()
+    assert (made["train"], made["test"], made["file_name"]) == (12, 4, "mug.zip")
+    assert service.get(answer.headers["location"]).json() == made
+    assert made in service.get("/api/fields/sets").json()["sets"]
+    overlay = service.get(f"/api/fields/sets/{made['id']}/overlay.png")
+    assert overlay.headers["content-type"] == "image/png"
+    assert min(Image.open(io.BytesIO(overlay.content)).size) >= 32
+    assert service.delete(answer.headers["location"]).status_code == 204
+    for address in (answer.headers["location"], f"{answer.headers['location']}/overlay.png"):
+        is_problem(service.get(address), 404)
+    is_problem(service.delete(answer.headers["location"]), 404)
+
+
+def test_a_bad_set_is_refused_in_one_sentence(service, tmp_path):
+    folder = write_set(tmp_path / "bad")
+    entries = json.loads((folder / "train" / "anno.json").read_text())
+    entries[2]["light_pos"] = [0, 0, 0]
+    (folder / "train" / "anno.json").write_text(json.dumps(entries))
+    detail = is_problem(upload(service, zipped(folder)), 422)["detail"]
+    assert detail.startswith("train/anno.json cannot be used: light_pos of entry 2")
+    assert "\n" not in detail
+    is_problem(upload(service, b"no zip at all"), 422)
+
+
+def test_an_upload_may_be_larger_than_other_requests_but_not_without_end(library, tmp_path, archive):
+    assert len(archive) > 10_000
+    limits = {"max_body_bytes": 2000, "max_upload_bytes": 10_000}
+    with running(library, tmp_path / "limits", **limits) as small:
+        assert "10000 bytes" in is_problem(upload(small, archive), 413)["detail"]
+        assert is_problem(upload(small, b"x" * 9_000), 422)["detail"].startswith("The uploaded file")
+        assert "2000 bytes" in is_problem(small.post("/api/jobs", content=b"x" * 3000), 413)["detail"]
+        assert list((tmp_path / "limits" / "sets").iterdir()) == []
+
+
+def test_from_a_mesh_to_a_field_that_can_be_seen_and_deleted(service, services):
+    accepted = train(service, GELATIN, {"mesh": GELATIN}, images=60)
+    assert accepted.status_code == 202
+    assert "already" in is_problem(train(service, GELATIN, {"mesh": GELATIN}), 409)["detail"]
+    job = finished(service, accepted.headers["location"], 240)
+    assert (job["state"], job["error"]) == ("done", None)
+    assert job["done"] == job["total"] > 0
+    assert 10 < job["result"]["psnr_mask"] < job["result"]["psnr_full"] < 60
+    preview = Image.open(io.BytesIO(service.get(f"/api/jobs/{job['id']}/preview.png").content))
+    assert preview.width == 3 * preview.height
+
+    assert job["files"] == [f"{GELATIN}.json", f"{GELATIN}.safetensors", "preview.png"]
+
+    field = service.get(f"/api/fields/{GELATIN}").json()
+    assert (field["source"], field["has_mesh"], field["note"]) == ("trained", True, None)
+    assert field["label"] == "Gelatin box"
+    file = service.get(f"/api/jobs/{job['id']}/files/{GELATIN}.safetensors")
+    assert 1000 < len(file.content) == field["bytes"] < 3_000_000
+    assert field["metrics"]["psnr_mask"] == pytest.approx(job["result"]["psnr_mask"], abs=1e-3)
+    assert field in service.get("/api/fields").json()["fields"]
+    assert not (services.settings.data_dir / "training" / GELATIN).exists()
+    assert service.delete(f"/api/fields/{GELATIN}").status_code == 204
+    assert not (services.settings.data_dir / "fields" / GELATIN).exists()
+
+
+def test_from_a_set_to_a_field_that_needs_a_mesh_for_scenes(service, archive):
+    made = upload(service, archive).json()
+    accepted = train(service, "my_mug", {"set": made["id"]})
+    assert "needs image set" in is_problem(service.delete(f"/api/fields/sets/{made['id']}"), 409)["detail"]
+    job = finished(service, accepted.headers["location"], 240)
+    assert (job["state"], job["error"]) == ("done", None)
+    field = service.get("/api/fields/my_mug").json()
+    assert (field["label"], field["has_mesh"]) == ("my_mug", False)
+    assert "needs a mesh" in field["note"]
+    assert service.delete("/api/fields/my_mug").status_code == 204
+    is_problem(service.delete("/api/fields/my_mug"), 404)
+    assert service.delete(f"/api/fields/sets/{made['id']}").status_code == 204
+
+
+def test_a_cancelled_training_leaves_nothing(service, services):
+    accepted = train(service, "short", {"mesh": GELATIN}, images=5000)
+    until(lambda: "Image" in service.get(accepted.headers["location"]).json()["note"], 60)
+    is_problem(service.get(f"{accepted.headers['location']}/preview.png"), 404)
+    assert service.delete(accepted.headers["location"]).json()["state"] == "cancelled"
+    assert not (services.settings.data_dir / "training" / "short").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "words"),
+    [
+        ("../evil", {"mesh": GELATIN}, "lower-case letters"),
+        ("Mug", {"mesh": GELATIN}, "lower-case letters"),
+        ("table", {"mesh": GELATIN}, "another one"),
+        ("sets", {"mesh": GELATIN}, "another one"),
+        ("a", {"mesh": "teapot"}, "teapot"),
+        ("a", {"mesh": "025_mug"}, "osf assets fetch"),
+        ("a", {"set": "none"}, "no image set named 'none'"),
+        ("a", {"set": "../../x"}, "no image set"),
+        ("a", {}, "either mesh or set"),
+        ("a", {"mesh": GELATIN, "set": "b"}, "either mesh or set"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_at_once(service, name, source, words):
+    assert words in is_problem(train(service, name, source), 422)["detail"]
+
+
+def test_missing_fields_and_previews_are_not_found(service):
+    is_problem(service.get("/api/fields/none"), 404)
+    is_problem(service.delete("/api/fields/none"), 404)
+    is_problem(service.get("/api/fields/..%2f..%2fservice.sqlite3"), 404)
+    is_problem(service.get("/api/jobs/none/preview.png"), 404)
+    job = service.post("/api/jobs", json=LONG).json()
+    assert "training a field" in is_problem(service.get(f"/api/jobs/{job['id']}/preview.png"), 404)["detail"]
+    service.delete(f"/api/jobs/{job['id']}")
+
+
+@pytest.mark.parametrize(
+    "metrics", ['{"device": "\\ud800"}', '{"recipe": ' + "[" * 900 + "]" * 900 + "}", '{"psnr_full": NaN}']
+)
+def test_odd_metrics_do_not_hide_the_fields(service, services, metrics):
+    folder = services.settings.data_dir / "fields" / "odd"
+    folder.mkdir(parents=True)
+    (folder / "field.safetensors").write_bytes(b"weights")
+    (folder / "field.json").write_text(metrics)
+    answer = service.get("/api/fields")
+    assert answer.status_code == 200
+    (found,) = [field for field in answer.json()["fields"] if field["name"] == "odd"]
+    assert found["metrics"] == {}
+    assert service.delete("/api/fields/odd").status_code == 204
+
+
+def test_damaged_sets_do_not_hide_the_list(service, services):
+    folder = services.settings.data_dir / "sets" / "odd"
+    folder.mkdir(parents=True)
+    (folder / "set.json").write_text(
+        '{"id": 1, "file_name": 2, "created_at": 3, "train": "a", "test": [], "summary": {}}'
+    )
+    assert service.get("/api/fields/sets").status_code == 200
+    shutil.rmtree(folder)
+
+
+def test_what_lies_in_the_data_directory_is_listed(service, services, archive):
+    made = upload(service, archive).json()
+    job = finished(service, train(service, "one", {"set": made["id"]}).headers["location"], 240)
+    assert job["state"] == "done"
+    fields = services.settings.data_dir / "fields"
+    shutil.copytree(fields / "one", fields / "two")
+    names = [field["name"] for field in service.get("/api/fields").json()["fields"]]
+    assert {"one", "two"} <= set(names)
+    for name in ("one", "two"):
+        service.delete(f"/api/fields/{name}")
+    service.delete(f"/api/fields/sets/{made['id']}")

@@ -1,0 +1,259 @@
+"""Goals as a program makes them: photos, layouts by hand and at random, and the draft that all visitors share."""
+
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from app.api.app_factory import create_app
+from app.services.service_settings import Settings
+from osfcore.geometry.cameras import goal_camera
+from osfcore.io.scene_file import camera_to_json
+from tests.app.api.routes.test_jobs import LONG
+from tests.app.api.test_problems import is_problem
+from tests.app.conftest import until
+from tests.app.services.test_goals import photo
+
+BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"
+PNG = {"Content-Type": "image/png"}
+
+
+@pytest.fixture(autouse=True)
+def tidy(service):
+    """Goals are few, so each test removes its own."""
+    before = {goal["id"] for goal in service.get("/api/goals").json()["goals"]}
+    yield
+    for goal in service.get("/api/goals").json()["goals"]:
+        if goal["id"] not in before:
+            service.delete(f"/api/goals/{goal['id']}")
+    service.delete("/api/goals/draft")
+
+
+def upload(service, data, headers=PNG, **params):
+    return service.post("/api/goals", content=data, headers=headers, params=params)
+
+
+def pixels(answer):
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "image/png"
+    return np.asarray(Image.open(io.BytesIO(answer.content)).convert("RGB"), float)
+
+
+def aside(entry, x_m):
+    """Where an object is, and a little to the side."""
+    x, y, z = entry["position"]
+    return {"name": entry["name"], "position": [x + x_m, y, z], "quaternion": entry["quaternion"]}
+
+
+def changed(before, after):
+    """Objects that lie elsewhere."""
+    apart = {one["name"]: np.array(one["position"]) for one in before["objects"]}
+    return {one["name"] for one in after["objects"] if np.linalg.norm(apart[one["name"]] - one["position"]) > 0.01}
+
+
+@pytest.fixture
+def held(service, services, scene):
+    """The scene, while a job drives it."""
+    job = service.post("/api/jobs", json=LONG).json()
+    until(lambda: service.get(f"/api/jobs/{job['id']}").json()["done"] > 0)
+    services.runner.jobs._jobs[job["id"]].params["scene"] = scene["id"]
+    yield scene
+    service.delete(f"/api/jobs/{job['id']}")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_a_photo_is_kept_as_it_looks(service, kind):
+    made = upload(service, photo(640, 640, kind), {"Content-Type": f"image/{kind.lower()}"}, name="From above")
+    assert made.status_code == 201
+    goal = made.json()
+    assert made.headers["location"] == f"/api/goals/{goal['id']}"
+    assert (goal["name"], goal["source"], goal["scene"], goal["objects"]) == ("From above", "upload", None, None)
+    assert (goal["width"], goal["height"], goal["camera"]["name"]) == (512, 512, "goal")
+    assert service.get(made.headers["location"]).json() == goal == service.get("/api/goals").json()["goals"][0]
+    seen = pixels(service.get(f"{made.headers['location']}/image.png"))
+    assert seen.shape == (512, 512, 3)
+    assert np.abs(seen.mean(axis=(0, 1)) - [200, 100, 50]).max() < 4
+    assert service.delete(made.headers["location"]).status_code == 204
+    is_problem(service.get(made.headers["location"]), 404)
+
+
+def test_a_photo_may_bring_its_own_camera(service):
+    camera = camera_to_json(replace(goal_camera(96), name="mine", height=64))
+    goal = upload(service, photo(96, 64), camera=json.dumps(camera)).json()
+    assert (goal["width"], goal["height"], goal["camera"]["name"]) == (96, 64, "mine")
+    assert "96 x 64" in is_problem(upload(service, photo(96, 64)), 422)["detail"]
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        "",
+        "{",
+        "[]",
+        "5",
+        "null",
+        "{}",
+        "[" * 3000,
+        "9" * 3999,
+        '{"name": "\\ud800"}',
+        json.dumps({**camera_to_json(goal_camera(64)), "width": 10**30}),
+        json.dumps({**camera_to_json(goal_camera(64)), "width": True}),
+        json.dumps({**camera_to_json(goal_camera(64)), "height": -64}),
+        json.dumps({**camera_to_json(goal_camera(64)), "K": [[1e999, 0, 0], [0, 1, 0], [0, 0, 1]]}),
+        json.dumps({**camera_to_json(goal_camera(64)), "K": [[0, 0, 0], [0, 0, 0], [0, 0, 0]]}),
+        json.dumps({**camera_to_json(goal_camera(64)), "T_world_camera": [[0] * 4] * 4}),
+    ],
+    ids=lambda text: text[:12],
+)
+def test_a_camera_that_makes_no_sense_is_refused(service, camera):
+    is_problem(upload(service, photo(), camera=camera), 422)
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "words"),
+    [
+        ({"content": b"GIF89a", "headers": PNG}, 422, "neither a PNG nor a JPEG"),
+        ({"content": photo()[:100], "headers": PNG}, 422, "damaged or incomplete"),
+        ({"content": photo(31, 31), "headers": PNG}, 422, "31 x 31"),
+        ({"content": b"", "headers": PNG}, 422, "photo"),
+        ({"content": photo(), "headers": PNG, "params": {"name": ""}}, 422, "name"),
+        ({"content": photo(), "headers": PNG, "params": {"name": "x" * 101}}, 422, "name"),
+        ({"content": photo(), "headers": {"Content-Type": "image/gif"}}, 415, "image/png or image/jpeg"),
+        ({"content": photo()}, 415, "untyped"),
+        ({"json": {}}, 422, "either objects or random"),
+        ({"json": {"random": {}, "objects": []}}, 422, "#/objects"),
+        ({"json": {"random": {"moved": 3}}}, 422, "between 1 and 2"),
+        ({"json": {"random": {}, "scene": "nowhere"}}, 422, "nowhere"),
+        ({"json": {"random": {}, "light": {"position": [1, 0, 0]}}}, 422, "light"),
+        ({"content": b"{", "headers": {"Content-Type": "application/json"}}, 422, "JSON"),
+        ({"content": b"0" * (5 << 20), "headers": {"Content-Type": "application/json"}}, 413, "larger"),
+        ({"content": b"0" * (21 << 20), "headers": PNG}, 413, "larger"),
+    ],
+)
+def test_mistakes_are_told(service, scene, request_, status, words):
+    assert words in is_problem(service.post("/api/goals", **request_), status)["detail"]
+    assert service.get(f"/api/scenes/{scene['id']}").json() == scene
+
+
+def test_a_layout_by_hand_becomes_a_goal_and_the_scene_stays(service, scene):
+    body = {"objects": [aside(scene["objects"][0], 0.1)], "name": "Aside"}
+    made = service.post("/api/goals", json=body)
+    assert made.status_code == 201
+    goal = made.json()
+    assert (goal["source"], goal["scene"], goal["name"]) == ("composed", scene["id"], "Aside")
+    assert changed(scene, goal) == {scene["objects"][0]["name"]}
+    assert service.get(f"/api/scenes/{scene['id']}").json() == scene
+    view = service.get(f"/api/scenes/{scene['id']}/images/goal.png", params={"size": goal["width"]})
+    assert np.abs(pixels(view) - pixels(service.get(f"{made.headers['location']}/image.png"))).max() > 50
+
+
+def test_a_random_goal_moves_as_many_as_asked_under_any_light(service, scene):
+    plain, dark = (
+        service.post("/api/goals", json={"random": {"seed": 4, "moved": 1}, **light}).json()
+        for light in ({}, {"light": {"position": [0.5, 0.5, 0.3]}})
+    )
+    assert plain["source"] == "drawn"
+    assert len(changed(scene, plain)) == 1
+    assert changed(plain, dark) == set()
+    one, other = (pixels(service.get(f"/api/goals/{goal['id']}/image.png")) for goal in (plain, dark))
+    assert np.abs(one - other).mean() > 1
+    assert service.get(f"/api/scenes/{scene['id']}").json() == scene
+
+
+@pytest.mark.parametrize(
+    ("objects", "words"),
+    [
+        (lambda box, bottle: [{**box, "position": bottle["position"]}], "verlap"),
+        (lambda box, _: [{**box, "position": [5, 0, 0.1]}], "over the table"),
+        (lambda box, _: [{**box, "name": "teapot"}], "teapot"),
+        (lambda box, _: [{**box, "quaternion": [0, 0, 0, 0]}], "unit quaternion"),
+        (lambda box, _: [box, box], "without repetition"),
+    ],
+)
+def test_layouts_that_cannot_be_are_refused_and_nothing_moves(service, scene, objects, words):
+    body = {"objects": objects(*(aside(entry, 0.0) for entry in scene["objects"]))}
+    assert words in is_problem(service.post("/api/goals", json=body), 422)["detail"]
+    assert service.get(f"/api/scenes/{scene['id']}").json() == scene
+
+
+def test_a_draft_is_laid_out_looked_at_and_kept(service, scene):
+    is_problem(service.get("/api/goals/draft"), 404)
+    begun = service.post("/api/goals/draft", json={})
+    assert begun.status_code == 201
+    draft = begun.json()
+    assert (draft["scene"], draft["problem"], draft["revision"]) == (scene["id"], "", 1)
+    assert changed(scene, draft) == set()
+    assert all(entry["label"] for entry in draft["objects"])
+    before = pixels(service.get("/api/goals/draft/image.png?v=1"))
+
+    patch = {"objects": [aside(scene["objects"][0], 0.1)]}
+    moved = service.patch("/api/goals/draft", json=patch).json()
+    assert changed(scene, moved) == {scene["objects"][0]["name"]}
+    assert np.abs(pixels(service.get("/api/goals/draft/image.png?v=2")) - before).max() > 50
+    assert service.get("/api/goals/draft").json() == moved
+
+    kept = service.post("/api/goals/draft/save", json={"name": "By hand"})
+    assert kept.status_code == 201
+    assert kept.headers["location"] == f"/api/goals/{kept.json()['id']}"
+    assert changed(moved, kept.json()) == set()
+    assert service.get("/api/goals").json()["goals"][0] == kept.json()
+    is_problem(service.get("/api/goals/draft"), 404)
+    assert service.get(f"/api/scenes/{scene['id']}").json() == scene
+
+
+def test_a_draft_tells_its_problem_until_it_is_gone(service, scene):
+    service.post("/api/goals/draft", json={"scene": scene["id"]})
+    box, bottle = scene["objects"]
+    into = {**aside(box, 0.0), "position": bottle["position"]}
+    bad = service.patch("/api/goals/draft", json={"objects": [into]})
+    assert bad.status_code == 200
+    assert "verlap" in bad.json()["problem"]
+    assert bad.json()["objects"][0]["position"] == bottle["position"]
+    assert "verlap" in is_problem(service.post("/api/goals/draft/save", json={}), 409)["detail"]
+    pixels(service.get("/api/goals/draft/image.png"))
+    good = service.patch("/api/goals/draft", json={"objects": [aside(box, 0.1)]}).json()
+    assert good["problem"] == ""
+    assert good["revision"] > bad.json()["revision"]
+
+
+def test_without_a_draft_there_is_nothing_to_change(service, scene):
+    patch = {"objects": [aside(scene["objects"][0], 0.0)]}
+    is_problem(service.patch("/api/goals/draft", json=patch), 404)
+    is_problem(service.post("/api/goals/draft/save", json={}), 404)
+    is_problem(service.get("/api/goals/draft/image.png"), 404)
+    assert service.delete("/api/goals/draft").status_code == 204
+    service.post("/api/goals/draft", json={})
+    for objects in ([{**patch["objects"][0], "name": "teapot"}], [{**patch["objects"][0], "quaternion": [9, 0, 0, 0]}]):
+        is_problem(service.patch("/api/goals/draft", json={"objects": objects}), 422)
+    assert service.get("/api/goals/draft").json()["revision"] == 1
+    assert service.delete("/api/goals/draft").status_code == 204
+    is_problem(service.get("/api/goals/draft"), 404)
+
+
+def test_a_scene_that_a_job_drives_is_left_alone(service, held):
+    for method, address, body in (
+        ("post", "/api/goals", {"random": {}}),
+        ("post", "/api/goals", {"objects": [aside(held["objects"][0], 0.1)]}),
+        ("post", "/api/goals/draft", {}),
+    ):
+        assert "pause or cancel" in is_problem(getattr(service, method)(address, json=body), 409)["detail"]
+    assert upload(service, photo()).status_code == 201  # has nothing to do with it
+
+
+@pytest.mark.parametrize(("method", "tail"), [("get", ""), ("delete", ""), ("get", "/image.png")])
+def test_missing_goals_are_not_found(service, services, method, tail):
+    is_problem(getattr(service, method)(f"/api/goals/none{tail}"), 404)
+    goal = upload(service, photo()).json()
+    services.goals.image(goal["id"]).unlink()
+    is_problem(service.get(f"/api/goals/{goal['id']}/image.png"), 404)
+
+
+def test_photos_may_be_larger_than_other_bodies():
+    limit_of = next(
+        own.kwargs["limit_of"] for own in create_app(Settings()).user_middleware if "limit_of" in own.kwargs
+    )
+    assert limit_of("/api/goals") == limit_of("/api/goals/") == Settings().max_photo_bytes
+    assert limit_of("/api/goals/draft") == limit_of("/api/episodes") == Settings().max_body_bytes

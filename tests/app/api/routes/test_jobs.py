@@ -1,0 +1,87 @@
+import io
+import json
+import zipfile
+
+import h5py
+import pytest
+
+from tests.app.api.test_problems import is_problem
+from tests.app.conftest import until
+
+TABLE = {"kind": "collect_table", "params": {"images": 60, "size": 16}}
+LONG = {"kind": "collect_pushes", "params": {"episodes": 100_000, "steps": 2, "objects": 1}}
+
+
+def finished(service, address, timeout_s=60):
+    def is_over():
+        job = service.get(address).json()
+        return job if job["state"] in ("done", "failed", "cancelled") else None
+
+    return until(is_over, timeout_s)
+
+
+def test_a_collection_runs_to_its_end_and_can_be_downloaded(service):
+    accepted = service.post("/api/jobs", json=TABLE)
+    assert accepted.status_code == 202
+    assert accepted.json()["state"] in ("queued", "running")
+    job = finished(service, accepted.headers["location"])
+    assert (job["state"], job["done"], job["total"], job["error"]) == ("done", 60, 60, None)
+    assert job["files"] == ["table.zip"]
+    file = service.get(f"/api/jobs/{job['id']}/files/table.zip")
+    names = zipfile.ZipFile(io.BytesIO(file.content)).namelist()
+    assert {"table/train/anno.json", "table/test/anno.json"} <= set(names)
+    annotations = json.loads(zipfile.ZipFile(io.BytesIO(file.content)).read("table/test/anno.json"))
+    assert annotations[0]["resolution"] == 16
+    is_problem(service.get(f"/api/jobs/{job['id']}/files/anno.json"), 404)
+    is_problem(service.get(f"/api/jobs/{job['id']}/files/..%2f..%2fservice.sqlite3"), 404)
+    is_problem(service.delete(accepted.headers["location"]), 409)
+
+
+def test_pushes_end_in_one_file(service):
+    body = {"kind": "collect_pushes", "params": {"episodes": 2, "steps": 3, "objects": 2, "seed": 1}}
+    job = finished(service, service.post("/api/jobs", json=body).headers["location"])
+    assert (job["state"], job["files"]) == ("done", ["pushes.h5"])
+    assert 0 <= job["result"]["contact_share"] <= 1
+    with h5py.File(io.BytesIO(service.get(f"/api/jobs/{job['id']}/files/pushes.h5").content)) as file:
+        assert len(file.keys()) > 0
+
+
+def test_one_runs_the_rest_wait_with_their_places(service, services):
+    first = service.post("/api/jobs", json=LONG).json()
+    until(lambda: service.get(f"/api/jobs/{first['id']}").json()["done"] > 0)
+    second, third = (service.post("/api/jobs", json=TABLE).json() for _ in range(2))
+    assert (second["position"], third["position"]) == (1, 2)
+    listed = [job["id"] for job in service.get("/api/jobs").json()["jobs"][:3]]
+    assert listed == [third["id"], second["id"], first["id"]]
+
+    assert service.delete(f"/api/jobs/{second['id']}").json()["state"] == "cancelled"
+    assert service.get(f"/api/jobs/{third['id']}").json()["position"] == 1
+    is_problem(service.post(f"/api/jobs/{third['id']}/pause"), 409)
+
+    assert service.post(f"/api/jobs/{first['id']}/pause").json()["state"] == "paused"
+    is_problem(service.post(f"/api/jobs/{first['id']}/pause"), 409)
+    assert service.post(f"/api/jobs/{first['id']}/resume").json()["state"] == "running"
+    ended = service.delete(f"/api/jobs/{first['id']}").json()
+    assert (ended["state"], ended["files"]) == ("cancelled", [])
+    assert not services.runner.jobs.folder(first["id"]).exists()
+    assert finished(service, f"/api/jobs/{third['id']}")["state"] == "done"
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"kind": "dance"}, "kind"),
+        ({"kind": "collect_object", "params": {"name": "teapot"}}, "teapot"),
+        ({"kind": "collect_object", "params": {"name": "025_mug"}}, "osf assets fetch"),
+        ({"kind": "collect_object", "params": {"name": "006_mustard_bottle", "images": 10}}, "images"),
+        ({"kind": "collect_pushes", "params": {"objects": 8}}, "at most 5"),
+        ({"kind": "fetch_assets", "params": {"names": ["teapot"]}}, "teapot"),
+    ],
+)
+def test_what_cannot_be_is_refused_at_once(service, body, words):
+    assert words in is_problem(service.post("/api/jobs", json=body), 422)["detail"]
+
+
+@pytest.mark.parametrize(("method", "tail"), [("get", ""), ("delete", ""), ("post", "/pause"), ("get", "/files/x")])
+def test_missing_jobs_are_not_found(service, method, tail):
+    is_problem(getattr(service, method)(f"/api/jobs/none{tail}"), 404)

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+
+from app.services.presets import PRESETS, preset
+from osfcore.errors import OsfError
+from tests.app.api.test_problems import is_problem
+
+
+@pytest.fixture
+def made(service):
+    made = service.post("/api/presets/pair")
+    yield made
+    service.delete(f"/api/scenes/{made.json()['scene']['id']}")
+    service.delete(f"/api/goals/{made.json()['goal']['id']}")
+
+
+def test_all_are_listed_with_what_is_missing_for_them(service, library):
+    listed = service.get("/api/presets").json()["presets"]
+    assert [one["id"] for one in listed] == [one.id for one in PRESETS]
+    for told, one in zip(listed, PRESETS, strict=True):
+        assert (told["title"], told["text"], told["objects"]) == (one.title, one.text, len(one.objects))
+        assert told["missing"] == [name for name in one.objects if not library.has(name)]
+        if told["image"] is not None:
+            assert service.get(f"/{told['image']}").headers["content-type"] == "image/webp"
+    assert [one["id"] for one in listed if one["missing"] == []] != []
+
+
+def test_a_preset_becomes_the_scene_that_is_shown_and_its_goal(service, services, made):
+    one = preset("pair")
+    assert made.status_code == 201
+    scene, goal = made.json()["scene"], made.json()["goal"]
+    assert services.runner.current == scene["id"]
+    assert [entry["name"] for entry in scene["objects"]] == list(one.objects)
+    np.testing.assert_allclose(scene["light"]["position"], one.light.position, atol=1e-9)
+    assert (goal["scene"], goal["name"], goal["source"]) == (scene["id"], one.title, "drawn")
+    assert service.get(f"/api/goals/{goal['id']}").json() == goal
+    here, there = (np.array([entry["position"] for entry in it["objects"]]) for it in (scene, goal))
+    assert (np.linalg.norm(here - there, axis=1) > 0.05).sum() == one.moved
+
+
+def test_the_same_preset_is_the_same_table_again(service, made):
+    again = service.post("/api/presets/pair").json()
+    for part in ("scene", "goal"):
+        assert again[part]["id"] != made.json()[part]["id"]
+        for here, there in zip(again[part]["objects"], made.json()[part]["objects"], strict=True):
+            np.testing.assert_allclose(here["position"], there["position"], atol=1e-6)
+        service.delete(f"/api/{part}s/{again[part]['id']}")
+
+
+def test_what_cannot_be_made_is_told_and_leaves_nothing(service, services, monkeypatch):
+    is_problem(service.post("/api/presets/seventh"), 404)
+    missing = next(one for one in PRESETS if set(one.objects) - set(services.shelf.names()))
+    before = service.get("/api/scenes").json()
+    assert "osf assets fetch" in is_problem(service.post(f"/api/presets/{missing.id}"), 422)["detail"]
+
+    def refuse(*_):
+        raise OsfError("There is no room.")
+
+    monkeypatch.setattr(services.goals, "draw", refuse)
+    assert is_problem(service.post("/api/presets/pair"), 422)["detail"] == "There is no room."
+    assert service.get("/api/scenes").json()["scenes"] == before["scenes"]

@@ -1,0 +1,90 @@
+from dataclasses import replace
+
+import pytest
+from pydantic import ValidationError
+
+from app.api.schemas.episodes import EpisodeIn, EpisodeOut, ServiceSettings, SettingsIn
+from app.jobs.job import Job
+from app.jobs.kinds.episodes import settings_of
+from app.services.episodes import nested
+from osfcore.control.episode_settings import EpisodeSettings
+
+PARAMS = {"scene": "s", "names": ["box"], "seed": 3, "settings": nested({"steps": 5}), "goal": {"id": "g"}}
+STEP = {
+    "step": 0,
+    "seconds": {"first": 9.5},
+    "image_cost": 0.25,
+    "ssim": 0.9,
+    "to_goal_mm": {"box": 60.0},
+    "to_goal_deg": {"box": 3.0},
+    "estimate_off_mm": {"box": 1.0},
+    "truth": {"objects": []},
+    "estimate": {},
+}
+REPORT = {"steps": [STEP], "noticed": [{"step": 0, "matter": "goal", "text": "It is odd."}]}
+
+
+def told(job, report=None, files=()):
+    return EpisodeOut.of_job(job, settings_of(job.params["settings"]), report, files)
+
+
+def test_only_what_was_said_is_handed_on():
+    assert SettingsIn.model_validate({}).given() == {}
+    assert SettingsIn.model_validate({"steps": 5, "acting": False, "cost": None}).given() == {
+        "steps": 5,
+        "acting": False,
+    }
+    asked = EpisodeIn.model_validate({"goal": "g", "settings": {"samples": 8}}).asked()
+    assert (asked.scene, asked.goal, asked.poses, asked.seed, asked.settings) == (None, "g", None, 0, {"samples": 8})
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"goal": ""},
+        {"goal": "x" * 65},
+        {"poses": []},
+        {"seed": -1},
+        {"settings": None},
+        {"settings": {"steps": 0}},
+        {"settings": {"steps": 1.5}},
+        {"settings": {"cost": "both"}},
+        {"settings": {"temperature": float("nan")}},
+        {"settings": {"noise_m": 1}},
+        {"more": 1},
+    ],
+)
+def test_what_makes_no_sense_is_refused(body):
+    with pytest.raises(ValidationError):
+        EpisodeIn.model_validate(body)
+
+
+def test_an_episode_that_waits_has_nothing_to_tell_yet():
+    out = told(Job("a", "episode", PARAMS, position=2))
+    assert (out.status, out.position, out.stage, out.outcome, out.text) == ("queued", 2, None, None, None)
+    assert (out.steps, out.notices, out.files) == ([], [], [])
+    assert (out.scene, out.goal, out.objects, out.seed, out.settings.steps) == ("s", "g", ["box"], 3, 5)
+
+
+def test_a_running_one_tells_stage_steps_and_notices():
+    job = Job("a", "episode", PARAMS, "running", 2, 5, "Pushing", result={"stage": "act", "steps": 3})
+    out = told(job, REPORT, ("report.json",))
+    assert (out.stage, out.done, out.total, out.note, out.files) == ("act", 2, 5, "Pushing", ["report.json"])
+    assert out.steps[0].model_dump() == {key: STEP[key] for key in STEP if key not in ("truth", "estimate")} | {
+        "truly_to_goal_mm": None
+    }
+    assert out.notices[0].text == "It is odd."
+
+
+@pytest.mark.parametrize("state", ["done", "failed", "cancelled", "interrupted"])
+def test_one_that_is_over_tells_how_it_ended(state):
+    result = {"stage": "next", "steps": 3, "outcome": "reached", "text": "It is there."}
+    out = told(replace(Job("a", "episode", PARAMS, state), result=result, error="No." if state == "failed" else None))
+    assert (out.status, out.outcome, out.text) == (state, "reached", "It is there.")
+    assert EpisodeOut.model_validate_json(out.model_dump_json()) == out
+
+
+def test_the_defaults_are_those_of_an_episode_without_settings():
+    defaults = ServiceSettings.now().episode.defaults
+    assert nested(defaults.model_dump()) == nested({})
+    assert defaults.model_dump()["steps"] == EpisodeSettings().steps

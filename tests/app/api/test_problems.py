@@ -1,0 +1,80 @@
+import pytest
+
+from app.api.problems import NotFound, problem, status_of
+from app.jobs.registry import QueueFull
+from app.processes.sim_client import StageError, StageUnavailable
+from osfcore.errors import InvalidInput, OverlappingObjects
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (InvalidInput("x", 1, "2"), 422),
+        (OverlappingObjects("a", "b", 0.01), 422),
+        (StageError("OverlappingObjects", "a and b overlap."), 422),
+        (StageError("Internal", "The simulation failed."), 500),
+        (StageUnavailable("died"), 503),
+        (QueueFull(20), 429),
+        (NotFound("no"), 404),
+    ],
+)
+def test_errors_have_the_status_that_says_the_same(error, status):
+    assert status_of(error) == status
+
+
+def test_text_that_is_not_unicode_goes_out_anyway():
+    assert b'"detail":"a ? b"' in problem(422, "a \ud800 b").body
+
+
+def is_problem(answer, status):
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/problem+json"
+    body = answer.json()
+    assert body["status"] == status
+    assert body["detail"]
+    assert "Traceback" not in answer.text
+    return body
+
+
+def test_nothing_there_and_wrong_methods_are_problems(service):
+    assert "/api/nowhere" in is_problem(service.get("/api/nowhere"), 404)["detail"]
+    assert "GET" in service.put("/api/health").headers["allow"]
+    is_problem(service.put("/api/health"), 405)
+
+
+def test_large_bodies_are_problems(service):
+    is_problem(service.post("/api/scenes", content=b" " * (8 << 20), headers={"content-type": "application/json"}), 413)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '{"light": {"position": [NaN, 0, 1]}}',
+        '{"light": {"position": [Infinity, 0, 1]}}',
+        '{"light": {"position": [1e999, 0, 1]}}',
+        '{"seed": NaN}',
+        '{"count": 1e400}',
+        '{"seed": ' + "9" * 5000 + "}",
+        '{"objects": ["\\ud800"]}',
+        '{"\\ud800": 1}',
+        "[" * 100_000,
+        "{",
+        '"\x00"',
+    ],
+    ids=lambda body: body[:24],
+)
+def test_hostile_json_is_never_a_defect(service, body):
+    answer = service.post("/api/scenes", content=body.encode(), headers={"content-type": "application/json"})
+    is_problem(answer, answer.status_code)
+    assert answer.status_code in (400, 422)
+
+
+def test_pointers_name_what_is_wrong(service):
+    body = {"count": 99, "poses": [{"name": "x", "position": [0, 0], "quaternion": [1, 0, 0, 0]}]}
+    errors = is_problem(service.post("/api/scenes", json=body), 422)["errors"]
+    assert [error["pointer"] for error in errors] == ["#/count", "#/poses/0/position"]
+    job = {"kind": "collect_table", "params": {"seed": -1}}
+    errors = is_problem(service.post("/api/jobs", json=job), 422)["errors"]
+    assert [error["pointer"] for error in errors] == ["#/params/seed"]
+    wrong = is_problem(service.get("/api/scenes/x/images/0.png?size=7"), 422)["errors"]
+    assert wrong[0]["parameter"] == "size"

@@ -1,0 +1,84 @@
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from app.api.app_factory import create_app
+from app.api.token_gate import COOKIE, TokenMiddleware
+from app.services.service_settings import Settings
+
+TOKEN = "open-sesame"
+
+
+async def inside(scope, _receive, send):
+    """An app that lets everybody in."""
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.accept"})
+        await send({"type": "websocket.close", "code": 1000})
+        return
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body", "body": b"inside"})
+
+
+@pytest.fixture
+def client():
+    return TestClient(TokenMiddleware(inside, token=TOKEN), base_url="http://localhost", follow_redirects=False)
+
+
+@pytest.mark.parametrize("path", ["/", "/api/scenes", "/docs", "/viewer", "/js/main.js"])
+def test_nothing_opens_without_the_token(client, path):
+    answer = client.get(path)
+    assert answer.status_code == 401
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "token" in answer.json()["detail"]
+    assert TOKEN not in answer.text
+
+
+@pytest.mark.parametrize("header", ["", "Bearer", "Bearer wrong", f"Basic {TOKEN}", TOKEN, f"Bearer {TOKEN}x"])
+def test_a_wrong_token_does_not_help(client, header):
+    assert client.get("/api/scenes", headers={"Authorization": header}).status_code == 401
+
+
+def test_programs_send_it_as_a_header(client):
+    assert client.get("/api/scenes", headers={"Authorization": f"Bearer {TOKEN}"}).text == "inside"
+    assert client.post("/api/scenes", headers={"authorization": f"bearer {TOKEN}"}).text == "inside"
+
+
+def test_a_browser_opens_the_page_with_it_once_and_keeps_a_cookie(client):
+    answer = client.get(f"/?token={TOKEN}")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    cookie = answer.headers["set-cookie"].lower()
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    assert client.cookies[COOKIE] == TOKEN
+    assert client.get("/").text == "inside"
+
+
+def test_a_wrong_token_in_the_address_sets_no_cookie(client):
+    answer = client.get("/?token=wrong")
+    assert answer.status_code == 401
+    assert "set-cookie" not in answer.headers
+
+
+def test_changes_are_not_made_by_addresses_with_a_token(client):
+    assert client.post(f"/api/scenes?token={TOKEN}").status_code == 401
+
+
+def test_the_viewer_needs_it_too(client):
+    with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect("/viewer"):
+        pass
+    assert refused.value.code == 1008
+    client.cookies.set(COOKIE, TOKEN)
+    with client.websocket_connect("/viewer"):
+        pass
+
+
+def test_health_is_open():
+    app = create_app(Settings(token=TOKEN, demo_scene=False, data_dir="unused"))
+    paths = {"/api/health": 500, "/api/scenes": 401}  # the service itself was not started, so health has no answer
+    client = TestClient(app, base_url="http://localhost", raise_server_exceptions=False)
+    assert {path: client.get(path).status_code for path in paths} == paths
+
+
+def test_a_short_token_is_refused():
+    with pytest.raises(ValueError, match="token"):
+        Settings(token="short")

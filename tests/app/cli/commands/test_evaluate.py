@@ -1,0 +1,218 @@
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+
+import osfcore.experiments.estimation.parts
+import osfcore.experiments.fields.evaluation
+from app.cli.commands.evaluate import Evaluate
+from app.cli.main import main
+from osfcore.control.events import Finished
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.experiments.benchmarks import rollouts as bench_dynamics
+from osfcore.experiments.dynamics import evaluation as dynamics
+from osfcore.experiments.estimation.parts import EvaluateEstimate
+from osfcore.experiments.fields.evaluation import EvaluateFields
+from osfcore.experiments.rearrangement import evaluation as mpc
+from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.world.collection.collect_images import CollectObject, collect_object
+from tests.core.experiments.oracle import Oracle
+from tests.core.experiments.solids import SOLIDS, write_fields
+
+
+@pytest.fixture
+def fields_dir(data_dir, library, monkeypatch):
+    """Solids for fields, and small images."""
+    write_fields(data_dir, library)
+    monkeypatch.setattr(osfcore.experiments.fields.evaluation, "EvaluateFields", partial(EvaluateFields, size=32))
+    return data_dir
+
+
+def test_figures_are_the_last_line_as_json(fields_dir, tmp_path, capsys):
+    arguments = ["--out", str(tmp_path / "out"), "--data-dir", str(fields_dir), "--names", *SOLIDS[:2], "--tasks", "1"]
+    assert main(["eval", "fields", *arguments, "--objects", "2", "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert set(result["objects"]) == set(SOLIDS[:2])
+    assert result["scene_psnr_mean"] > 10
+    assert SOLIDS[1] in told.err  # progress
+    assert main(["eval", "fields", *arguments, "--objects", "2"]) == 0  # taken over
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in SOLIDS[:2])
+    assert f"{result['psnr_mask_mean']:.2f}" in shown
+    assert "1 scenes" in shown
+
+
+def test_any_set_and_weights(fields_dir, library, tmp_path):
+    name = SOLIDS[2]
+    for _ in collect_object(CollectObject(name, tmp_path / "set", 60, 32, seed=9), library):
+        pass
+    weights = fields_dir / "fields" / name / "field.safetensors"
+    result = Evaluate("fields", tmp_path / "out", data=tmp_path / "set", weights=weights).run()
+    assert set(result["objects"]) == {"set"}
+    assert result["scene_psnr_mean"] is None
+    with pytest.raises(InvalidInput, match="both or none"):
+        Evaluate("fields", tmp_path / "out", data=tmp_path / "set").run()
+    table = fields_dir / "fields" / "table" / "field.safetensors"
+    with pytest.raises(CorruptFile, match="format"):
+        Evaluate("fields", tmp_path / "out", data=tmp_path / "set", weights=table).run()
+    with pytest.raises(CorruptFile, match="anno.json"):
+        Evaluate("fields", tmp_path / "out", data=tmp_path, weights=weights).run()
+
+
+@pytest.fixture
+def oracle(fields_dir, monkeypatch):
+    """Estimators that know the truth, and little to do for them."""
+    small = partial(EvaluateEstimate, size=32, steps=2)
+    monkeypatch.setattr(osfcore.experiments.estimation.parts, "EvaluateEstimate", small)
+    oracle = Oracle()
+    oracle.install(monkeypatch)
+    return oracle
+
+
+def test_estimators_are_measured(fields_dir, oracle, capsys):
+    arguments = ["--data-dir", str(fields_dir), "--names", *SOLIDS, "--tasks", "2", "--objects", "2", "--bad", "1"]
+    assert main(["eval", "estimate", *arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert (result["objects_total"], result["frac_1cm_5deg"], result["track_lost"], result["bad_cases"]) == (4, 1, 0, 1)
+    assert "Tracks (1 of 2)" in told.err
+    assert (fields_dir / "evaluation" / "estimate" / "2-objects-seed-0" / "report.json").exists()
+    asked = len(oracle.asked)
+    assert main(["eval", "estimate", *arguments]) == 0  # taken over
+    assert len(oracle.asked) == asked
+    shown = capsys.readouterr().out
+    for words in (
+        "First frames: 2 scenes, 4 objects: 100.0 %",
+        "0 of 2 lost",
+        "Goals: 100.0 % of 8",
+        "2 views",
+        "Bad cases: 1",
+    ):
+        assert words in shown, words
+
+
+def test_estimators_are_measured_in_pieces(fields_dir, oracle, tmp_path, capsys):
+    arguments = ["--data-dir", str(fields_dir), "--out", str(tmp_path), "--names", *SOLIDS, "--tasks", "1"]
+    assert main(["eval", "estimate", *arguments, "--parts", "first"]) == 0
+    assert [what for what, _ in oracle.asked] == ["first search 4"]
+    shown = capsys.readouterr().out
+    assert "First frames" in shown
+    assert not any(words in shown for words in ("Tracks", "Goals", "views", "Bad"))
+    assert main(["eval", "estimate", *arguments, "--parts", "track", "--json"]) == 0
+    assert [what for what, _ in oracle.asked] == ["first search 4", "next", "next"]
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["goal_frac_1cm_5deg"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--names", "teapot"], "teapot"),
+        (["--tasks", "0"], "number of tasks is 0"),
+        (["--data", "set"], "osf eval fields"),
+        ([], "osf assets fetch"),  # the default objects are not all here
+    ],
+)
+def test_a_mistake_about_estimators_is_one_sentence(fields_dir, oracle, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert main(["eval", "estimate", "--out", str(out), "--data-dir", str(fields_dir), *arguments]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("osf: ")
+    assert words in line
+    assert not out.exists()
+    assert not oracle.asked
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["--names", "teapot"], "teapot"), (["--tasks", "-1"], "scenes"), (["--objects", "9"], "between 1 and 8")],
+)
+def test_a_mistake_is_one_sentence(fields_dir, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert main(["eval", "fields", "--out", str(out), "--data-dir", str(fields_dir), *arguments]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("osf: ")
+    assert words in line
+    assert not out.exists()
+
+
+def test_predicted_pushes_are_measured(data_dir, library, monkeypatch, capsys):
+    monkeypatch.setattr(dynamics, "_STEPS", 34)
+    monkeypatch.setattr(dynamics, "COUNTS", (2, 3))
+    monkeypatch.setattr(bench_dynamics, "SEQUENCES", 10)
+    arguments = ["eval", "dynamics", "--data-dir", str(data_dir), "--tasks", "1", "--workers", "1"]
+    assert main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert result["windows"] > 0
+    assert "Predicting directed pushes of 3 objects" in told.err
+    assert json.loads((data_dir / "evaluation" / "dynamics.json").read_text()) == result
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert f"{result['median_mm_4']:.1f} mm" in shown
+    assert "2 objects" in shown
+    assert main([*arguments, "--data", "set"]) == 1
+    assert "osf eval fields" in capsys.readouterr().err
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
+    made, image = [], np.full((16, 16, 3), 0.5)
+
+    def ours(task, _assets, _knowledge, settings, _rng):
+        made.append(settings.cost)
+        yield Finished(0, "reached", "The table looks like the goal.", task.goal)
+        yield Ended(task.goal, image, image)
+
+    monkeypatch.setattr(mpc, "run_from_images", ours)
+    monkeypatch.setattr(mpc, "run_told_the_truth", lambda task, *_: Ended(task.goal, image, image))
+    monkeypatch.setattr(mpc, "knowledge_of", lambda *_: None)
+    return made
+
+
+def test_episodes_are_measured(data_dir, runs, capsys):
+    arguments = ["eval", "mpc", "--data-dir", str(data_dir), "--tasks", "2", "--objects", "1", "--workers", "1"]
+    assert main([*arguments, "--names", "009_gelatin_box", "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert (result["tasks"], result["objects"], result["success_2cm"], result["oracle_success_2cm"]) == (2, 1, 1, 1)
+    assert (result["noaction_success_2cm"], result["final_mm_mean"], result["replan_s_median"]) == (0, 0, None)
+    assert "Told the truth" in told.err
+    assert json.loads((data_dir / "evaluation" / "mpc.json").read_text()) == result
+    assert main([*arguments, "--names", "009_gelatin_box"]) == 0  # taken over
+    shown = capsys.readouterr().out
+    assert runs == ["pose", "pose"]
+    for words in ("2 tasks with 1 objects, pose cost: 100.0 %", "100.0 % of 1", "Told the truth", "A plan takes - s"):
+        assert words in shown, words
+    assert main([*arguments, "--cost", "image", "--no-oracle"]) == 0
+    assert "Told the truth" not in capsys.readouterr().out
+    assert runs[2:] == ["image", "image"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--names", "teapot"], "teapot"),
+        (["--tasks", "0"], "number of tasks is 0"),
+        (["--objects", "7"], "between 1 and 6"),
+        (["--workers", "0"], "workers"),
+        (["--data", "set"], "osf eval fields"),
+    ],
+)
+def test_a_mistake_about_episodes_is_one_sentence(data_dir, runs, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out"
+    assert main(["eval", "mpc", "--out", str(out), "--data-dir", str(data_dir), *arguments]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("osf: ")
+    assert words in line
+    assert not out.exists()
+    assert not runs
+
+
+def test_the_command_explains_itself(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["eval", "--help"])
+    assert stop.value.code == 0
+    assert "--weights" in capsys.readouterr().out

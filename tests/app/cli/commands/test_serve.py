@@ -1,0 +1,139 @@
+import contextlib
+import http.client
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from app.cli.commands.serve import CannotListen, Serve, bound_socket
+from app.storage.database import FILE
+from osfcore.errors import InvalidInput
+from tests.app.conftest import until
+from tests.app.processes.test_child_process import is_running
+
+START = "from app.cli.commands.serve import Serve; from pathlib import Path; import sys\nif __name__ == '__main__':\n"
+
+
+@pytest.fixture
+def serve(tmp_path):
+    """Starts the command on a free port; gives process and port. All are ended with the test."""
+    script = tmp_path / "serve.py"
+    script.write_text(START + "    Serve(port=int(sys.argv[1]), data_dir=Path(sys.argv[2])).run()\n")
+    started = []
+
+    def serve(data_dir, port=0):
+        process = subprocess.Popen(
+            [sys.executable, script, str(port), data_dir],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.getcwd()},
+        )
+        started.append(process)
+        return process
+
+    yield serve
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def address(process):
+    """The port in the one line that the command prints."""
+    line = process.stdout.readline()
+    match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)\n", line)
+    assert match, (line, process.stderr.read())
+    return int(match[1])
+
+
+def get(port, path):
+    """Status of one request."""
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=20)) as connection:
+        connection.request("GET", path)
+        with connection.getresponse() as response:
+            response.read()
+            return response.status
+
+
+def test_it_tells_one_address_and_leaves_at_once_with_streams_open(serve, data_dir):
+    process = serve(data_dir)
+    port = address(process)
+    assert get(port, "/api/health") == 200
+    stream = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    stream.request("GET", "/api/events?frames=1")
+    events = stream.getresponse()
+    assert events.status == 200
+    viewer = socket.create_connection(("127.0.0.1", port))
+    viewer.sendall(
+        b"GET /viewer HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+        b"Sec-WebSocket-Protocol: viser-v1.1.1\r\n\r\n"
+    )
+    assert b"101" in viewer.recv(100)
+    start = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert time.monotonic() - start < 5
+    assert (process.returncode, out, err) == (0, "", "")
+    viewer.close()
+    events.close()
+    stream.close()
+
+
+def test_a_killed_service_leaves_no_process_and_can_start_again(serve, data_dir):
+    process = serve(data_dir)
+    address(process)
+
+    def children():
+        lists = Path(f"/proc/{process.pid}/task").glob("*/children")  # one for each thread
+        return [int(pid) for file in lists for pid in file.read_text().split()]
+
+    born = until(children)
+    process.kill()
+    process.wait()
+    until(lambda: not any(is_running(pid) for pid in born))
+    again = serve(data_dir)
+    assert get(address(again), "/api/health") == 200
+
+
+def test_without_objects_the_page_starts_and_says_how_to_get_them(serve, tmp_path):
+    process = serve(tmp_path / "empty")
+    port = address(process)
+    assert get(port, "/api/scenes") == 200
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=30)
+    assert "osf assets fetch" in err
+
+
+def test_a_damaged_database_stops_it_in_one_sentence(serve, data_dir):
+    (data_dir / FILE).write_bytes(b"no database" * 1000)
+    process = serve(data_dir)
+    out, err = process.communicate(timeout=30)
+    assert out == ""
+    assert err.splitlines()[-1].startswith("osfcore.errors.CorruptFile")
+    assert "damaged" in err
+
+
+def test_a_senseless_setting_is_told(data_dir, monkeypatch):
+    monkeypatch.setenv("OSF_MAX_SCENES", "many")
+    with pytest.raises(InvalidInput, match="OSF_MAX_SCENES is 'many'"):
+        Serve(port=0, data_dir=data_dir).run()
+
+
+def test_a_port_in_use_is_told():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(CannotListen, match=f"Port {port} .* in use"):
+            bound_socket("127.0.0.1", port)
+
+
+@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", -1), ("127.0.0.1", 65536), ("no.such.host.invalid", 8000)])
+def test_addresses_that_are_none_are_told(host, port):
+    with pytest.raises(CannotListen):
+        bound_socket(host, port)

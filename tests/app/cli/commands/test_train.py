@@ -1,0 +1,95 @@
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from app.cli.commands.train import TrainFieldCommand, TrainTableCommand
+from app.cli.main import main
+from osfcore.dynamics.network_weights import read_network
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.fields.field_weights import read_field
+from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from tests.core.fields.sets import write_set
+
+
+@pytest.fixture(scope="module")
+def image_set(tmp_path_factory):
+    return write_set(tmp_path_factory.mktemp("set") / "egg", train=24, size=48)
+
+
+def test_a_field_is_written_with_what_it_reaches(image_set, tmp_path, capsys):
+    out = tmp_path / "egg.safetensors"
+    result = TrainFieldCommand(image_set, out, minutes=0.05, device="cpu").run()
+    assert read_field(out).hidden > 0
+    assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
+    assert 15 < result["psnr_mask"] <= result["psnr_full"] < 60
+    told = capsys.readouterr()
+    assert f"{result['psnr_mask']:.1f} dB in the mask" in told.out
+    assert "left" in told.err  # progress
+
+
+def test_a_killed_training_goes_on_when_the_same_command_is_run_again(image_set, tmp_path):
+    out, log = tmp_path / "egg.safetensors", tmp_path / "log"
+    command = [sys.executable, "-m", "app.cli", "train", "field", "--data", str(image_set), "--out", str(out)]
+    command += ["--minutes", "0.5", "--device", "cpu", "--json"]
+    with log.open("w") as file:
+        process = subprocess.Popen(command, stdout=file, stderr=file)
+    deadline = time.monotonic() + 120
+    while not out.with_suffix(".partial").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert out.with_suffix(".partial").exists(), log.read_text()
+    assert not out.exists()
+
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "Going on from a checkpoint" in done.stderr
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result["minutes"] == pytest.approx(0.5, abs=0.05)  # of both runs together
+    assert result["psnr_mask"] > 15
+    assert not out.with_suffix(".partial").exists()
+
+
+def test_the_table_has_a_training_of_its_own(tmp_path, capsys):
+    from osfcore.world.collection.collect_images import CollectTable, collect_table
+
+    for _ in collect_table(CollectTable(tmp_path / "table", images=60, size=32)):
+        pass
+    out = tmp_path / "table.safetensors"
+    result = TrainTableCommand(tmp_path / "table", out).run()
+    assert result["psnr"] > 20
+    assert f"Wrote {out}" in capsys.readouterr().out
+
+
+def test_mistakes_are_told_before_anything_is_trained(image_set, tmp_path):
+    with pytest.raises(InvalidInput, match=r"\.safetensors"):
+        TrainFieldCommand(image_set, tmp_path / "egg.npz").run()
+    with pytest.raises(InvalidInput, match="minutes"):
+        TrainFieldCommand(image_set, tmp_path / "egg.safetensors", minutes=0).run()
+    with pytest.raises(CorruptFile, match="anno.json"):
+        TrainFieldCommand(tmp_path, tmp_path / "egg.safetensors").run()
+    assert not (tmp_path / "egg.safetensors").exists()
+
+
+def test_pushes_are_learned_from_collected_ones(library, tmp_path, capsys):
+    pushes = tmp_path / "pushes.h5"
+    config = CollectPushes(pushes, episodes=14, steps=8, policy="directed", seed=1)
+    assert list(collect_pushes(config, library))[-1].done == 14
+    out = tmp_path / "pushes.safetensors"
+    arguments = ["train", "dynamics", "--data", str(pushes), "--out", str(out), "--data-dir", str(tmp_path)]
+    quick = ["--iterations", "30", "--long-iterations", "2", "--hidden", "8", "--device", "cpu"]
+    assert main([*arguments, *quick, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
+    assert result["iterations"] == 32
+    assert "held out" in told.err
+    assert read_network(out).hidden == 8
+    assert main([*arguments, *quick, "--without", "teapot", "--rate", "0"]) == 1
+    assert "rate of learning" in capsys.readouterr().err
+    assert main([*arguments, *quick]) == 0
+    assert "after 4 steps" in capsys.readouterr().out

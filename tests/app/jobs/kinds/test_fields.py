@@ -1,0 +1,111 @@
+"""The job's own work, with a stand-in for the training itself; tests/app/routes/test_fields.py trains for real."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import osfcore.fields.training.kiloosf_training as training
+from app.jobs.context import JobContext
+from app.jobs.kinds.fields import PREVIEW, train_field_job
+from app.storage.field_files import workshop
+from osfcore.errors import MissingAssets
+from osfcore.progress import Progress
+
+GELATIN = "009_gelatin_box"
+ORDER = {
+    "name": GELATIN,
+    "source": {"mesh": GELATIN, "set": None},
+    "minutes": 0.5,
+    "seed": 3,
+    "images": 60,
+    "hollow": False,
+}
+
+
+@pytest.fixture
+def place(data_dir, tmp_path):
+    folder = tmp_path / "job"
+    folder.mkdir()
+    return JobContext(data_dir, folder)
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Replaces the training; the list holds the configuration of each run."""
+    runs = []
+
+    def fake(config):
+        runs.append(config)
+        assert (config.data / "train" / "anno.json").is_file()
+        preview = np.full((4, 12, 3), 200, np.uint8)
+        yield training.FieldStep(Progress(15, 30, "20.0 dB held out, 15 s left"), 20.0, 15.0, preview)
+        config.out.with_suffix(".partial").write_bytes(b"checkpoint")
+        config.out.write_bytes(b"weights")
+        config.out.with_suffix(".json").write_text(json.dumps({"psnr_full": 30.5, "psnr_mask": 25.5}))
+        yield training.FieldStep(Progress(30, 30, "Done"), 30.5, 25.5, preview)
+
+    monkeypatch.setattr(training, "train_field", fake)
+    return runs
+
+
+def test_from_a_mesh_images_are_taken_first_and_the_field_is_put_in_place(place, trained):
+    steps = list(train_field_job(ORDER, place))
+    done = [step.done for step in steps]
+    assert done == sorted(done)
+    assert done[-1] == steps[-1].total == {step.total for step in steps}.pop()
+    assert any("Image 60 of 60" in step.note for step in steps)
+    halfway = next(step for step in steps if step.psnr_mask == 15.0)
+    assert (halfway.previews, halfway.note[-4:]) == (1, "left")
+    assert (steps[-1].psnr_full, steps[-1].psnr_mask, steps[-1].previews) == (30.5, 25.5, 2)
+    installed = place.data_dir / "fields" / GELATIN
+    assert (installed / "field.safetensors").read_bytes() == b"weights"
+    assert {path.name for path in installed.iterdir()} == {"field.safetensors", "field.json"}
+    with Image.open(place.folder / PREVIEW) as preview:
+        assert preview.size == (12, 4)
+    assert not workshop(place.data_dir, GELATIN).exists()
+    assert (trained[0].minutes, trained[0].seed) == (0.5, 3)
+    json.dumps(dataclasses.asdict(steps[-1]))
+
+
+def test_after_a_kill_the_same_order_uses_the_images_that_are_there(place, trained):
+    first = train_field_job(ORDER, place)
+    next(step for step in first if step.previews)
+    first.close()
+    shop = workshop(place.data_dir, GELATIN)
+    kept = (shop / GELATIN / "train" / "anno.json").stat().st_mtime_ns
+    again = train_field_job(ORDER, place)
+    notes = [next(again).note, next(again).note]
+    assert not any("Image" in note for note in notes)
+    assert (shop / GELATIN / "train" / "anno.json").stat().st_mtime_ns == kept
+    again.close()
+    other = train_field_job({**ORDER, "seed": 4}, place)
+    next(other)
+    assert "Image 1 of 60" in next(other).note
+
+
+def test_a_kill_between_training_and_putting_in_place_trains_nothing_twice(place, trained):
+    first = train_field_job(ORDER, place)
+    next(step for step in first if step.psnr_full == 30.5)
+    first.close()
+    steps = list(train_field_job(ORDER, place))
+    assert len(trained) == 1
+    assert steps[-1].psnr_full == 30.5
+    assert (place.data_dir / "fields" / GELATIN / "field.json").is_file()
+
+
+def test_from_a_set_no_mesh_is_needed(place, trained):
+    images = place.data_dir / "sets" / "abc" / "images" / "train"
+    images.mkdir(parents=True)
+    (images / "anno.json").write_text("[]")
+    list(train_field_job({**ORDER, "name": "thing", "source": {"mesh": None, "set": "abc"}}, place))
+    assert trained[0].data == images.parent
+    assert (place.data_dir / "fields" / "thing" / "field.safetensors").is_file()
+
+
+def test_a_mesh_that_is_gone_is_told(place, trained):
+    with pytest.raises(MissingAssets):
+        list(train_field_job({**ORDER, "source": {"mesh": "025_mug", "set": None}}, place))
+    assert trained == []

@@ -1,0 +1,41 @@
+import json
+from typing import get_args
+
+import pytest
+
+from app.jobs.job import Job, State, WrongJobState, check_file_name, check_params, ended, job_fields, job_from_fields
+from osfcore.errors import InvalidInput, UnknownName
+
+
+def test_a_job_survives_json():
+    job = Job("a", "collect_table", {"images": 60}, files=("x.zip",), result={"n": 1}, eta_s=1.5)
+    assert job_from_fields(json.loads(json.dumps(job_fields(job)))) == job
+
+
+@pytest.mark.parametrize("state", get_args(State))
+def test_finished_jobs_change_no_more(state):
+    assert Job("a", "x", {}, state).is_finished == (state not in ("queued", "running", "paused"))
+
+
+def test_an_ended_job_has_neither_place_nor_time_left():
+    over = ended(Job("a", "x", {}, "running", eta_s=3, position=1), "failed", error="No.")
+    assert (over.state, over.eta_s, over.position, over.error) == ("failed", None, None, "No.")
+    assert over.finished_at is not None
+
+
+def test_files_have_to_be_the_jobs_own():
+    job = Job("a", "x", {}, files=("pushes.h5",))
+    assert check_file_name(job, "pushes.h5") == "pushes.h5"
+    with pytest.raises(UnknownName):
+        check_file_name(job, "../a/pushes.h5")
+
+
+def test_orders_that_do_not_fit_say_so():
+    assert str(WrongJobState(Job("a", "x", {}, "done"), "paused")) == "Job a is done, so it cannot be paused."
+
+
+@pytest.mark.parametrize("available", [0, 2])
+def test_more_objects_than_there_are_is_refused(available):
+    with pytest.raises(InvalidInput, match="number of objects"):
+        check_params("collect_pushes", {"objects": 3}, str, available)
+    check_params("collect_pushes", {"objects": 2}, str, 2)

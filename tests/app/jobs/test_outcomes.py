@@ -1,0 +1,78 @@
+import pytest
+
+from app.jobs.job import Job
+from app.jobs.outcomes import DIED, DIED_NOTE, INTERRUPTED_NOTE, RESUMES_NOTE, STOPPED, STOPPED_NOTE, after
+from app.processes.messages import Failure, JobCancelled, JobDone
+
+REFUSED = Failure(0, "InvalidInput", "It is too large.")
+
+
+def running(kind):
+    params = {"name": "mug"} if kind == "train_field" else {}
+    return Job("a", kind, params, "running", done=3, total=9, eta_s=5.0, result={"steps": 3})
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """What a job has left so far: two files, one that is half-written, and inputs."""
+    folder = tmp_path / "job"
+    (folder / "inputs").mkdir(parents=True)
+    (folder / ".seen").mkdir()
+    for name in ("report.json", "steps.csv", ".video.part"):
+        (folder / name).write_text("x")
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["episode", "collect_table", "estimate", "train_field"])
+def test_what_was_done_to_its_end_is_kept(folder, kind):
+    over = after(running(kind), JobDone({"n": 1}), folder)
+    assert (over.state, over.note, over.result, over.error) == ("done", "Done", {"n": 1}, None)
+    assert over.files == ("report.json", "steps.csv")
+    assert over.finished_at is not None
+    assert over.eta_s is None
+
+
+@pytest.mark.parametrize(
+    ("outcome", "state", "error"),
+    [
+        (STOPPED, "interrupted", INTERRUPTED_NOTE),
+        (DIED, "failed", DIED_NOTE),
+        (REFUSED, "failed", REFUSED.text),
+        (JobCancelled(), "cancelled", None),
+        ("nonsense", "failed", "The job's process told nonsense."),
+    ],
+)
+def test_an_episode_keeps_its_steps_however_it_ends(folder, outcome, state, error):
+    over = after(running("episode"), outcome, folder)
+    assert not list(folder.glob(".*"))
+    assert (over.state, over.error, over.files) == (state, error, ("report.json", "steps.csv"))
+    assert over.is_finished
+    assert (over.done, over.result) == (3, {"steps": 3})
+    assert (folder / "inputs").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("outcome", "state", "error"),
+    [
+        (STOPPED, "failed", STOPPED_NOTE),
+        (DIED, "failed", DIED_NOTE),
+        (REFUSED, "failed", REFUSED.text),
+        (JobCancelled(), "cancelled", None),
+        (None, "failed", "The job's process told nonsense."),
+    ],
+)
+@pytest.mark.parametrize("kind", ["collect_pushes", "estimate"])
+def test_half_of_anything_else_is_worth_nothing(folder, kind, outcome, state, error):
+    over = after(running(kind), outcome, folder)
+    assert (over.state, over.error, over.files) == (state, error, ())
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(("outcome", "is_advised"), [(STOPPED, True), (DIED, True), (REFUSED, False)])
+def test_a_training_that_can_go_on_says_so(folder, outcome, is_advised):
+    assert (RESUMES_NOTE in str(after(running("train_field"), outcome, folder).error)) == is_advised
+
+
+def test_a_folder_that_has_gone_is_no_matter(tmp_path):
+    for kind in ("episode", "estimate"):
+        assert after(running(kind), DIED, tmp_path / "none").files == ()

@@ -1,0 +1,419 @@
+import os
+import signal
+import time
+from multiprocessing import Pipe
+
+import pytest
+
+import app.jobs.outcomes as job_ends
+import app.jobs.registry as jobs_module
+from app.jobs.job import JobSeen
+from app.jobs.outcomes import DIED_NOTE, INTERRUPTED_NOTE, RESUMES_NOTE, STOPPED_NOTE
+from app.jobs.registry import Jobs, QueueFull, WrongJobState
+from app.processes.messages import (
+    AskStage,
+    CancelJob,
+    JobCancelled,
+    JobDone,
+    JobRests,
+    JobStep,
+    PauseJob,
+    StepJob,
+    TakeImage,
+)
+from app.storage.database import CannotStore, Store
+from app.storage.field_files import workshop
+from osfcore.errors import UnknownName
+from tests.app.conftest import until
+
+TABLE = ("collect_table", {"images": 60, "size": 16, "seed": 0})
+LONG = ("collect_table", {"images": 5000, "size": 16, "seed": 0})
+
+
+@pytest.fixture
+def store(data_dir):
+    store = Store(data_dir)
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def open_jobs(store, data_dir):
+    """Opens the registry, as a service that starts; all are stopped in the end."""
+    opened = []
+
+    def open_jobs(**options):
+        events = []
+        jobs = Jobs(store, data_dir, events.append, **options)
+        jobs.start()
+        opened.append(jobs)
+        return jobs, events
+
+    yield open_jobs
+    for jobs in opened:
+        jobs.stop()
+
+
+def until_state(jobs, job, *states):
+    until(lambda: jobs.get(job.id).state in states, 60)
+    return jobs.get(job.id)
+
+
+def test_a_job_lives_and_every_change_is_told(open_jobs, store):
+    jobs, events = open_jobs()
+    job = jobs.submit(*TABLE)
+    done = until_state(jobs, job, "done", "failed")
+    assert (done.state, done.files, done.error) == ("done", ("table.zip",), None)
+    states = [event.job.state for event in events]
+    assert (states[0], states[-1]) == ("queued", "done")
+    assert set(states) == {"queued", "running", "done"}
+    numbers = [event.event for event in events]
+    assert numbers == sorted(set(numbers))
+    assert [number for number, _ in store.events_after(0)] == numbers
+
+
+def test_waiting_jobs_run_in_order(open_jobs):
+    jobs, _ = open_jobs()
+    first, second, third = (jobs.submit(*TABLE) for _ in range(3))
+    until_state(jobs, third, "done")
+    assert jobs.get(first.id).finished_at <= jobs.get(second.id).started_at
+    assert jobs.get(second.id).finished_at <= jobs.get(third.id).started_at
+    assert [job.id for job in jobs.all()] == [third.id, second.id, first.id]
+
+
+def test_the_queue_has_an_end(open_jobs):
+    jobs, _ = open_jobs(max_queued=2)
+    running = jobs.submit(*LONG)
+    until_state(jobs, running, "running")
+    jobs.submit(*TABLE)
+    jobs.submit(*TABLE)
+    with pytest.raises(QueueFull, match="2 jobs"):
+        jobs.submit(*TABLE)
+
+
+def test_cancelled_work_stops_within_a_second_and_leaves_nothing(open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    until_state(jobs, job, "running")
+    start = time.monotonic()
+    assert jobs.cancel(job.id).state == "cancelled"
+    assert time.monotonic() - start < 2.5  # a second, and slack for a loaded machine
+    assert not jobs.folder(job.id).exists()
+    with pytest.raises(WrongJobState):
+        jobs.cancel(job.id)
+
+
+def test_a_job_that_does_not_listen_is_ended(open_jobs):
+    jobs, _ = open_jobs(cancel_grace_s=0.2)
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(jobs._run.process.pid, signal.SIGSTOP)
+    assert jobs.cancel(job.id).state == "cancelled"
+    assert not jobs.folder(job.id).exists()
+
+
+def test_a_job_that_dies_fails_and_the_next_one_runs(open_jobs):
+    jobs, _ = open_jobs()
+    job, following = jobs.submit(*LONG), jobs.submit(*TABLE)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    failed = until_state(jobs, job, "failed")
+    assert "ended unexpectedly" in failed.error
+    assert until_state(jobs, following, "done").state == "done"
+
+
+def test_pausing_stops_progress_and_resuming_goes_on(open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    with pytest.raises(WrongJobState):
+        jobs.resume(job.id)
+    until(lambda: jobs.get(job.id).done > 0)
+    assert jobs.pause(job.id).state == "paused"
+    time.sleep(0.3)
+    held = jobs.get(job.id).done
+    time.sleep(0.4)
+    assert jobs.get(job.id).done == held
+    assert jobs.resume(job.id).state == "running"
+    until(lambda: jobs.get(job.id).done > held)
+
+
+def test_after_a_stop_running_jobs_failed_and_waiting_ones_go_on(open_jobs):
+    jobs, _ = open_jobs()
+    job, waiting = jobs.submit(*LONG), jobs.submit(*TABLE)
+    until(lambda: jobs.get(job.id).done > 0)
+    jobs.stop()
+    again, _ = open_jobs()
+    failed = again.get(job.id)
+    assert (failed.state, failed.error) == ("failed", STOPPED_NOTE)
+    assert until_state(again, waiting, "done", "failed").state == "done"
+
+
+def test_after_a_crash_running_jobs_failed_too(open_jobs, store):
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    kept = dict(store.jobs())
+    jobs.stop()
+    for number, fields in kept.items():
+        store.save_job(fields["id"], number, {**fields, "state": "paused"})  # as a killed service leaves it
+    again, events = open_jobs()
+    assert again.get(job.id).error == STOPPED_NOTE
+    assert events[0].job.state == "failed"
+    with pytest.raises(UnknownName):
+        again.get("none")
+
+
+def test_a_scene_is_held_only_by_the_running_job_that_names_it(open_jobs):
+    jobs, _ = open_jobs()
+    assert jobs.holder("s") is None
+    job = jobs.submit(LONG[0], dict(LONG[1]))
+    until(lambda: jobs.get(job.id).done > 0)
+    assert jobs.holder("s") is None
+    jobs._jobs[job.id].params["scene"] = "s"
+    assert jobs.holder("s") == job.id
+    jobs.pause(job.id)
+    assert jobs.holder("s") is None
+
+
+def test_a_training_that_was_killed_says_that_it_can_go_on_and_a_cancelled_one_leaves_nothing(open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    source = {"mesh": "009_gelatin_box", "set": None}
+    params = {"name": "box", "source": source, "minutes": 10, "seed": 0, "images": 5000}
+    shop = workshop(data_dir, "box")
+    job = jobs.submit("train_field", params)
+    until(lambda: "Image" in jobs.get(job.id).note)
+    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    assert RESUMES_NOTE in until_state(jobs, job, "failed").error
+    assert shop.is_dir()
+    again = jobs.submit("train_field", params)
+    assert [live.id for live in jobs.live("train_field")] == [again.id]
+    until(lambda: "Image" in jobs.get(again.id).note)
+    start = time.monotonic()
+    assert jobs.cancel(again.id).state == "cancelled"
+    assert time.monotonic() - start < 2.5
+    assert not shop.exists()
+    assert jobs.live("train_field") == ()
+
+
+def test_cancelling_a_waiting_twin_leaves_the_workshop_of_the_running_one(open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    source = {"mesh": "009_gelatin_box", "set": None}
+    params = {"name": "box", "source": source, "minutes": 10, "seed": 0, "images": 5000}
+    running = jobs.submit("train_field", params)
+    until(lambda: "Image" in jobs.get(running.id).note)
+    twin = jobs.submit("train_field", params)
+    assert jobs.cancel(twin.id).state == "cancelled"
+    assert workshop(data_dir, "box").is_dir()
+    jobs.cancel(running.id)
+    assert not workshop(data_dir, "box").exists()
+
+
+def test_progress_that_comes_too_soon_is_told_when_nothing_follows(open_jobs):
+    jobs, events = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    jobs.pause(job.id)  # a step may be on its way still
+    events.clear()
+    jobs.resume(job.id)
+    until(lambda: jobs.get(job.id).done > 200)
+    os.kill(jobs._run.process.pid, signal.SIGSTOP)  # nothing follows, as in a long step
+    until(lambda: events and events[-1].job.done == jobs.get(job.id).done)
+    jobs.cancel(job.id)
+
+
+def test_inputs_become_the_jobs_own_and_go_with_it(open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    running = jobs.submit(*LONG)
+    (data_dir / "given").mkdir()
+    (data_dir / "given" / "file").write_text("x")
+    job = jobs.submit(*TABLE, data_dir / "given")
+    assert not (data_dir / "given").exists()
+    assert (jobs.inputs(job.id) / "file").read_text() == "x"
+    jobs.cancel(job.id)
+    assert not jobs.folder(job.id).exists()
+    jobs.cancel(running.id)
+    with pytest.raises(CannotStore):
+        jobs.submit(*TABLE, data_dir / "given")
+    assert len(jobs.all()) == 2
+
+
+def test_inputs_that_no_job_takes_go_at_once_and_those_of_a_killed_service_at_the_next_start(open_jobs, data_dir):
+    left = data_dir / "collections" / ".new-abc"
+    left.mkdir(parents=True)
+    jobs, _ = open_jobs()
+    assert not left.exists()
+    with jobs.new_inputs() as folder, jobs.new_inputs() as other:
+        (folder / "deep").mkdir(parents=True)
+        assert folder.parent == left.parent != other
+    assert list(left.parent.iterdir()) == []
+
+
+def test_what_a_job_lets_the_live_view_draw_is_told_but_not_kept(open_jobs, monkeypatch):
+    jobs, events = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    connection = jobs._run.connection
+
+    class Showing:
+        def recv(self):
+            monkeypatch.setattr(jobs._run, "connection", connection)
+            return JobStep(7, 10, "Look", {}, seen="a view")
+
+        def fileno(self):
+            return connection.fileno()
+
+    monkeypatch.setattr(jobs._run, "connection", Showing())
+    (seen,) = until(lambda: [event for event in events if isinstance(event, JobSeen)])
+    assert (seen.job.id, seen.seen) == (job.id, "a view")
+    assert "a view" not in str(jobs.get(job.id))
+    jobs.cancel(job.id)
+
+
+def test_an_estimate_is_ended_without_grace(open_jobs, monkeypatch):
+    jobs, _ = open_jobs(cancel_grace_s=600)
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(jobs._run.process.pid, signal.SIGSTOP)  # as in a step that takes long
+    monkeypatch.setattr(jobs_module, "_ENDED_AT_ONCE", (LONG[0],))
+    assert jobs.cancel(job.id).state == "cancelled"
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """The job's end of the pipe, so that a test can play the job."""
+    ours, theirs = Pipe()
+    monkeypatch.setattr(jobs_module, "launch", lambda *_: (None, ours))
+    monkeypatch.setattr(jobs_module, "end", lambda *_: None)
+    yield theirs
+    theirs.close()
+
+
+def test_a_job_may_rest_after_a_round_and_go_on_by_single_steps(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit("episode", {"scene": "s1"})
+    until_state(jobs, job, "running")
+    jobs.pause(job.id)
+    assert isinstance(played.recv(), PauseJob)
+    assert jobs.step(job.id).state == "running"
+    assert isinstance(played.recv(), StepJob)
+    played.send(JobRests())
+    until_state(jobs, job, "paused")
+    jobs.resume(job.id)
+    with pytest.raises(WrongJobState):
+        jobs.step(job.id)  # it runs anyway
+
+
+def test_parameters_of_a_live_job_can_be_changed(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = jobs.submit("episode", {"scene": "s1", "settings": {"steps": 30}})
+    until_state(jobs, job, "running")
+    assert jobs.change(job.id, {"settings": {"steps": 5}}).params == {"scene": "s1", "settings": {"steps": 5}}
+    assert played.recv().params == {"settings": {"steps": 5}}
+    played.send(JobDone({}))
+    until_state(jobs, job, "done")
+    with pytest.raises(WrongJobState):
+        jobs.change(job.id, {"settings": {}})
+
+
+def test_what_a_job_asks_for_is_done_with_its_own_scene_only(played, open_jobs):
+    asked = []
+
+    def serve(command):
+        asked.append(command)
+        if command.camera == "7":
+            raise UnknownName("camera", "7", ["0", "goal"])
+        return b"picture"
+
+    jobs, _ = open_jobs(serve=serve)
+    job = jobs.submit("episode", {"scene": "s1"})
+    until_state(jobs, job, "running")
+    played.send(AskStage(TakeImage("s1", "goal", 32)))
+    assert played.recv().value == b"picture"
+    played.send(AskStage(TakeImage("s1", "7", 32)))
+    assert "camera" in played.recv().text
+    played.send(AskStage(TakeImage("s2", "goal", 32)))
+    assert "s2" in played.recv().text
+    assert [command.id for command in asked] == ["s1", "s1"]
+
+
+def begun(jobs, kind="episode"):
+    """A job of which one step is done."""
+    job = jobs.submit(kind, {"scene": "s1"})
+    until_state(jobs, job, "running")
+    (jobs.folder(job.id) / "report.json").write_text("{}")
+    return job
+
+
+def test_an_episode_that_a_stop_interrupts_keeps_its_steps(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = begun(jobs)
+    played.send(JobStep(1, 3, "Pushing", {"stage": "act", "steps": 1}))
+    until(lambda: jobs.get(job.id).done == 1)
+    jobs.stop()
+    again, _ = open_jobs()
+    kept = again.get(job.id)
+    assert (kept.state, kept.error, kept.files) == ("interrupted", INTERRUPTED_NOTE, ("report.json",))
+    assert (kept.done, kept.result) == (1, {"stage": "act", "steps": 1})
+    assert (again.folder(job.id) / "report.json").is_file()
+    with pytest.raises(WrongJobState, match="interrupted"):
+        again.cancel(job.id)
+
+
+@pytest.mark.parametrize("state", ["running", "paused"])
+@pytest.mark.parametrize(("kind", "over"), [("episode", "interrupted"), ("estimate", "failed")])
+def test_after_a_crash_an_episode_is_interrupted_and_half_of_anything_else_is_removed(
+    played, open_jobs, store, kind, over, state
+):
+    jobs, _ = open_jobs()
+    job = begun(jobs, kind)
+    ((number, fields),) = store.jobs()
+    folder = jobs.folder(job.id)
+    jobs.stop()
+    folder.mkdir(exist_ok=True)
+    (folder / "report.json").write_text("{}")
+    store.save_job(job.id, number, {**fields, "state": state})  # as a killed service leaves it
+    again, events = open_jobs()
+    assert again.get(job.id).state == events[0].job.state == over
+    assert folder.exists() == (kind == "episode")
+    assert again.get(job.id).files == (("report.json",) if kind == "episode" else ())
+
+
+def test_an_episode_whose_process_dies_fails_and_keeps_its_steps(played, open_jobs):
+    jobs, _ = open_jobs()
+    job = begun(jobs)
+    played.close()
+    failed = until_state(jobs, job, "failed", "done")
+    assert (failed.state, failed.error, failed.files) == ("failed", DIED_NOTE, ("report.json",))
+    assert (jobs.folder(job.id) / "report.json").is_file()
+
+
+def test_what_keeps_its_steps_keeps_them_when_its_process_is_killed(open_jobs, monkeypatch):
+    monkeypatch.setattr(job_ends, "_KEEPING", (LONG[0],))
+    jobs, _ = open_jobs()
+    job = jobs.submit(*LONG)
+    until(lambda: jobs.get(job.id).done > 0)
+    (jobs.folder(job.id) / "report.json").write_text("{}")
+    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    failed = until_state(jobs, job, "failed")
+    assert (failed.error, failed.files) == (DIED_NOTE, ("report.json",))
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_cancelled_episode_keeps_its_steps_whether_it_listens_or_not(played, open_jobs, answers):
+    jobs, _ = open_jobs(cancel_grace_s=600 if answers else 0.1)
+    job = begun(jobs)
+    if answers:
+        played.send(JobCancelled())
+    over = jobs.cancel(job.id) if not answers else until_state(jobs, job, "cancelled", "done")
+    assert (over.state, over.error, over.files) == ("cancelled", None, ("report.json",))
+    if not answers:
+        assert isinstance(played.recv(), CancelJob)
+
+
+def test_an_episode_that_was_cancelled_before_it_began_leaves_nothing(played, open_jobs, data_dir):
+    jobs, _ = open_jobs()
+    begun(jobs)
+    (data_dir / "given").mkdir()
+    waiting = jobs.submit("episode", {"scene": "s1"}, data_dir / "given")
+    assert jobs.cancel(waiting.id).state == "cancelled"
+    assert not jobs.folder(waiting.id).exists()

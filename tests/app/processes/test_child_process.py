@@ -1,0 +1,64 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from app.processes.child_process import end, import_quietly, launch, own_group, silence_stdout
+from tests.app.conftest import until
+
+
+def echo(connection, greeting):
+    own_group()
+    silence_stdout()
+    os.write(1, b"nobody reads this")
+    connection.send((greeting, os.getpid(), signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())))
+    connection.recv()
+
+
+def with_child(connection):
+    own_group()
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    connection.send(child.pid)
+    time.sleep(600)
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_children_do_not_see_interrupts_and_leave_by_themselves(capfd):
+    process, connection = launch(echo, "echo", "hello")
+    greeting, pid, is_blocked = connection.recv()
+    assert (greeting, pid, is_blocked) == ("hello", process.pid, True)
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    connection.send(None)
+    end(process, 10)
+    assert process.exitcode == 0
+    end(process)
+    connection.close()
+    assert capfd.readouterr().out == ""
+
+
+def test_ending_takes_grandchildren_along():
+    process, connection = launch(with_child, "parent")
+    child = connection.recv()
+    assert is_running(child)
+    end(process)
+    assert process.exitcode == -signal.SIGKILL
+    until(lambda: not is_running(child))
+    connection.close()
+
+
+def test_a_quiet_import_still_fails_loudly(capfd):
+    import_quietly("json")
+    with pytest.raises(ModuleNotFoundError):
+        import_quietly("no_such_module")
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"

@@ -1,0 +1,308 @@
+"""What is taken in and what is refused before any work begins; the work itself is tested through REST."""
+
+import asyncio
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import app.jobs.registry as jobs_module
+from app.jobs.job import Job
+from app.jobs.kinds.estimates import STATE
+from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, examine
+from app.services.fields import FieldCatalogue, MissingFields
+from app.storage.database import now_utc
+from app.storage.uploads import UploadRefused
+from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.io.observation_file import read_observation, write_observation
+from osfcore.io.state_file import write_estimated
+from tests.app.services.test_image_sets import zipped
+from tests.app.storage.test_database import record
+
+BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"
+
+
+def seen(names=(BOX, MUSTARD), views=4, masks=True) -> Observation:
+    cameras = default_cameras(16)[:views]
+    shown = np.zeros((views, len(names), 16, 16), bool)
+    shown[0, :, :4] = True
+    return Observation(cameras, np.full((views, 16, 16, 3), 0.5), names, shown if masks else None, None, 0.0)
+
+
+def believed(names=(BOX, MUSTARD)) -> EstimatedState:
+    count = len(names)
+    poses = Pose(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)))
+    state = SceneState(names, poses, Light(np.array([0, 0, 1.0])), None)
+    return EstimatedState(state, np.ones(count), np.ones(count), 0.1, ("",) * count, "")
+
+
+class Jobs:
+    """A registry that never works."""
+
+    def __init__(self, root):
+        self._root = root
+        self._all = []
+
+    new_inputs = jobs_module.Jobs.new_inputs
+
+    def submit(self, kind, params, inputs):
+        job = Job(f"job{len(self._all)}", kind, params)
+        shutil.copytree(inputs, self.inputs(job.id))
+        self._all.insert(0, job)
+        return job
+
+    def all(self):
+        return tuple(self._all)
+
+    def get(self, name):
+        return next(job for job in self._all if job.id == name)
+
+    def folder(self, name):
+        return self._root / name
+
+    def inputs(self, name):
+        return self._root / name / "inputs"
+
+    def finish(self, job, state="done", estimate=None):
+        ended = replace(job, state=state, finished_at=now_utc())
+        self._all[self._all.index(job)] = ended
+        if state == "done":
+            write_estimated(self.folder(job.id) / STATE, estimate or believed())
+        else:
+            shutil.rmtree(self.folder(job.id))
+        return ended
+
+
+class Runner:
+    """A service with one scene, whose camera images are grey."""
+
+    def __init__(self, root, library):
+        self.jobs = Jobs(root)
+        self.library = library
+        self.current = "s"
+        self.names = (BOX, MUSTARD)
+
+    def scene(self, scene):
+        if scene != "s":
+            raise UnknownName("scene", scene, ["s"])
+        return replace(record(), id="s", state=believed(self.names).state)
+
+    def observe(self, scene, folder, *, goal, masks):
+        write_observation(folder, seen(self.names, views=1 if goal else 4, masks=masks))
+        return replace(self.scene(scene), revision=7)
+
+
+@pytest.fixture
+def runner(tmp_path, library):
+    return Runner(tmp_path / "collections", library)
+
+
+@pytest.fixture
+def estimates(runner, tmp_path):
+    estimates = Estimates(runner, FieldCatalogue(tmp_path, lambda: ()))
+    yield estimates
+    estimates.stop()
+
+
+def archive(tmp_path, observation=None, **files):
+    folder = tmp_path / "seen"
+    write_observation(folder, observation or seen())
+    for name, text in files.items():
+        (folder / name.replace("_json", ".json")).write_text(text)
+    return zipped(folder)
+
+
+def upload(estimates, data, asked=None):
+    async def chunks():
+        yield data
+
+    return asyncio.run(estimates.of_upload(asked or Asked(), chunks(), "seen.zip"))
+
+
+def left_over(tmp_path):
+    return list((tmp_path / "collections").glob(".new-*"))
+
+
+# Scenes
+
+
+def test_a_scene_is_looked_at_with_masks_and_the_truth_stays_outside_the_observation(estimates, runner, tmp_path):
+    job = estimates.of_scene(Asked(seed=3))
+    assert job.kind == "estimate"
+    assert job.params["of"] == {"scene": "s", "revision": 7, "file_name": None}
+    assert (job.params["mode"], job.params["seed"]) == ("first", 3)
+    assert (job.params["names"], job.params["cameras"]) == ([BOX, MUSTARD], ["0", "1", "2", "3"])
+    inputs = runner.jobs.inputs(job.id)
+    assert {path.name for path in inputs.iterdir()} == {"observation", "truth.json"}
+    assert read_observation(inputs / "observation").masks is not None
+    told = json.dumps(job.params) + (inputs / "observation" / "observation.json").read_text()
+    assert "quaternion" not in told
+    assert "light" not in told
+    assert left_over(tmp_path) == []
+
+
+def test_later_frames_and_goals_begin_with_the_latest_estimate_of_the_scene(estimates, runner):
+    with pytest.raises(NoPrior, match='Mode "next" begins with an earlier estimate, and there is none of this scene'):
+        estimates.of_scene(Asked("next"))
+    first = estimates.of_scene(Asked())
+    with pytest.raises(NoPrior):
+        estimates.of_scene(Asked("goal"))  # it is not done
+    with pytest.raises(InvalidInput, match="status of estimate job0 is queued"):
+        estimates.of_scene(Asked("goal", prior=first.id))
+    runner.jobs.finish(first)
+    later = estimates.of_scene(Asked("next"))
+    inputs = runner.jobs.inputs(later.id)
+    assert read_observation(inputs / "observation").masks is None
+    assert (inputs / "prior.json").read_text() == (runner.jobs.folder(first.id) / STATE).read_text()
+    goal = estimates.of_scene(Asked("goal", prior=first.id))
+    assert goal.params["cameras"] == ["0"]
+    runner.jobs.finish(runner.jobs.get(goal.id))
+    with pytest.raises(UnknownName, match="no estimate named 'x'"):
+        estimates.of_scene(Asked("next", prior="x"))
+    runner.names = (MUSTARD,)
+    with pytest.raises(InvalidInput, match=f"objects of estimate job0 is {BOX}, {MUSTARD}"):
+        estimates.of_scene(Asked("next"))
+
+
+def test_scenes_that_cannot_be_estimated_are_told(estimates, runner, tmp_path):
+    with pytest.raises(UnknownName, match="no scene named 't'"):
+        estimates.of_scene(Asked(), "t")
+    with pytest.raises(InvalidInput, match="seed"):
+        estimates.of_scene(Asked(seed=-1))
+    runner.names = (BOX, "spoon")
+    with pytest.raises(MissingFields, match="no field yet for spoon"):
+        estimates.of_scene(Asked())
+    runner.current = None
+    with pytest.raises(NoScene, match="make one"):
+        estimates.of_scene(Asked())
+    assert left_over(tmp_path) == []
+
+
+# Uploads
+
+
+def test_an_uploaded_folder_is_taken_in_with_its_prior(estimates, runner, tmp_path):
+    job = upload(estimates, archive(tmp_path))
+    assert job.params["of"] == {"scene": None, "revision": None, "file_name": "seen.zip"}
+    assert read_observation(runner.jobs.inputs(job.id) / "observation").names == (BOX, MUSTARD)
+    assert estimates.simulation_errors(runner.jobs.finish(job)) is None
+    write_estimated(tmp_path / "prior.json", believed())
+    data = archive(tmp_path, seen(views=1, masks=False), prior_json=(tmp_path / "prior.json").read_text())
+    goal = upload(estimates, data, Asked("goal"))
+    assert (runner.jobs.inputs(goal.id) / "prior.json").is_file()
+    later = upload(estimates, archive(tmp_path, seen(masks=False)), Asked("next", prior=job.id))
+    assert (runner.jobs.inputs(later.id) / "prior.json").is_file()
+    assert left_over(tmp_path) == []
+
+
+def empty_mask():
+    observation = seen()
+    observation.masks[:, 1] = False
+    return observation
+
+
+@pytest.mark.parametrize(
+    ("observation", "asked", "kind", "words"),
+    [
+        (seen(masks=False), Asked(), InvalidInput, "masks of the first frame is missing, but it must be given"),
+        (empty_mask(), Asked(), InvalidInput, f"mask of {MUSTARD} is empty in every view"),
+        (seen(("spoon",)), Asked(), UnknownName, "no field named 'spoon'"),
+        (seen(), Asked("goal", prior="x"), InvalidInput, "number of views of a goal is 4, but it must be 1"),
+        (seen(), Asked("next"), NoPrior, "in the archive .prior.json. or named in the request"),
+        (seen(), Asked("next", prior="x"), UnknownName, "no estimate named 'x'"),
+    ],
+)
+def test_observations_that_do_not_fit_are_refused_at_once(estimates, tmp_path, observation, asked, kind, words):
+    with pytest.raises(kind, match=words):
+        upload(estimates, archive(tmp_path, observation), asked)
+    assert estimates.all() == ()
+    assert left_over(tmp_path) == []
+
+
+def larger_image(folder):
+    write_observation(
+        folder.parent / "large",
+        replace(seen(), cameras=default_cameras(32), images=np.zeros((4, 32, 32, 3)), masks=None),
+    )
+    shutil.copy(folder.parent / "large" / "image_2.png", folder / "image_2.png")
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (larger_image, "^image_2.png cannot be used: it is 32 x 32 px; 16 x 16 px as camera 2 is expected"),
+        (lambda folder: (folder / "mask_0_1.png").unlink(), "^mask_0_1.png cannot be used: there is no such file"),
+        (lambda folder: (folder / "image_0.png").write_bytes(b"no image"), "^image_0.png cannot be used: it is no PNG"),
+        (lambda folder: (folder / "observation.json").write_text("{"), "^observation.json cannot be used: it is not v"),
+        (lambda folder: (folder / "observation.json").unlink(), "^The uploaded file cannot be used: it holds no obs"),
+        (lambda folder: (folder / "prior.json").write_text("{}"), "^prior.json cannot be used"),
+        (lambda folder: write_estimated(folder / "prior.json", believed((BOX,))), "objects of prior.json is 003"),
+    ],
+)  # fmt: skip
+def test_damaged_uploads_are_told_in_one_sentence_that_knows_only_the_uploaders_names(
+    estimates, tmp_path, damage, words
+):
+    folder = tmp_path / "seen"
+    write_observation(folder, seen())
+    damage(folder)
+    with pytest.raises(UploadRefused, match=words) as refusal:
+        upload(estimates, zipped(folder))
+    assert str(tmp_path) not in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    assert left_over(tmp_path) == []
+
+
+def test_what_was_found_in_an_upload_is_told(tmp_path):
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "observation.zip").write_bytes(archive(tmp_path, empty_mask()))
+    assert examine(tmp_path / "new") == Uploaded((BOX, MUSTARD), ("0", "1", "2", "3"), True, (MUSTARD,), False)
+
+
+# Telling
+
+
+def test_the_errors_are_against_the_scene_as_it_was_seen(estimates, runner):
+    job = estimates.of_scene(Asked())
+    assert estimates.simulation_errors(job) is None
+    assert estimates.result(job) is None
+    moved = believed()
+    moved.state.poses.position[0] = [0.003, 0.004, 0]
+    done = runner.jobs.finish(job, estimate=moved)
+    errors = estimates.simulation_errors(done)
+    assert [error["position_mm"] for error in errors["objects"]] == pytest.approx([5, 0])
+    assert estimates.result(done)["trusted"] is True
+
+
+def test_images_are_of_cameras_and_steps_that_exist(estimates, runner):
+    job = estimates.of_scene(Asked())
+    assert estimates.observed(job, 2).read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(UnknownName, match="no view named '4'"):
+        estimates.observed(job, 4)
+    with pytest.raises(NoImages, match="first step has not been made"):
+        estimates.comparison(job, 0)
+    guesses = [{"objects": [], "light": {"position": [x, 0, 1]}} for x in (0.0, 1.0)]
+    lines = [json.dumps({"step": n, "guess": guess}) for n, guess in enumerate(guesses, 1)]
+    (runner.jobs.folder(job.id) / "steps.jsonl").write_text("\n".join(lines) + "\n")
+    assert estimates.comparison(job, 1, 1).state.light.position[0] == 0
+    latest = estimates.comparison(job, 1)
+    assert latest.state.light.position[0] > 0
+    assert latest.camera.name == "1"
+    assert latest.observed == estimates.observed(job, 1).read_bytes()
+    with pytest.raises(UnknownName, match="no step named '3'"):
+        estimates.comparison(job, 1, 3)
+    with pytest.raises(NoImages, match="it was cancelled"):
+        estimates.observed(runner.jobs.finish(job, "cancelled"), 0)
+
+
+def test_a_result_that_was_damaged_is_told(estimates, runner):
+    done = runner.jobs.finish(estimates.of_scene(Asked()))
+    (runner.jobs.folder(done.id) / STATE).write_text("{}")
+    with pytest.raises(CorruptFile, match=STATE):
+        estimates.result(done)

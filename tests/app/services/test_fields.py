@@ -1,0 +1,42 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from app.services.fields import FieldCatalogue, ShippedField
+from osfcore.errors import UnknownName
+from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo
+
+
+@pytest.fixture
+def shelf(tmp_path):
+    return FieldCatalogue(tmp_path, lambda: ("mug",))
+
+
+def put(data_dir, name):
+    folder = data_dir / "fields" / name
+    folder.mkdir(parents=True)
+    (folder / FIELD_FILE).write_bytes(b"weights")
+    (folder / METRICS_FILE).write_text(json.dumps({"psnr_full": 30.0, "psnr_mask": 25.0}))
+    return folder
+
+
+def test_what_was_trained_here_is_told_and_can_be_deleted(shelf, tmp_path):
+    folder = put(tmp_path, "mug")
+    put(tmp_path, "own_thing")
+    trained = {info.name: info for info in shelf.all() if info.source == "trained"}
+    assert set(trained) == {"mug", "own_thing"}
+    assert (trained["mug"].bytes, trained["mug"].metrics["psnr_mask"]) == (7, 25.0)
+    assert shelf.has_mesh("mug")
+    assert not shelf.has_mesh("own_thing")
+    shelf.remove("mug")
+    assert not folder.exists()
+    with pytest.raises(UnknownName):
+        shelf.remove("mug")
+
+
+def test_what_is_shipped_stays(shelf, monkeypatch):
+    shipped = FieldInfo("mug", "shipped", Path("mug.safetensors"), 7, {})
+    monkeypatch.setattr(shelf._library, "info", lambda name: shipped)
+    with pytest.raises(ShippedField, match="mug is shipped"):
+        shelf.remove("mug")

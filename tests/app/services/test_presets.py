@@ -1,0 +1,106 @@
+import contextlib
+
+import numpy as np
+import pytest
+
+from app.services.presets import PRESETS, preset, set_up
+from app.services.runner import TooManyScenes
+from app.storage.database import CannotStore
+from osfcore.errors import UnknownName
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import rotation_angle
+from osfcore.objects.catalogue import DEFAULT_NAMES
+from osfcore.world.goal_layouts import random_goal
+from osfcore.world.tabletop import SceneRequest, Tabletop
+from tests.app.storage.test_database import record
+
+STAYS_M, STAYS_RAD = 0.003, 0.05  # putting everything back to rest may shift it this much
+
+each = pytest.mark.parametrize("one", PRESETS, ids=lambda one: one.id)
+
+
+@each
+def test_a_first_visit_can_choose_any_of_them(one):
+    assert set(one.objects) <= set(DEFAULT_NAMES)
+
+
+def test_there_are_six_of_different_names():
+    assert len({one.id for one in PRESETS}) == len({one.title for one in PRESETS}) == len(PRESETS) == 6
+    assert all(preset(one.id) is one for one in PRESETS)
+    with pytest.raises(UnknownName, match="no preset named 'seventh'"):
+        preset("seventh")
+
+
+@each
+def test_every_object_can_be_recognised_as_shipped(one):
+    fields = FieldLibrary(None)
+    assert [name for name in one.objects if not fields.has(name)] == []
+    assert len(set(one.objects)) == len(one.objects)
+    assert 1 <= one.moved <= len(one.objects)
+
+
+@each
+def test_light_comes_from_where_the_preset_says(one):
+    for light, angles in ((one.light, (one.azimuth_deg, one.elevation_deg)), (one.goal_light, one.goal_angles_deg)):
+        if angles is None:
+            assert light is None
+            continue
+        x, y, z = light.direction
+        assert np.rad2deg(np.arcsin(z)) == pytest.approx(angles[1])
+        assert np.rad2deg(np.arctan2(y, x)) % 360 == pytest.approx(angles[0])
+
+
+@each
+def test_the_goal_differs_from_the_table_for_as_many_objects_as_it_says(one, library):
+    if missing := set(one.objects) - set(library.names()):
+        pytest.skip(f"without meshes here: {', '.join(sorted(missing))}")
+    with contextlib.closing(Tabletop(library, request=SceneRequest(names=one.objects, light=one.light))) as world:
+        world.arrange(one.seed)
+        start = world.truth()
+        goal, moved = random_goal(world, one.goal_seed, one.moved)
+    shift_m = np.linalg.norm(goal.poses.position - start.poses.position, axis=1)
+    turn_rad = rotation_angle(goal.poses.quaternion, start.poses.quaternion)
+    elsewhere = {n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > STAYS_M or rad > STAYS_RAD}
+    assert elsewhere == set(moved)
+    assert len(moved) == one.moved
+
+
+class Service:
+    """A runner and goals in one, of which one thing may fail."""
+
+    def __init__(self, error=None):
+        self.error, self.scenes, self.goals = error, [], []
+
+    def create_scene(self, **asked):
+        self.scenes.append(asked)
+        return record("s")
+
+    def delete_scene(self, scene):
+        assert scene == "s"
+        self.scenes.pop()
+
+    def draw(self, *asked):
+        if self.error is not None:
+            raise self.error
+        self.goals.append(asked)
+        return "goal"
+
+
+@each
+def test_a_preset_is_asked_for_as_it_is_described(one):
+    service = Service()
+    scene, goal = set_up(one, service, service)
+    assert (scene.id, goal) == ("s", "goal")
+    (asked,) = service.scenes
+    assert (asked["names"], asked["seed"]) == (one.objects, one.seed)
+    np.testing.assert_array_equal(asked["light"].direction, one.light.direction)
+    (drawn,) = service.goals
+    assert drawn[:4] == ("s", one.goal_seed, one.moved, one.title)
+
+
+@pytest.mark.parametrize("error", [CannotStore("goals", "No space left on device"), TooManyScenes(3)])
+def test_without_its_goal_no_table_is_left(error):
+    service = Service(error)
+    with pytest.raises(type(error)):
+        set_up(PRESETS[0], service, service)
+    assert service.scenes == []

@@ -1,0 +1,222 @@
+import asyncio
+import os
+import shutil
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from app.jobs.job import JobChanged, TrainingAlready
+from app.processes.messages import CurrentScene, Notice, SceneChanged, TakeImage
+from app.services.runner import Runner, SceneHeld, TooManyScenes
+from app.services.service_settings import Settings
+from app.storage.database import Store
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.objects.asset_library import AssetLibrary
+from tests.app.conftest import until
+from tests.app.jobs.test_registry import LONG, TABLE
+
+BOX = "003_cracker_box"
+
+
+@pytest.fixture
+def open_runner(data_dir):
+    """Opens a runner on the data directory, as a service that starts; closed in the end, or by `close`."""
+    opened = []
+
+    def close():
+        while opened:
+            runner, store = opened.pop()
+            runner.stop()
+            store.close()
+
+    def open_runner(**settings):
+        close()
+        settings = Settings(data_dir=data_dir, **settings)
+        store = Store(data_dir)
+        runner = Runner(settings, store, AssetLibrary(data_dir / "objects"))
+        opened.append((runner, store))
+        runner.events = []
+        runner.hub.subscribe(runner.events.append)
+        runner.start()
+        return runner
+
+    yield open_runner
+    close()
+
+
+def test_the_first_start_shows_a_scene_by_itself(open_runner):
+    runner = open_runner()
+    until(lambda: runner.current is not None)
+    (record,) = runner.scenes()
+    assert (record.seed, len(record.state.names)) == (0, 3)
+    assert any(isinstance(event, CurrentScene) for event in runner.events)
+
+
+def test_without_objects_there_is_no_scene_until_some_come(open_runner, data_dir, tmp_path):
+    shutil.move(data_dir / "objects", tmp_path / "later")
+    runner = open_runner()
+    runner.ensure_demo_scene()
+    assert runner.scenes() == ()
+    shutil.move(tmp_path / "later", data_dir / "objects")
+    runner.ensure_demo_scene()
+    until(runner.scenes)
+
+
+def test_everything_is_there_after_a_restart(open_runner):
+    runner = open_runner(demo_scene=False)
+    first = runner.create_scene(names=(BOX,), seed=3)
+    runner.create_scene(count=2, seed=4)
+    moved = runner.act(first.id, [(0.1, 0.1, 0.0)] * 2)
+    runner.activate(first.id)
+    again = open_runner()
+    assert again.current == first.id
+    assert [record.seed for record in again.scenes()] == [3, 4]
+    found = again.scene(first.id)
+    assert found.time_s == moved.time_s
+    assert np.array_equal(found.state.poses.position, moved.state.poses.position)
+    back = again.reset_scene(first.id)
+    assert np.allclose(back.state.poses.position, first.state.poses.position, atol=1e-9)
+
+
+def test_a_dying_stage_is_told_and_the_scenes_live_on(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    until(lambda: runner.stage_status == "ready")
+    process = runner._stage.process
+    os.kill(process.pid, signal.SIGKILL)
+    until(lambda: runner._stage.process is not process)
+    assert any(isinstance(event, Notice) and event.level == "error" for event in runner.events)
+    assert runner.act(scene.id, [(0.1, 0, 0)]).revision > scene.revision
+
+
+def test_scenes_have_a_limit(open_runner):
+    runner = open_runner(demo_scene=False, max_scenes=1)
+    runner.create_scene(names=(BOX,))
+    with pytest.raises(TooManyScenes, match="1 scenes"):
+        runner.create_scene(names=(BOX,))
+
+
+def test_the_limit_holds_for_scenes_made_at_the_same_time(open_runner):
+    runner = open_runner(demo_scene=False, max_scenes=2)
+
+    def make(_):
+        try:
+            return runner.create_scene(names=(BOX,))
+        except TooManyScenes:
+            return None
+
+    with ThreadPoolExecutor(8) as executor:
+        made = [record for record in executor.map(make, range(8)) if record is not None]
+    assert len(made) == len(runner.scenes()) == 2
+
+
+def test_a_busy_stage_is_not_taken_for_a_hanging_one(open_runner):
+    """Each answer comes in time, the last one long after the limit for one answer."""
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    single = time.monotonic()
+    asyncio.run(runner.image(TakeImage(scene.id, "0", 700)))
+    single = time.monotonic() - single
+    runner._stage._timeout_s = max(3 * single, 0.5)
+    pid = runner._stage._process.pid
+
+    async def many():
+        return await asyncio.gather(*(runner.image(TakeImage(scene.id, "1", 700 + k)) for k in range(16)))
+
+    images = asyncio.run(many())
+    assert len({*images}) == 16
+    assert runner._stage._process.pid == pid
+
+
+def test_an_image_that_many_ask_for_at_once_is_made_once(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+
+    async def many():
+        return await asyncio.gather(*(runner.image(TakeImage(scene.id, "2", 256)) for _ in range(10)))
+
+    first, *others = asyncio.run(many())
+    assert all(other is first for other in others)
+
+
+def test_changes_are_told_and_refusals_are_not(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    runner.events.clear()
+    with pytest.raises(InvalidInput):
+        runner.act(scene.id, [(9, 0, 0)])
+    with pytest.raises(InvalidInput, match="repetition"):
+        runner.edit_scene(scene.id, poses=((BOX, Pose.identity()), (BOX, Pose.identity())))
+    with pytest.raises(UnknownName):
+        runner.edit_scene("none", light=Light(np.array([0, 0, 1.0])))
+    assert runner.events == []
+    runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))
+    (change,) = [event for event in runner.events if isinstance(event, SceneChanged)]
+    assert np.allclose(change.record.state.light.position, [0, 0, 1])
+
+
+def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    job = runner.jobs.submit(LONG[0], dict(LONG[1]))
+    until(lambda: runner.jobs.get(job.id).done > 0)
+    runner.jobs._jobs[job.id].params["scene"] = scene.id
+    for command in (
+        lambda: runner.act(scene.id, [(0.1, 0, 0)]),
+        lambda: runner.reset_scene(scene.id),
+        lambda: runner.delete_scene(scene.id),
+        lambda: runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0]))),
+    ):
+        with pytest.raises(SceneHeld, match=job.id):
+            command()
+
+
+def test_an_image_is_made_once_for_each_revision(open_runner):
+
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    command = TakeImage(scene.id, "0", 64)
+    first = asyncio.run(runner.image(command))
+    assert asyncio.run(runner.image(command)) is first
+    runner.edit_scene(scene.id, light=Light(np.array([0.0, 1.0, 0.2])))
+    second = asyncio.run(runner.image(command))
+    assert second != first
+
+
+def test_jobs_are_told_to_those_who_listen(open_runner):
+    runner = open_runner(demo_scene=False)
+    job = runner.submit_job(*TABLE)
+    until(lambda: runner.jobs.get(job.id).state == "done", 60)
+    until(lambda: any(isinstance(e, JobChanged) and e.job.state == "done" for e in runner.events))
+
+
+def test_one_field_is_ordered_once_however_many_ask_at_once(open_runner, monkeypatch):
+    runner = open_runner(demo_scene=False)
+    params = {"name": "box", "source": {"mesh": BOX, "set": None}, "minutes": 10, "seed": 0, "images": 5000}
+    submit = runner.jobs.submit
+    monkeypatch.setattr(runner.jobs, "submit", lambda *order: (time.sleep(0.05), submit(*order))[1])
+
+    def order(_):
+        try:
+            return runner.submit_job("train_field", dict(params))
+        except TrainingAlready:
+            return None
+
+    with ThreadPoolExecutor(6) as executor:
+        made = [job for job in executor.map(order, range(6)) if job is not None]
+    assert len(made) == len(runner.jobs.live("train_field")) == 1
+    runner.jobs.cancel(made[0].id)
+
+
+def test_a_field_that_was_put_aside_by_a_killed_service_is_back_after_the_next_start(open_runner, data_dir):
+    aside = data_dir / "fields" / ".replaced-x" / "mug"
+    aside.mkdir(parents=True)
+    (aside / "field.safetensors").write_bytes(b"weights")
+    open_runner(demo_scene=False)
+    assert (data_dir / "fields" / "mug" / "field.safetensors").read_bytes() == b"weights"
+    assert not aside.parent.exists()

@@ -1,0 +1,33 @@
+from dataclasses import replace
+
+import numpy as np
+
+from app.viewer.panels.push_trial import Trial
+from osfcore.geometry.rollouts import Rollouts
+from tests.app.storage.test_database import record
+
+NOTHING = Rollouts(("x", "y"), np.zeros((1, 3, 2, 3)), np.zeros((1, 3, 2, 4)), np.zeros((1, 3, 3)))
+
+
+def trial():
+    return Trial(record(revision=5), np.zeros((2, 3)), NOTHING, 0.1)
+
+
+def test_it_follows_its_own_execution_action_by_action():
+    new = trial()
+    first = new.after(record(revision=6), (record().state,), new)
+    assert not first.is_executed
+    assert len(first.truth) == 3  # the start, the way, the end
+    done = first.after(record(revision=7), (), new)
+    assert done.is_executed
+    assert len(done.truth) == 4
+    assert done.after(record(revision=7), (), None) is done
+    assert done.after(record(revision=8), (), None) is None
+
+
+def test_any_other_change_ends_it_and_old_news_do_not():
+    new = trial()
+    assert new.after(record(revision=5), (), None) is new
+    assert new.after(record(revision=6), (), None) is None
+    assert new.after(record(revision=6), (), replace(new, rollouts=replace(NOTHING))) is None
+    assert new.after(record(revision=8), (), new) is None

@@ -1,0 +1,208 @@
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.control import closed_loop as module
+from osfcore.control.closed_loop import Episode
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
+from osfcore.control.goal import GoalImage
+from osfcore.errors import InvalidInput
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.planning.mppi import PlanSettings
+from osfcore.planning.pose_cost import PoseGoal
+from osfcore.progress import Progress
+from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, knowledge, sure, table
+
+SMALL = EpisodeSettings(steps=12, plan=PlanSettings(samples=48, horizon=10))
+KNOWN = knowledge()
+
+
+@pytest.fixture
+def world(library):
+    world = table(library)
+    yield world
+    world.close()
+
+
+@pytest.fixture
+def told(world, monkeypatch):
+    """Estimators that are told the truth at once, with doubts that a test may set."""
+    doubts: dict[str, tuple[str, ...]] = {}
+
+    def steps(look, state):
+        yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state, doubts.get(look)))
+
+    monkeypatch.setattr(module, "estimate_first", lambda *_: steps("first", world.truth()))
+    monkeypatch.setattr(module, "estimate_next", lambda *_, usual: steps("next", world.truth()))
+    monkeypatch.setattr(module, "search_lost", lambda *_: steps("search", world.truth()))
+    monkeypatch.setattr(module, "usual_residuals", lambda *_: np.zeros(len(NAMES)))
+    return doubts
+
+
+def shifted(world, name=GELATIN, shift=(0.0, 0.0)) -> PoseGoal:
+    state = world.truth()
+    pose = state.pose(name)
+    return PoseGoal.of(state, {name: Pose(pose.position + [*shift, 0.0], pose.quaternion)})
+
+
+def toward_middle(world, name=GELATIN, length=0.08) -> PoseGoal:
+    place = world.truth().pose(name).position[:2]
+    return shifted(world, name, -length * place / np.linalg.norm(place))
+
+
+def begun(world, goal, settings=SMALL, **more) -> Episode:
+    return Episode(world, KNOWN, goal, settings, np.random.default_rng(0), **more)
+
+
+def test_the_table_becomes_what_was_asked_for(world, told):
+    goal = toward_middle(world)
+    events = list(begun(world, goal).run())
+    left = np.linalg.norm(goal.offsets_m(world.truth()), axis=1)
+    assert left.max() < 0.02
+    assert isinstance(events[-1], Finished)
+    acted = [event.number for event in events if isinstance(event, Acted)]
+    assert acted == list(range(1, events[-1].number + 1))
+    steps = [event for event in events if isinstance(event, Stepped)]
+    assert [step.number for step in steps] == [0, *acted]
+    assert steps[-1].offsets_m.max() == pytest.approx(left.max(), abs=1e-9)
+    assert steps[-1].image_cost < 0.3 * steps[0].image_cost
+    kinds = Counter(type(event) for event in events)
+    assert kinds[GoalFound] == 1
+    assert kinds[Planning] == 2 * len(acted)
+    assert all(set(step.seconds) == {"estimate", "plan", "act"} for step in steps[1:])
+
+
+def test_a_goal_that_is_met_ends_at_once(world, told):
+    *_, last = events = list(begun(world, shifted(world)).run())
+    assert (last.outcome, last.number) == ("reached", 0)
+    assert not any(isinstance(event, (Planning, Acted)) for event in events)
+
+
+@pytest.mark.parametrize("despite", [False, True])
+def test_a_goal_image_that_is_not_explained_moves_nothing_unless_told_to(world, told, monkeypatch, despite):
+    goal = toward_middle(world)
+    state = replace(world.truth(), poses=goal.poses, pusher=None)
+    found = sure(state, ("it differs", ""))
+    step = EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=found)
+    monkeypatch.setattr(module, "estimate_goal", lambda *_: iter([step]))
+    monkeypatch.setattr(module, "unmoved", lambda _models, _goal, found, _now: found)
+    image = GoalImage(goal_camera(), np.zeros((128, 128, 3), np.float32))
+    settings = replace(SMALL, steps=1, despite_doubts=despite)
+    *_, last = events = list(begun(world, image, settings).run())
+    assert any(isinstance(event, Noticed) and event.matter == "goal" for event in events)
+    assert last.outcome == ("out of steps" if despite else "refused")
+    assert any(isinstance(event, Acted) for event in events) == despite
+
+
+def test_objects_of_another_scene_are_refused_before_anything_moves(world, told):
+    before = world.truth()
+    goal = PoseGoal(("025_mug", CAN), before.poses)
+    with pytest.raises(InvalidInput, match="objects of the goal"):
+        list(begun(world, goal).run())
+    np.testing.assert_array_equal(world.truth().pusher, before.pusher)
+
+
+def test_without_acting_plans_are_shown_and_nothing_moves(world, told):
+    before, seen = world.truth(), []
+    events = begun(world, toward_middle(world), replace(SMALL, acting=False)).run()
+    for event in events:
+        seen.append(event)
+        if sum(isinstance(one, Stepped) for one in seen) == 3:
+            break
+    events.close()
+    assert sum(isinstance(event, Planning) for event in seen) == 4
+    assert not any(isinstance(event, Acted) for event in seen)
+    np.testing.assert_array_equal(world.truth().poses.position, before.poses.position)
+
+
+def test_without_planning_the_last_plan_is_followed_to_its_end(world, told):
+    episode = begun(world, toward_middle(world), replace(SMALL, steps=5))
+    plans, actions = [], []
+    for event in episode.run():
+        if isinstance(event, Planning):
+            plans.append(event.round.actions)
+        if isinstance(event, Acted):
+            actions.append(event.action)
+            episode.settings = replace(episode.settings, planning=False)
+    assert len(plans) == 2
+    np.testing.assert_allclose(actions, plans[-1][:5])
+
+
+def test_a_plan_serves_for_as_many_actions_as_asked(world, told):
+    events = list(begun(world, toward_middle(world, length=0.15), replace(SMALL, steps=5, replan_every=2)).run())
+    assert sum(isinstance(event, Planning) for event in events) == 2 * 3
+    assert sum(isinstance(event, Acted) for event in events) == 5
+
+
+def test_settings_count_from_the_next_step_on(world, told):
+    episode = begun(world, toward_middle(world, length=0.15))
+    for event in episode.run():
+        if isinstance(event, Acted) and event.number == 2:
+            episode.settings = replace(episode.settings, steps=3)
+    assert event.number == 3
+
+
+def test_nothing_coming_nearer_is_noticed(world, told):
+    events = list(begun(world, toward_middle(world), replace(SMALL, planning=False)).run())
+    stalled = [event for event in events if isinstance(event, Noticed) and event.matter == "stalled"]
+    assert [event.number for event in stalled] == [9]
+
+
+def test_a_lamp_and_an_object_moved_by_hand_are_noticed(world, told):
+    goal, notices = toward_middle(world), []
+    for event in begun(world, goal, replace(SMALL, steps=2, planning=False)).run():
+        if isinstance(event, Acted) and event.number == 1:
+            world.set_light(Light.from_angles(LIGHT.direction[0] + 2.0, 0.6))
+            truth = world.truth()
+            far = max(NAMES, key=lambda name: np.linalg.norm((truth.pose(name).position - truth.pusher)[:2]))
+            pose = truth.pose(far)
+            world.move_object(far, Pose(pose.position + [0.0, 0.04, 0.0], pose.quaternion))
+        if isinstance(event, Noticed):
+            notices.append(event)
+    assert [notice.matter for notice in notices] == ["lamp", "object"]
+    assert notices[1].names == (far,)
+
+
+def test_what_stays_doubtful_is_looked_for_once_the_pusher_made_room(world, told):
+    seen, looks = [], []
+    for event in begun(world, toward_middle(world), replace(SMALL, steps=6, planning=False)).run():
+        told["next"] = ("it is hardly visible", "") if not looks.count("search") else ("", "")
+        seen.append(event)
+        looks += [event.look] if isinstance(event, Looking) else []
+    matters = [event.matter for event in seen if isinstance(event, Noticed)]
+    assert matters[:2] == ["lost", "found"]
+    assert looks.count("search") == 1
+    retreat = [event.action for event in seen if isinstance(event, Acted) and np.any(event.action)]
+    assert len(retreat) == 2
+
+
+def test_the_first_look_needs_masks_unless_it_is_known(world, told):
+    state = world.truth()
+    events = list(begun(world, shifted(world), start=sure(state)).run())
+    assert not any(isinstance(event, Looking) for event in events)
+    assert events[0].observation.masks is None
+
+
+def test_by_real_eyes_a_lamp_and_an_object_moved_by_hand_are_survived(world):
+    """The pusher stands still; somebody else moves lamp and can. Both are found again."""
+    start, goal = sure(world.truth()), shifted(world, CAN, (0.0, 0.06))
+    light = Light.from_angles(-1.8, 0.8)
+    last = None
+    for event in begun(world, goal, replace(SMALL, steps=3, planning=False), start=start).run():
+        if isinstance(event, Acted) and event.number == 1:
+            world.set_light(light)
+        if isinstance(event, Acted) and event.number == 2:
+            pose = world.truth().pose(CAN)
+            world.move_object(CAN, Pose(pose.position + [0.03, 0.02, 0.0], pose.quaternion))
+        last = event if isinstance(event, Stepped) else last
+    assert last.estimate.trusted
+    assert np.arccos(last.estimate.state.light.direction @ light.direction) < np.deg2rad(5)
+    truth = world.truth()
+    for name in NAMES:
+        assert last.estimate.state.pose(name).position == pytest.approx(truth.pose(name).position, abs=0.005)

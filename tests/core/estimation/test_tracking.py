@@ -1,0 +1,118 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.estimation.objective.resting_orientations import about_z
+from osfcore.estimation.tracking import TrackingConfig, estimate_next
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, quaternion_multiply, rotation_angle
+from tests.core.estimation.scenes import apart, lying, observe
+
+CAMERAS = default_cameras(96)[:3]
+
+
+def followed(models, state, expected, effort=None, seed=0):
+    seen = observe(models, state, CAMERAS, masks=False)
+    steps = list(estimate_next(models, seen, expected, np.random.default_rng(seed), effort))
+    assert [step.estimate is None for step in steps] == [True] * (len(steps) - 1) + [False]
+    return steps
+
+
+def pushed(truth, shift, yaw):
+    """The first object pushed and turned."""
+    position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
+    position[0, :2] += shift
+    quaternion[0] = quaternion_multiply(about_z(np.array([yaw]))[0], quaternion[0])
+    return replace(truth, poses=Pose(position, quaternion))
+
+
+def test_what_stands_still_stays_where_it_is(models, truth):
+    steps = followed(models, truth, truth)
+    shift, turn, light = apart(steps[-1].estimate.state, truth)
+    assert shift.max() < 0.001
+    assert np.rad2deg(turn).max() < 1
+    assert light == 0  # held
+    assert steps[-1].estimate.trusted
+    assert all(step.candidates is None for step in steps)  # nothing to search
+
+
+@pytest.mark.parametrize(("shift", "yaw"), [((0.008, -0.006), 0.08), ((-0.03, 0.03), 0.3)])
+def test_a_pushed_object_is_followed(models, truth, shift, yaw):
+    moved = pushed(truth, shift, yaw)
+    shift, turn, _ = apart(followed(models, moved, truth)[-1].estimate.state, moved)
+    assert shift.max() < 0.004
+    assert np.rad2deg(turn).max() < 4
+
+
+def test_what_a_push_moved_far_is_followed(models, truth):
+    push = np.array([0.07, -0.04, 0.0])
+    moved = replace(pushed(truth, push[:2], 0.0), pusher=np.array([0.0, 0.0, 0.062]) + push)
+    before = replace(truth, pusher=np.array([0.0, 0.0, 0.062]))
+    estimate = followed(models, moved, before)[-1].estimate
+    shift, turn, _ = apart(estimate.state, moved)
+    assert shift.max() < 0.004
+    assert np.rad2deg(turn).max() < 4
+    assert estimate.trusted
+
+
+def test_what_fell_over_is_found_lying_in_another_way(models, truth):
+    fallen = lying(models, truth.names[0], 0, 0.05, -0.08)
+    position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
+    position[0], quaternion[0] = fallen.position, fallen.quaternion
+    other = replace(truth, poses=Pose(position, quaternion))
+    assert rotation_angle(fallen.quaternion, truth.poses.quaternion[0]) > 1
+    shift, turn, _ = apart(followed(models, other, truth)[-1].estimate.state, other)
+    assert shift.max() < 0.004
+    assert np.rad2deg(turn).max() < 4
+
+
+def test_what_was_taken_the_wrong_way_round_is_turned(models, truth):
+    wrong = pushed(truth, (0.0, 0.0), np.pi)
+    estimate = followed(models, truth, wrong)[-1].estimate
+    shift, turn, _ = apart(estimate.state, truth)
+    assert shift.max() < 0.002
+    assert np.rad2deg(turn).max() < 2
+    assert estimate.trusted
+
+
+def test_objects_that_moved_are_no_moved_lamp(models, truth):
+    steps = followed(models, pushed(truth, (0.05, 0.05), 0.5), truth)
+    assert "light" not in [step.stage for step in steps]
+
+
+def test_a_moved_lamp_is_noticed(models, truth):
+    moved = replace(truth, light=Light(np.array([-0.6, 0.2, 0.5])))
+    steps = followed(models, moved, truth)
+    shift, turn, light = apart(steps[-1].estimate.state, moved)
+    assert "light" in [step.stage for step in steps]
+    assert np.rad2deg(light) < 3
+    assert shift.max() < 0.002
+    assert np.rad2deg(turn).max() < 2
+
+
+def test_a_vanished_object_is_doubted(models, truth):
+    away = truth.poses.position.copy()
+    away[0] = 3.0, 0.0, 0.0
+    gone = replace(truth, poses=Pose(away, truth.poses.quaternion))
+    effort = TrackingConfig(generations=2, sweeps=1)
+    assert followed(models, gone, truth, effort)[-1].estimate.doubts[0]
+
+
+def test_the_same_generator_gives_the_same_estimate(models, truth):
+    moved, effort = pushed(truth, (0.02, 0.01), 0.2), TrackingConfig(generations=2, sweeps=1)
+    first, second = (followed(models, moved, truth, effort, seed=5)[-1].estimate.state for _ in range(2))
+    np.testing.assert_array_equal(first.poses.position, second.poses.position)
+    np.testing.assert_array_equal(first.poses.quaternion, second.poses.quaternion)
+
+
+def test_other_objects_than_expected_are_refused(models, truth):
+    seen = observe(models, truth, CAMERAS, masks=False)
+    other = replace(truth, names=truth.names[::-1])
+    with pytest.raises(InvalidInput, match="expected state"):
+        next(estimate_next(models, seen, other, np.random.default_rng(0)))
+    unheard = replace(seen, names=("unheard", truth.names[1]))
+    with pytest.raises(UnknownName, match="unheard"):
+        next(estimate_next(models, unheard, truth, np.random.default_rng(0)))

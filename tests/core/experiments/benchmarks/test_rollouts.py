@@ -1,0 +1,23 @@
+import numpy as np
+
+from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.experiments.benchmarks import rollouts as bench_dynamics
+from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, bench_rollouts, rollout_rate
+from osfcore.geometry.rollouts import check_actions
+from tests.core.experiments.pushes import shapes
+
+
+def test_rollouts_are_timed_in_a_scene_where_most_paths_meet_something(monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "SEQUENCES", 40)
+    monkeypatch.setattr(bench_dynamics, "_REPEATS", 1)
+    costs = bench_rollouts(PropagationNetwork(8, 1), shapes())
+    assert costs.rollout_s > 0
+    assert np.isclose(costs.rollout_steps_per_s, 400 / costs.rollout_s)
+    assert costs.touched_share > 0.3
+    assert rollout_rate(PropagationNetwork(8, 1), shapes()) > 0
+
+
+def test_paths_are_actions():
+    actions = bench_dynamics._paths(np.random.default_rng(0))
+    assert check_actions(actions).shape == (1000, 10, 3)
+    assert len(BENCH_NAMES) == 3

@@ -1,0 +1,55 @@
+import json
+
+import pytest
+
+from osfcore.errors import InvalidInput, MissingAssets, UnknownName
+from osfcore.experiments.benchmarks import rollouts as bench_dynamics
+from osfcore.experiments.dynamics import evaluation as dynamics
+from osfcore.experiments.dynamics.evaluation import REPORT_FILE, EvaluateDynamics, evaluate_dynamics
+from osfcore.fields.field_library import FieldLibrary
+
+NAMES = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Short episodes of few objects."""
+    monkeypatch.setattr(dynamics, "_STEPS", 34)
+    monkeypatch.setattr(dynamics, "COUNTS", (2, 3))
+    monkeypatch.setattr(bench_dynamics, "SEQUENCES", 10)
+
+
+def test_an_evaluation_collects_once_and_tells_everything(quick, library, tmp_path):
+    config = EvaluateDynamics(tmp_path, tasks=1, seed=4, names=NAMES)
+    steps = list(evaluate_dynamics(config, FieldLibrary(None), library))
+    report = steps[-1].report
+    assert report is not None
+    assert (steps[-1].done, steps[-1].total) == (steps[-1].total, steps[-1].total)
+    assert set(report["by_objects"]) == {"2", "3"}
+    assert report["windows"] > 0
+    assert report["rollout_steps_per_s"] > 0
+    assert json.loads((tmp_path / REPORT_FILE).read_text()) == report
+    for name in ("dynamics.png", "trajectories.png"):
+        assert (tmp_path / name).exists()
+    files = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.h5")}
+    assert len(files) >= 4
+    again = list(evaluate_dynamics(config, FieldLibrary(None), library))[-1].report
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.h5")} == files
+    assert again is not None
+    assert {**again, "rollout_steps_per_s": 0} == {**report, "rollout_steps_per_s": 0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"tasks": 0}, InvalidInput, "number of tasks"),
+        ({"seed": -1}, InvalidInput, "seed"),
+        ({"names": ("003_cracker_box", "teapot")}, UnknownName, "teapot"),
+        ({"names": ("003_cracker_box", "011_banana", "024_bowl")}, MissingAssets, "011_banana"),
+        ({"names": ("003_cracker_box", "005_tomato_soup_can")}, InvalidInput, "at least 3"),
+    ],
+)
+def test_a_mistake_is_one_sentence(library, tmp_path, changes, error, words):
+    with pytest.raises(error, match=words):
+        next(evaluate_dynamics(EvaluateDynamics(tmp_path, **changes), FieldLibrary(None), library))
+    assert not list(tmp_path.iterdir())

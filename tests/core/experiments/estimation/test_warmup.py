@@ -1,0 +1,53 @@
+from dataclasses import replace
+
+import pytest
+
+import osfcore.experiments.estimation.warmup as module
+from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
+from osfcore.experiments.fields.composite_scenes import draw_scene
+from osfcore.experiments.fields.evaluation import MAX_TASKS
+from tests.core.experiments.oracle import Oracle
+from tests.core.experiments.solids import SOLIDS
+
+
+def test_every_kind_of_estimate_is_made_once(solids, library, monkeypatch):
+    made, found = [], []
+
+    def counted(name):
+        real = getattr(module, name)
+
+        def run(*args):
+            made.append(name)
+            for step in real(*args):
+                found.append(step.estimate)
+                yield step
+
+        return run
+
+    for name in ("estimate_first", "estimate_next", "estimate_goal"):
+        monkeypatch.setattr(module, name, counted(name))
+    monkeypatch.setattr(module, "_GOAL", replace(module._GOAL, side=32))
+    models = warm_models(SOLIDS[:2], solids, library, draw_scene(SOLIDS[:1], 1, 0, WARM_SCENE), 32)
+    assert made == ["estimate_first", "estimate_next", "estimate_goal"]
+    assert sum(estimate is not None for estimate in found) == len(made)
+    assert set(models._resting) == set(SOLIDS[:2])  # also of what is not in the scene
+
+
+def test_goals_are_left_out_where_none_are_measured(solids, library, monkeypatch):
+    oracle = Oracle()
+    oracle.install(monkeypatch)
+    for name in ("first", "next", "goal"):
+        monkeypatch.setattr(module, f"estimate_{name}", getattr(oracle, name))
+    draw = draw_scene(SOLIDS[:1], 1, 0, WARM_SCENE)
+    for goal in (False, True):
+        warm_models(SOLIDS[:1], solids, library, draw, 32, goal=goal)
+    assert [what for what, _ in oracle.asked] == [*["first search 4", "next"] * 2, "goal"]
+
+
+def test_nothing_is_measured_on_the_scene():
+    assert WARM_SCENE > MAX_TASKS
+
+
+def test_an_estimate_without_an_end_is_a_mistake():
+    with pytest.raises(AssertionError, match="last step"):
+        last_estimate(iter(()))

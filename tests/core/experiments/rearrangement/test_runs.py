@@ -1,0 +1,144 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import osfcore.control.closed_loop as episode
+import osfcore.experiments.rearrangement.runs as module
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import Acted, Finished, GoalFound, Observed
+from osfcore.control.knowledge import knowledge_of
+from osfcore.errors import OsfError, UnknownName
+from osfcore.estimation.steps import EstimateStep
+from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
+from osfcore.experiments.rearrangement.tasks import mpc_task
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import default_cameras, goal_camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.metrics.success import score_of
+from osfcore.objects.catalogue import CATALOGUE
+from osfcore.planning.mppi import PlanSettings
+from osfcore.progress import Progress
+from osfcore.world.tabletop import Tabletop
+
+NAME = "009_gelatin_box"
+QUICK = EpisodeSettings(steps=2, plan=PlanSettings(samples=8, horizon=4), despite_doubts=True)
+
+
+@pytest.fixture(scope="module")
+def task(library):
+    return mpc_task(library, (NAME,), 1, 0, 1)
+
+
+@pytest.fixture(scope="module")
+def knowledge(library):
+    return knowledge_of((NAME,), FieldLibrary(None), library, None)
+
+
+@pytest.fixture
+def worlds(monkeypatch):
+    """The worlds that are made, which count their actions."""
+    made = []
+
+    class Watched(Tabletop):
+        def __init__(self, *args, **more):
+            super().__init__(*args, **more)
+            self.acted = 0
+            made.append(self)
+
+        def act(self, action):
+            self.acted += 1
+            super().act(action)
+
+    monkeypatch.setattr(module, "Tabletop", Watched)
+    return made
+
+
+@pytest.fixture
+def eyes(monkeypatch, task, worlds):
+    """Estimators that know the truth, for real ones take half a minute."""
+
+    def told(state):
+        one = np.full(len(state.names), 1e-3)
+        estimate = EstimatedState(state, one, one, 1e-3, ("",) * len(state.names), "")
+        yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=estimate)
+
+    monkeypatch.setattr(episode, "estimate_first", lambda *_: told(worlds[0].truth()))
+    monkeypatch.setattr(episode, "estimate_next", lambda *_, **__: told(worlds[0].truth()))
+    monkeypatch.setattr(episode, "estimate_goal", lambda *_: told(task.goal))
+
+
+def is_closed(world):
+    try:
+        world.truth()
+    except OsfError:
+        return True
+    return False
+
+
+def pictures(library, state, cameras):
+    world = Tabletop(library)
+    try:
+        world.restore(state)
+        return world.render(cameras, with_pusher=state.pusher is not None).images
+    finally:
+        world.close()
+
+
+def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, knowledge, eyes, worlds):
+    events = list(run_from_images(task, library, knowledge, QUICK, np.random.default_rng(0)))
+    first, *_, finished, ended = events
+    assert isinstance(first, Observed)
+    cameras = first.observation.cameras
+    assert len(cameras) == len(default_cameras())
+    assert first.observation.masks is not None
+    np.testing.assert_allclose(first.observation.images, pictures(library, task.start, cameras), atol=1e-6)
+    (found,) = (event for event in events if isinstance(event, GoalFound))
+    np.testing.assert_allclose(found.image, pictures(library, task.goal, (goal_camera(),))[0], atol=1e-6)
+    assert isinstance(finished, Finished)
+    assert finished.number == sum(isinstance(event, Acted) for event in events) == worlds[0].acted == 2
+    assert isinstance(ended, Ended)
+    assert is_closed(worlds[0])
+    np.testing.assert_array_equal(ended.goal, found.image)
+    bare = replace(ended.state, pusher=None)
+    np.testing.assert_allclose(ended.image, pictures(library, bare, (goal_camera(),))[0], atol=1e-6)
+
+
+def test_an_episode_that_is_left_closes_its_world(task, library, knowledge, eyes, worlds):
+    events = run_from_images(task, library, knowledge, QUICK, np.random.default_rng(0))
+    next(events)
+    assert not is_closed(worlds[0])
+    events.close()
+    assert is_closed(worlds[0])
+
+
+def test_who_is_told_the_truth_comes_nearer(task, library, knowledge, worlds):
+    settings = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16))
+    ended = run_told_the_truth(task, library, knowledge, settings, np.random.default_rng(0))
+    before, after = (score_of(task, state, knowledge.symmetries).moved_mm for state in (task.start, ended.state))
+    assert before > 70
+    assert after < before / 2
+    assert 0 < worlds[0].acted <= 12
+    assert is_closed(worlds[0])
+    np.testing.assert_allclose(ended.goal, pictures(library, task.goal, (goal_camera(),))[0], atol=1e-6)
+    assert np.abs(ended.image - ended.goal).max() > 0.01
+
+
+def test_no_more_actions_than_there_may_be(task, library, knowledge, worlds):
+    run_told_the_truth(task, library, knowledge, replace(QUICK, steps=3, replan_every=2), np.random.default_rng(0))
+    assert worlds[0].acted == 3
+
+
+def test_what_is_at_its_goal_is_left_alone(task, library, knowledge, worlds):
+    done = replace(task, goal=replace(task.start, pusher=None))
+    ended = run_told_the_truth(done, library, knowledge, QUICK, np.random.default_rng(0))
+    assert worlds[0].acted == 0
+    assert score_of(done, ended.state, knowledge.symmetries).moved_mm == pytest.approx(0, abs=0.01)
+    np.testing.assert_allclose(ended.image, ended.goal, atol=1e-3)
+
+
+def test_of_each_object_everything_is_known(knowledge, library):
+    assert set(knowledge.shapes) == {NAME}
+    assert knowledge.symmetries == {NAME: CATALOGUE[NAME].symmetry}
+    with pytest.raises(UnknownName, match="teapot"):
+        knowledge_of(("teapot",), FieldLibrary(None), library, None)

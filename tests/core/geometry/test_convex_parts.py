@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.convex_parts import MAX_PARTS, MAX_VERTICES, convex_parts, dent_depth_m, reduced_hull
+from osfcore.objects.asset import TexturedMesh
+from osfcore.objects.mesh import read_mesh, textured_mesh
+
+
+def as_textured(mesh: trimesh.Trimesh) -> TexturedMesh:
+    uv = np.zeros((len(mesh.vertices), 2))
+    return textured_mesh(mesh.vertices, mesh.faces, uv, np.zeros((4, 4, 3), np.uint8), "mesh")
+
+
+def clearance_m(point, parts) -> float:
+    """Distance from a point to the nearest part's planes; negative inside a part."""
+    depths = [(hull.equations[:, :3] @ point + hull.equations[:, 3]).max() for hull in map(ConvexHull, parts)]
+    return float(min(depths))
+
+
+def cut_m(points, kept) -> float:
+    """How far the points stick out of the hull of those kept."""
+    hull = ConvexHull(kept)
+    return float((points @ hull.equations[:, :3].T + hull.equations[:, 3]).max())
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.05])
+def test_reduced_hull_of_a_ball_cuts_off_little(radius):
+    points = np.array(trimesh.creation.icosphere(4, radius).vertices)
+    kept = reduced_hull(points)
+    assert kept is not None
+    assert len(kept) <= MAX_VERTICES
+    assert cut_m(points, kept) < 1.2e-3
+    assert np.linalg.norm(kept, axis=1).max() < radius + 2e-3
+
+
+def test_reduced_hull_keeps_a_box_exactly():
+    box = trimesh.creation.box((0.1, 0.06, 0.04)).subdivide().subdivide()
+    kept = reduced_hull(np.array(box.vertices))
+    assert kept is not None
+    assert {tuple(v) for v in kept.round(6)} >= {
+        (x, y, z) for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)
+    }
+    assert ConvexHull(kept).volume == pytest.approx(0.1 * 0.06 * 0.04)
+
+
+def test_points_in_a_plane_have_no_hull():
+    assert reduced_hull(np.random.default_rng(0).random((20, 3)) * [1, 1, 0]) is None
+
+
+def test_a_sheet_is_refused():
+    sheet = np.random.default_rng(0).random((30, 3)) * [0.1, 0.1, 0]
+    faces = np.arange(30).reshape(-1, 3)
+    mesh = TexturedMesh(sheet, sheet, faces, sheet[:, :2], np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InvalidInput, match="volume"):
+        convex_parts(mesh.vertices, mesh.faces)
+
+
+def test_dents_are_measured():
+    ball = as_textured(trimesh.creation.icosphere(4, 0.05))
+    assert dent_depth_m(ball.vertices, ball.faces) < 2e-3
+    ring = as_textured(trimesh.creation.annulus(0.04, 0.05, 0.08))
+    assert 0.025 < dent_depth_m(ring.vertices, ring.faces) < 0.045  # the middle of the lid is 40 mm from the ring
+
+
+def test_a_ring_stays_open_and_is_the_same_each_time():
+    ring = as_textured(trimesh.creation.annulus(0.04, 0.05, 0.05, sections=48))
+    parts = convex_parts(ring.vertices, ring.faces)
+    assert 3 <= len(parts) <= MAX_PARTS
+    assert clearance_m(np.zeros(3), parts) > 0.03
+    again = convex_parts(ring.vertices, ring.faces)
+    assert len(parts) == len(again)
+    assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("003_cracker_box", (1, 1)),
+        ("005_tomato_soup_can", (1, 3)),
+        ("006_mustard_bottle", (1, 3)),
+        ("035_power_drill", (4, 9)),
+    ],
+)
+def test_parts_of_real_objects(name, counts, library):
+    asset = library.load(name)
+    low, high = counts
+    assert low <= len(asset.parts) <= high
+    assert all(4 <= len(part) <= MAX_VERTICES for part in asset.parts)
+    body = trimesh.Trimesh(asset.mesh.vertices, asset.mesh.faces, process=False)
+    inside = np.min(
+        [
+            (h.equations[:, :3] @ asset.mesh.vertices.T + h.equations[:, 3:]).max(axis=0)
+            for h in map(ConvexHull, asset.parts)
+        ],
+        axis=0,
+    )
+    assert np.percentile(inside, 99) < 2e-3  # nearly all of the surface is within the parts
+    assert body.convex_hull.volume * 1.05 > sum(ConvexHull(part).volume for part in asset.parts)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("name", "radius_m"), [("024_bowl", 0.025), ("025_mug", 0.02)])
+def test_a_ball_fits_into_hollow_objects(name, radius_m, ycb_folder):
+    mesh = read_mesh(ycb_folder / name / "google_16k" / "textured.obj")
+    parts = convex_parts(mesh.vertices, mesh.faces)
+    assert len(parts) <= MAX_PARTS
+    axis = np.median(mesh.vertices[mesh.vertices[:, 2] < mesh.vertices[:, 2].min() + 0.005], axis=0)
+    best = max(clearance_m(np.array([axis[0], axis[1], z]), parts) for z in np.linspace(-0.02, 0.04, 25))
+    assert best > radius_m

@@ -1,0 +1,111 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.inspection.contact_sheet import Comparison, contact_sheet
+from osfcore.io.image_file import to_uint8, write_png
+from osfcore.metrics.image_errors import dilated, psnr, ssim
+
+
+def smooth(height: int = 48, width: int = 64) -> np.ndarray:
+    v, u = np.mgrid[:height, :width]
+    return np.stack([0.5 + 0.5 * np.sin(u / 3 + v / 7), 0.5 + 0.4 * np.cos(u * v / 200), (u + v) / 112], axis=-1)
+
+
+@pytest.mark.parametrize("difference", [0.5, 0.1, 1 / 255])
+def test_psnr_of_an_even_difference_is_minus_20_log10_of_it(difference):
+    truth = np.full((8, 9, 3), 0.4, np.float32)
+    assert psnr(truth, truth + np.float32(difference)) == pytest.approx(-20 * np.log10(difference), abs=1e-4)
+
+
+def test_psnr_knows_only_the_pixels_of_the_mask():
+    truth = np.zeros((8, 8, 3))
+    image = truth.copy()
+    image[0, 0] = 0.1
+    mask = np.zeros((8, 8), bool)
+    mask[0, :4] = True
+    assert psnr(truth, image, mask) == pytest.approx(20 - 10 * np.log10(1 / 4))
+    assert psnr(truth, image) == pytest.approx(20 - 10 * np.log10(1 / 64))
+    assert psnr(truth, image, ~mask) == 100
+
+
+def test_equal_images_count_as_100_db_and_not_as_infinity():
+    assert psnr(smooth(), smooth()) == 100
+    assert psnr(smooth(), smooth() + 1e-7) == 100
+
+
+def test_an_empty_mask_and_other_shapes_are_refused():
+    with pytest.raises(InvalidInput, match="mask"):
+        psnr(smooth(), smooth(), np.zeros((48, 64), bool))
+    with pytest.raises(InvalidInput, match="mask"):
+        psnr(smooth(), smooth(), np.ones((64, 48), bool))
+    with pytest.raises(InvalidInput, match="shape"):
+        psnr(smooth(), smooth()[1:])
+    with pytest.raises(InvalidInput, match="11"):
+        ssim(smooth(10, 64), smooth(10, 64))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [  # skimage.metrics.structural_similarity 0.26.0, gaussian_weights, sigma 1.5, no sample covariance, range 1
+        (lambda a: np.clip(a * 0.9 + 0.05 * np.sin(np.arange(48) * 1.3)[:, None, None] + 0.02, 0, 1), 0.7912099636),
+        (lambda a: np.clip(0.5 * a[::-1] + 0.25, 0, 1), 0.2657732736),
+    ],
+)
+def test_ssim_is_that_of_scikit_image(change, expected):
+    assert ssim(smooth(), change(smooth())) == pytest.approx(expected, abs=1e-9)
+
+
+def test_ssim_of_flat_images_is_its_luminance_term():
+    a, b = np.full((16, 16, 3), 0.3), np.full((16, 16, 3), 0.6)
+    assert ssim(a, b) == pytest.approx((2 * 0.3 * 0.6 + 1e-4) / (0.3**2 + 0.6**2 + 1e-4))
+    assert ssim(smooth(), smooth()) == pytest.approx(1)
+
+
+def test_a_mask_grows_by_two_pixels_in_every_direction():
+    mask = np.zeros((11, 12), bool)
+    mask[5, 6] = True
+    expected = np.zeros_like(mask)
+    expected[3:8, 4:9] = True
+    np.testing.assert_array_equal(dilated(mask), expected)
+    np.testing.assert_array_equal(dilated(mask, 0), mask)
+
+
+def test_a_sheet_shows_truth_ours_and_the_difference_four_times(tmp_path):
+    truth, ours = to_uint8(np.full((32, 40, 3), 0.5)), to_uint8(np.full((32, 40, 3), 0.6))
+    sheet = contact_sheet([Comparison("a name that is far too long", truth, ours)] * 3, per_row=2)
+    top, left = sheet.shape[0] // 2 - 3 * 32, sheet.shape[1] - 2 * 40
+    for row, value in enumerate((128, 153, 4 * 25)):
+        block = sheet[top + 32 * row : top + 32 * (row + 1), left:]
+        assert np.all(block == value)
+    assert np.all(sheet[-32:, left + 40 :] == 255)  # three columns: the last block is half empty
+    assert np.any(sheet[:top, left : left + 40] < 100)  # the label
+    assert np.any(sheet[top : top + 32, :left] < 100)  # the row's name
+    write_png(tmp_path / "new" / "sheet.png", sheet)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new" / "sheet.png"))[..., ::-1], sheet)
+
+
+def test_labels_leave_the_images_alone_and_colours_keep_their_order(tmp_path):
+    red = np.zeros((20, 20, 3), np.uint8)
+    red[..., 0] = 200
+    write_png(tmp_path / "red.png", red)
+    assert cv2.imread(str(tmp_path / "red.png"))[0, 0].tolist() == [0, 0, 200]
+    sheet = contact_sheet([Comparison("", red, red)])
+    assert np.all(sheet[-20:, -20:] == 0)
+    assert np.all(sheet[-60:-40, -20:] == red)
+
+
+def test_sheets_need_images_of_one_size():
+    small, large = np.zeros((20, 20, 3), np.uint8), np.zeros((24, 24, 3), np.uint8)
+    with pytest.raises(InvalidInput):
+        contact_sheet([])
+    with pytest.raises(InvalidInput):
+        contact_sheet([Comparison("", small, small), Comparison("", large, large)])
+
+
+def test_an_unwritable_place_is_told():
+    with pytest.raises(CannotWrite, match="/proc/sheets"):
+        write_png(Path("/proc/sheets/sheet.png"), np.zeros((20, 20, 3), np.uint8))

@@ -1,0 +1,188 @@
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, MissingAssets, UnknownName
+from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
+from osfcore.objects.asset_library import AssetLibrary, check_name
+
+SYMMETRY = Symmetry("discrete", ((0.0, 0.0, 0.0, 1.0),), (0.0, 0.0, 1.0), "made up")
+INFO = ObjectInfo("toy", "Toy", 0.25, SYMMETRY, "CC0-1.0", "nobody")
+FILES = ("object.json", "arrays.npz", "texture.png", "viewer.glb")
+
+
+@pytest.fixture
+def asset() -> ObjectAsset:
+    rng = np.random.default_rng(0)
+    vertices = rng.random((30, 3)) * 0.1 - 0.05
+    normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    texture = rng.integers(0, 256, (64, 32, 3), dtype=np.uint8)
+    mesh = TexturedMesh(vertices, normals, rng.integers(0, 30, (40, 3)), rng.random((30, 2)), texture)
+    parts = tuple(rng.random((n, 3)).astype(np.float32) for n in (4, 9, 17))
+    resting = RestingPoses(np.eye(4)[:2], np.array([0.75, 0.25]))
+    return ObjectAsset(INFO, mesh, parts, resting)
+
+
+@pytest.fixture
+def shelf(tmp_path, asset) -> AssetLibrary:
+    shelf = AssetLibrary(tmp_path / "objects")
+    shelf.write(asset, "a test")
+    return shelf
+
+
+def test_what_is_written_comes_back(shelf, asset):
+    back = shelf.load("toy")
+    assert back.info == asset.info
+    np.testing.assert_array_equal(back.mesh.texture, asset.mesh.texture)
+    np.testing.assert_array_equal(back.mesh.vertices, asset.mesh.vertices.astype(np.float32))
+    np.testing.assert_array_equal(back.mesh.faces, asset.mesh.faces)
+    assert [len(part) for part in back.parts] == [4, 9, 17]
+    assert all(np.array_equal(a, b) for a, b in zip(back.parts, asset.parts, strict=True))
+    np.testing.assert_array_equal(back.resting.quaternions, asset.resting.quaternions)
+    assert back.mesh.vertices.dtype == np.float32
+    assert back.mesh.faces.dtype == np.int32
+    np.testing.assert_allclose(shelf.size_m("toy"), asset.size_m, atol=1e-6)
+    assert shelf.source("toy") == "a test"
+    assert shelf.names() == ("toy",)
+
+
+def test_info_of_the_catalogue_needs_no_files(tmp_path):
+    library = AssetLibrary(tmp_path / "none")
+    assert library.names() == ()
+    assert library.info("024_bowl").label == "Bowl"
+
+
+def test_missing_and_unknown_are_told_apart(shelf):
+    for method in (shelf.load, shelf.size_m, shelf.viewer_glb, shelf.source, shelf.digest):
+        with pytest.raises(MissingAssets, match=r"024_bowl.*osf assets fetch"):
+            method("024_bowl")
+        with pytest.raises(UnknownName, match="toy"):
+            method("nothing")
+    with pytest.raises(UnknownName):
+        shelf.info("nothing")
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../objects/toy", "toy/", ".writing-x", "a\0b", "x" * 300])
+def test_names_cannot_leave_the_folder(shelf, name):
+    assert not shelf.has(name)
+    with pytest.raises(UnknownName):
+        shelf.load(name)
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("damage", ["gone", "empty", "truncated", "flipped"])
+def test_damage_is_told(shelf, file, damage):
+    path = shelf.root / "toy" / file
+    data = path.read_bytes()
+    if damage == "gone":
+        path.unlink()
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    else:
+        path.write_bytes(data[:20] + bytes([data[20] ^ 255]) + data[21:])
+    is_absent = file == "object.json" and damage == "gone"
+    with pytest.raises(UnknownName if is_absent else CorruptFile, match="toy"):
+        shelf.viewer_glb("toy") if file == "viewer.glb" else shelf.load("toy")
+
+
+@pytest.mark.parametrize("facts", [[], {}, {"format_version": 1}, {"format_version": 1, "info": {}, "crc32": 3}])
+def test_facts_of_another_shape_are_told(shelf, facts):
+    (shelf.root / "toy" / "object.json").write_text(json.dumps(facts))
+    for method in (shelf.load, shelf.info, shelf.size_m, shelf.digest):
+        with pytest.raises(CorruptFile):
+            method("toy")
+
+
+def test_an_older_format_counts_as_not_there(shelf):
+    path = shelf.root / "toy" / "object.json"
+    path.write_text(path.read_text().replace('"format_version": 1', '"format_version": 0'))
+    assert not shelf.has("toy")
+    with pytest.raises(CorruptFile, match="another version"):
+        shelf.load("toy")
+
+
+def test_writing_again_replaces_and_leaves_nothing_behind(shelf, asset):
+    shelf.write(replace(asset, info=replace(INFO, mass_kg=0.5)), "again")
+    assert shelf.load("toy").info.mass_kg == 0.5
+    assert [path.name for path in shelf.root.iterdir()] == ["toy"]
+    assert sorted(path.name for path in (shelf.root / "toy").iterdir()) == sorted(FILES)
+
+
+def test_digests_tell_what_was_written_from_what_was_there_before(shelf, asset):
+    before = shelf.digest("toy")
+    shelf.write(asset, "another place")
+    assert shelf.digest("toy") == before
+    changed = [
+        replace(asset, mesh=replace(asset.mesh, vertices=asset.mesh.vertices * 1.01)),
+        replace(asset, mesh=replace(asset.mesh, texture=asset.mesh.texture // 2)),
+        replace(asset, info=replace(INFO, mass_kg=0.3)),
+    ]
+    digests = {before}
+    for other in changed:
+        shelf.write(other, "a test")
+        digests.add(shelf.digest("toy"))
+    assert len(digests) == 4
+
+
+def test_old_temporary_folders_are_removed_and_fresh_ones_kept(shelf, asset):
+    old, fresh = shelf.root / ".writing-old", shelf.root / ".writing-fresh"
+    for folder in (old, fresh):
+        folder.mkdir()
+        (folder / "arrays.npz").write_bytes(b"half")
+    os.utime(old, (0, 0))
+    shelf.write(asset, "again")
+    assert not old.exists()
+    assert fresh.exists()
+    assert shelf.names() == ("toy",)
+
+
+def test_a_root_that_cannot_be_made_is_told(tmp_path, asset):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(FetchFailed, match="cannot be written"):
+        AssetLibrary(tmp_path / "file" / "objects").write(asset, "a test")
+
+
+# Files of this process can grow to a few kilobytes only, as on a full disk.
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+from osfcore.errors import FetchFailed
+from osfcore.objects.library import AssetLibrary
+shelf = AssetLibrary(Path(sys.argv[1]))
+asset = shelf.load("toy")
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+try:
+    shelf.write(asset, "on a full disk")
+except FetchFailed as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
+@pytest.mark.parametrize("limit", [100, 2000, 5000])
+def test_a_full_disk_keeps_the_old_object_whole(shelf, limit):
+    run = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(shelf.root), str(limit)], capture_output=True, text=True, check=True
+    )
+    assert "cannot be written" in run.stdout
+    assert shelf.source("toy") == "a test"
+    shelf.load("toy")
+    assert [path.name for path in shelf.root.iterdir()] == ["toy"]
+
+
+@pytest.mark.parametrize("name", ["a", "my-mug_2", "0x", "a" * 64])
+def test_good_names(name):
+    assert check_name(name) == name
+
+
+@pytest.mark.parametrize("name", ["", "A", "-a", "_a", "a b", "a/b", "..", "a" * 65, "mug\n", "é"])
+def test_bad_names(name):
+    with pytest.raises(InvalidInput, match="object name"):
+        check_name(name)

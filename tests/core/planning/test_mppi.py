@@ -1,0 +1,171 @@
+import numpy as np
+import pytest
+
+from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.errors import InvalidInput
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
+from osfcore.planning.mppi import Planner, PlanSettings
+from osfcore.planning.pose_cost import PoseCost, PoseGoal
+from osfcore.planning.push_proposals import PushProposals
+from tests.core.dynamics.scenes import APPLE, CAN, scene
+
+FIELDS = FieldLibrary(None)
+SMALL = PlanSettings(samples=64, horizon=12)
+SHORT = PlanSettings(samples=64, horizon=12, refined=6)
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return load_shapes(None, FIELDS, (APPLE, CAN))
+
+
+@pytest.fixture(scope="module")
+def start(shapes) -> SceneState:
+    return scene(shapes, {CAN: (0.0, 0.0), APPLE: (0.2, 0.2)}, pusher=(0.0, -0.1))
+
+
+def goal_of(state, shift) -> PoseGoal:
+    pose = state.pose(CAN)
+    return PoseGoal.of(state, {CAN: Pose(pose.position + [*shift, 0.0], pose.quaternion)})
+
+
+def carried(state, actions, before=None) -> Rollouts:
+    """A world in which the first object is carried along with the pusher."""
+    path = np.concatenate([np.zeros_like(actions[:, :1]), STEP_S * np.cumsum(actions, axis=1)], axis=1)
+    positions = np.broadcast_to(state.poses.position, (*path.shape[:2], *state.poses.position.shape)).copy()
+    positions[:, :, 0] += path
+    quaternions = np.broadcast_to(state.poses.quaternion, (*positions.shape[:3], 4))
+    return Rollouts(state.names, positions, quaternions, state.pusher + path)
+
+
+def planned(planner, state, goal, seed: int = 0):
+    return list(planner.plan(state, goal, PoseCost(goal, 0.0), np.random.default_rng(seed)))
+
+
+def test_a_plan_leads_toward_the_goal(shapes, start):
+    goal = goal_of(start, (0.12, -0.08))
+    rounds = planned(Planner(carried, PushProposals(shapes), SMALL), start, goal)
+    assert [r.number for r in rounds] == [0, 1]
+    actions = rounds[-1].actions
+    assert actions.shape == (12, 3)
+    assert np.abs(actions).max() <= MAX_SPEED_M_S
+    end = STEP_S * actions.sum(axis=0)
+    assert np.linalg.norm(end[:2] - [0.12, -0.08]) < 0.12  # from 0.144; proposals walk around the object first
+    for r in rounds:
+        assert len(r.costs) == len(r.rollouts.positions) >= 60
+        np.testing.assert_array_equal(r.best.positions[0], r.rollouts.positions[r.costs.argmin()])
+
+
+def test_planning_on_comes_closer(shapes, start):
+    goal = goal_of(start, (0.12, -0.08))
+    planner = Planner(carried, PushProposals(shapes), SMALL)
+    costs = [planned(planner, start, goal, seed)[-1].costs.min() for seed in range(6)]
+    assert costs[-1] < 0.8 * costs[0]
+    planner.forget()
+    assert planned(planner, start, goal, 0)[-1].costs.min() == costs[0]
+
+
+def test_the_second_round_looks_less_far_and_leaves_the_rest_alone(shapes, start):
+    goal = goal_of(start, (0.12, -0.08))
+    first, second = planned(Planner(carried, PushProposals(shapes), SHORT), start, goal)
+    assert first.rollouts.positions.shape[1] == 12 + 1
+    assert second.rollouts.positions.shape[1] == 6 + 1
+    assert first.actions.shape == second.actions.shape == (12, 3)
+    np.testing.assert_array_equal(second.actions[6:], first.actions[6:])
+    assert np.abs(second.actions[:6] - first.actions[:6]).max() > 0
+
+
+@pytest.mark.parametrize(("refined", "every"), [(6, 3), (8, 2), (10, 5)])
+def test_noise_vanishes_where_the_refined_part_begins_and_ends(shapes, start, refined, every):
+    """The goal is met, so that the best plan is to rest and paths are nothing but noise."""
+    settings = PlanSettings(samples=64, horizon=12, knot_every=every, refined=refined)
+    goal = PoseGoal.of(start, {})
+    first, second = planned(Planner(carried, PushProposals(shapes), settings), start, goal)
+    np.testing.assert_array_equal(first.actions, 0)
+    noise = second.rollouts.pusher[..., :2] - start.pusher[:2]
+    np.testing.assert_array_equal(noise[0], 0)  # one sample is the plan itself
+    np.testing.assert_array_equal(noise[:, 0], 0)
+    np.testing.assert_allclose(noise[:, -1], 0, atol=1e-12)
+    np.testing.assert_allclose(every * noise[:, 1], noise[:, every], atol=1e-12)  # straight lines between knots
+    assert noise[1:, every].std() == pytest.approx(settings.noise_m, rel=0.3)
+
+
+def test_what_comes_next_is_the_plan_and_then_rest(shapes, start):
+    planner = Planner(carried, PushProposals(shapes), SHORT)
+    np.testing.assert_array_equal(planner.upcoming(3), np.zeros((3, 3)))
+    plan = planned(planner, start, goal_of(start, (0.12, -0.08)))[-1].actions
+    np.testing.assert_array_equal(planner.upcoming(4), plan[:4])
+    np.testing.assert_array_equal(planner.upcoming(15), np.pad(plan, ((0, 3), (0, 0))))
+    planner.executed(4)
+    np.testing.assert_array_equal(planner.upcoming(12), np.pad(plan[4:], ((0, 4), (0, 0))))
+    planner.forget()
+    np.testing.assert_array_equal(planner.upcoming(2), np.zeros((2, 3)))
+
+
+def test_the_same_seed_gives_the_same_plan(shapes, start):
+    goal = goal_of(start, (0.1, 0.0))
+    a, b = (planned(Planner(carried, PushProposals(shapes), SMALL), start, goal, 5)[-1] for _ in range(2))
+    np.testing.assert_array_equal(a.actions, b.actions)
+
+
+def test_what_was_executed_is_dropped(shapes, start):
+    seen = []
+
+    def recorded(state, actions, before):
+        seen.append(actions[0])
+        return carried(state, actions)
+
+    planner = Planner(recorded, PushProposals(shapes), SMALL)
+    goal = goal_of(start, (0.1, 0.0))
+    plan = planned(planner, start, goal)[-1].actions
+    planner.executed(3)
+    planned(planner, start, goal)
+    np.testing.assert_array_equal(seen[2][:-3], plan[3:])  # the first sample is the last plan itself
+    np.testing.assert_array_equal(seen[2][-3:], 0)
+    planner.settings = PlanSettings(samples=64, horizon=5)
+    assert planned(planner, start, goal)[-1].actions.shape == (5, 3)
+    planner.settings = PlanSettings(samples=64, horizon=20)
+    assert planned(planner, start, goal)[-1].actions.shape == (20, 3)
+
+
+def test_a_can_is_brought_to_its_goal_by_the_shipped_network(shapes, start):
+    """Planned and executed in the network's own world; the way there leads around the can."""
+    model = load_push_model(None, FIELDS, (APPLE, CAN))
+    goal = goal_of(start, (0.02, -0.12))  # toward the pusher
+    settings = PlanSettings(samples=32, horizon=12, refined=6)
+    planner, state, before = Planner(model.rollout, PushProposals(shapes), settings), start, None
+    for step in range(12):
+        actions = list(planner.plan(state, goal, PoseCost(goal, 0.0), np.random.default_rng(step), before))[-1].actions
+        future = model.rollout(state, actions[None, :2], before)
+        planner.executed(2)
+        before, state = (
+            SceneState(
+                state.names, Pose(future.positions[0, t], future.quaternions[0, t]), state.light, future.pusher[0, t]
+            )
+            for t in (1, 2)
+        )
+    off = np.linalg.norm(goal.offsets_m(state), axis=1)
+    assert off[0] < 0.015
+    assert off[1] < 1e-3  # the apple was in nobody's way
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 0}, "number of samples is 0"),
+        ({"horizon": 0}, "horizon"),
+        ({"horizon": 10_000}, "horizon"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"temperature": float("nan")}, "temperature"),
+        ({"noise_m": 0.4}, "noise"),
+        ({"knot_every": 0}, "knots"),
+        ({"refined": 0}, "refined"),
+    ],
+)
+def test_settings_out_of_range_are_told(change, message):
+    with pytest.raises(InvalidInput, match=message):
+        PlanSettings(**change)

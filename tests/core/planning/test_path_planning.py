@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
+from osfcore.planning.path_planning import CELL_M, CLEARANCE_M, FreeSpace, actions_along, duration_s
+
+BOX = np.array([[-0.05, -0.03], [0.05, -0.03], [0.05, 0.03], [-0.05, 0.03]])
+place = st.floats(-0.3, 0.3)
+
+
+def along(way, count: int = 400) -> np.ndarray:
+    """Points all along a way."""
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    at = np.linspace(0, length[-1], count)
+    return np.stack([np.interp(at, length, way[:, axis]) for axis in range(2)], axis=1)
+
+
+def length_of(way) -> float:
+    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+
+
+def distance_to_box(points) -> np.ndarray:
+    return np.linalg.norm(np.maximum(np.abs(points) - [0.05, 0.03], 0), axis=1)
+
+
+def test_on_an_empty_table_ways_are_straight():
+    start, ends = np.array([-0.2, 0.1]), np.array([[0.3, 0.05], [-0.2, 0.1], [0.0, -0.3]])
+    ways = FreeSpace([]).ways_from(start)
+    for end in ends:
+        way = ways.to(end)
+        np.testing.assert_array_equal(way[[0, -1]], [start, end])
+        assert length_of(way) == pytest.approx(np.linalg.norm(end - start))
+
+
+@given(x=place, y=place, u=place, v=place)
+def test_ways_go_around_what_stands_in_them(x, y, u, v):
+    space = FreeSpace([BOX])
+    start, end = np.array([x, y]), np.array([u, v])
+    if not space.is_free(np.stack([start, end])).all():
+        return
+    way = space.ways_from(start).to(end)
+    assert distance_to_box(along(way)).min() > PUSHER_RADIUS_M + CLEARANCE_M - 2 * CELL_M
+    assert length_of(way) < np.linalg.norm(end - start) + 0.25
+
+
+def test_the_other_side_of_a_box_is_reached_by_the_shorter_way_around():
+    way = FreeSpace([BOX]).ways_from(np.array([-0.02, -0.1])).to(np.array([-0.02, 0.1]))
+    assert along(way)[:, 0].min() < -0.05 - PUSHER_RADIUS_M  # by the left end
+    assert along(way)[:, 0].max() < 0.0
+    aside = 0.05 + PUSHER_RADIUS_M + CLEARANCE_M - 0.02
+    assert length_of(way) < 1.1 * (2 * np.hypot(aside, 0.1 - 0.03) + 0.06)
+
+
+def test_from_a_place_in_contact_a_way_leads_out():
+    space = FreeSpace([BOX])
+    start = np.array([0.0, 0.03 + PUSHER_RADIUS_M])
+    assert not space.is_free(start[None])[0]
+    way = space.ways_from(start).to(np.array([0.0, -0.2]))
+    points = along(way)
+    inside = distance_to_box(points) < PUSHER_RADIUS_M - CELL_M
+    assert not inside.any()
+
+
+def test_a_way_does_not_depend_on_those_asked_for_before():
+    space, start, end = FreeSpace([BOX]), np.array([-0.2, 0.0]), np.array([0.2, 0.01])
+    ways = space.ways_from(start)
+    ways.to(np.array([0.0, 0.3]))
+    np.testing.assert_array_equal(ways.to(end), space.ways_from(start).to(end))
+
+
+def test_out_of_reach_is_not_free():
+    assert not FreeSpace([]).is_free(np.array([[0.36, 0.0], [0.0, -0.4]])).any()
+
+
+@given(seed=st.integers(0, 10**6), horizon=st.integers(1, 20))
+def test_actions_keep_the_limits_and_lead_along_the_way(seed, horizon):
+    rng = np.random.default_rng(seed)
+    way = rng.uniform(-0.3, 0.3, (rng.integers(2, 6), 2))
+    speeds = rng.uniform(0.2, 1, len(way) - 1)
+    actions = actions_along(way, horizon, speeds)
+    assert actions.shape == (horizon, 3)
+    assert np.abs(actions).max() <= MAX_SPEED_M_S + 1e-9
+    assert (actions[:, 2] == 0).all()
+    reached = way[0] + STEP_S * np.cumsum(actions[:, :2], axis=0)
+    for point in reached:
+        assert np.linalg.norm(along(way, 4000) - point, axis=1).min() < 1e-3
+
+
+def test_actions_take_as_long_as_the_slower_axis_and_then_rest():
+    actions = actions_along(np.array([[0.0, 0.0], [0.12, 0.03]]), 4)
+    np.testing.assert_allclose(actions[:2], [[0.3, 0.075, 0]] * 2)
+    np.testing.assert_allclose(actions[2:], 0, atol=1e-12)
+    half = actions_along(np.array([[0.0, 0.0], [0.12, 0.03]]), 4, np.array([0.5]))
+    np.testing.assert_allclose(half, [[0.15, 0.0375, 0]] * 4)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_a_way_ends_when_it_is_said_to(seed):
+    rng = np.random.default_rng(seed)
+    way = rng.uniform(-0.3, 0.3, (rng.integers(2, 6), 2))
+    speeds = rng.uniform(0.2, 1, len(way) - 1)
+    last = int(np.ceil(duration_s(way, speeds) / STEP_S))
+    reached = way[0] + STEP_S * np.cumsum(actions_along(way, last + 2, speeds)[:, :2], axis=0)
+    np.testing.assert_allclose(reached[last - 1 :], np.broadcast_to(way[-1], (3, 2)), atol=1e-9)
+    assert np.linalg.norm(reached[last - 2] - way[-1]) > 0 or last < 2
+
+
+def test_durations_add_up_and_grow_as_speeds_fall():
+    way = np.array([[0.0, 0.0], [0.12, 0.03], [0.12, -0.06]])
+    assert duration_s(way) == pytest.approx((0.12 + 0.09) / MAX_SPEED_M_S)
+    assert duration_s(way, np.array([0.5, 0.25])) == pytest.approx((0.12 / 0.5 + 0.09 / 0.25) / MAX_SPEED_M_S)
+    assert duration_s(way[:1]) == 0

@@ -1,0 +1,108 @@
+import contextlib
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects, UnknownName
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.workspace import TABLE_SIDE_M
+from osfcore.world import goal_layouts
+from osfcore.world.goal_layouts import arranged_goal, random_goal
+from osfcore.world.tabletop import SceneRequest, Tabletop
+
+CAN, BOX, BOTTLE = NAMES = ("005_tomato_soup_can", "009_gelatin_box", "006_mustard_bottle")
+
+
+@pytest.fixture
+def table(library):
+    with contextlib.closing(Tabletop(library, request=SceneRequest(names=NAMES))) as world:
+        world.arrange(3)
+        yield world
+
+
+def away(before, after):
+    """Objects that are more than a centimetre from where they were."""
+    shift_m = np.linalg.norm(after.poses.position - before.poses.position, axis=1)
+    return {name for name, distance in zip(before.names, shift_m, strict=True) if distance > 0.01}
+
+
+def aside(state, name, x_m=0.0, z_m=0.0):
+    pose = state.pose(name)
+    return Pose(pose.position + [x_m, 0, z_m], pose.quaternion)
+
+
+def test_what_is_put_down_in_the_air_comes_to_rest_and_the_others_stay(table):
+    before = table.truth()
+    goal = arranged_goal(table, {BOX: aside(before, BOX, z_m=0.03)})
+    assert away(before, goal) == set()
+    assert goal.pose(BOX).position[2] < before.pose(BOX).position[2] + 0.005
+    assert goal.names == before.names
+
+
+def test_objects_may_swap_their_places(table):
+    before = table.truth()
+    can, box = before.pose(CAN), before.pose(BOX)
+    over = [Pose(np.array([*p.position[:2], own.position[2]]), own.quaternion) for p, own in ((box, can), (can, box))]
+    goal = arranged_goal(table, {CAN: over[0], BOX: over[1]})
+    assert np.linalg.norm((goal.pose(CAN).position - box.position)[:2]) < 0.01
+    assert np.linalg.norm((goal.pose(BOX).position - can.position)[:2]) < 0.01
+
+
+def test_nothing_asked_for_is_the_table_as_it_is(table):
+    before = table.truth()
+    assert away(before, arranged_goal(table, {})) == set()
+
+
+def test_what_cannot_be_is_told(table):
+    state = table.truth()
+    edge = TABLE_SIDE_M / 2
+    on_the_edge = Pose(np.array([edge - 1e-3, 0.1, 0.15]), state.pose(CAN).quaternion)
+    for kind, words, poses in (
+        (UnknownName, "teapot", (("teapot", Pose.identity()),)),
+        (OverlappingObjects, BOX, ((BOX, state.pose(BOTTLE)),)),
+        (InvalidInput, "over the table", ((BOX, aside(state, BOX, x_m=2.0)),)),
+        (InvalidInput, "fall off", ((CAN, on_the_edge),)),
+    ):
+        with pytest.raises(kind, match=words):
+            arranged_goal(table, dict(poses))
+        table.restore(state)
+
+
+@pytest.mark.parametrize("moved", [1, 2, 3])
+def test_as_many_objects_as_asked_lie_elsewhere_at_random(table, moved):
+    before = table.truth()
+    goal, names = random_goal(table, 5, moved)
+    assert len(set(names)) == moved
+    assert away(before, goal) == set(names)
+    assert goal.pusher is None
+
+
+def test_a_seed_means_one_random_layout(table):
+    before = table.truth()
+    goals = []
+    for seed in (1, 1, 2):
+        table.restore(before)
+        goals.append(random_goal(table, seed, None)[0])
+    assert away(goals[0], goals[1]) == set()
+    assert away(goals[0], goals[2]) != set()
+
+
+@pytest.mark.parametrize("moved", [0, 4])
+def test_more_or_fewer_objects_than_there_are_cannot_move(table, moved):
+    with pytest.raises(InvalidInput, match="between 1 and 3"):
+        random_goal(table, 0, moved)
+
+
+def test_every_try_begins_where_things_are_now_and_there_is_an_end_to_them(table, monkeypatch):
+    before = table.truth()
+    begun = []
+
+    def none(world, count, _rng):
+        begun.append((count, away(before, world.truth())))
+        world.move_object(BOX, aside(world.truth(), BOX, z_m=0.3))
+
+    monkeypatch.setattr(goal_layouts, "draw_goal", none)
+    with pytest.raises(NoRoom, match=BOX):
+        random_goal(table, 0, 2)
+    assert len(begun) > 5
+    assert set(map(repr, begun)) == {repr((2, set()))}

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.poses import rotation_angle
+from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
+from osfcore.world.simulated_dynamics import SimulatedPushes
+from osfcore.world.tabletop import SceneRequest, Tabletop
+
+BOX, CAN, GELATIN = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box")
+
+
+@pytest.fixture(scope="module")
+def world(library):
+    tabletop = Tabletop(library, request=SceneRequest(names=NAMES))
+    tabletop.arrange(0)
+    yield tabletop
+    tabletop.close()
+
+
+@pytest.fixture(scope="module")
+def start(world):
+    return world.truth()
+
+
+@pytest.fixture
+def simulated(world):
+    model = SimulatedPushes(world.assets)
+    yield model
+    model.close()
+
+
+def push(state, name: str, after: int = 2) -> np.ndarray:
+    """Straight at an object and 4 cm on, then rest."""
+    way = state.pose(name).position[:2] - state.pusher[:2]
+    way *= 1 + 0.04 / np.linalg.norm(way)
+    count = int(np.ceil(np.abs(way).max() / (0.25 * STEP_S)))
+    return np.pad(np.tile(way / (count * STEP_S), (count, 1)), ((0, after), (0, 1)))
+
+
+def away(state, count: int = 6) -> np.ndarray:
+    """Out of everything's way."""
+    way = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
+    return np.tile([*(0.1 * way / np.abs(way).max()), 0.0], (count, 1))
+
+
+@pytest.mark.parametrize(("name", "off_m", "off_rad"), [(BOX, 1e-3, 0.02), (GELATIN, 1e-3, 0.02), (CAN, 2e-3, 0.1)])
+def test_pushes_go_as_on_the_table(world, start, simulated, name, off_m, off_rad):
+    """The can lies on its side and rolls, which tiny differences decide."""
+    actions = push(start, name)
+    told = simulated.rollout(start, actions[None])
+    world.restore(start)
+    for t, action in enumerate(actions):
+        world.act(action)
+        truth = world.truth()
+        np.testing.assert_allclose(told.positions[0, t + 1], truth.poses.position, atol=off_m)
+        assert rotation_angle(told.quaternions[0, t + 1], truth.poses.quaternion).max() < off_rad
+        np.testing.assert_allclose(told.pusher[0, t + 1], truth.pusher, atol=1e-9)
+    assert np.abs(told.positions[0, -1] - start.poses.position).max() > 0.02
+
+
+def test_what_the_pusher_walks_past_stays_exactly_where_it_is(start, simulated):
+    actions = away(start)
+    told = simulated.rollout(start, actions[None])
+    for t in range(len(actions) + 1):
+        np.testing.assert_array_equal(told.positions[0, t], start.poses.position)
+        np.testing.assert_array_equal(told.quaternions[0, t], start.poses.quaternion)
+    path = start.pusher + STEP_S * np.pad(np.cumsum(actions, axis=0), ((1, 0), (0, 0)))
+    path[:, :2] = path[:, :2].clip(-PUSHER_REACH_M, PUSHER_REACH_M)
+    np.testing.assert_allclose(told.pusher[0], path, atol=1e-12)
+
+
+def test_skipping_free_travel_changes_nothing(world, start, simulated, monkeypatch):
+    actions = np.stack([push(start, name, 2)[:6] for name in NAMES])
+    told = simulated.rollout(start, actions)
+    whole = SimulatedPushes(world.assets)
+    monkeypatch.setattr(whole, "_walks_past", lambda names, action: False)
+    every = whole.rollout(start, actions)
+    whole.close()
+    np.testing.assert_allclose(told.positions, every.positions, atol=2e-3)
+    np.testing.assert_allclose(told.pusher, every.pusher, atol=1e-9)
+
+
+def test_sequences_do_not_influence_each_other(world, start, simulated):
+    one = push(start, CAN, 0)
+    other = np.resize(push(start, BOX, 0), one.shape)
+    together = simulated.rollout(start, np.stack([one, other, one]))
+    fresh = SimulatedPushes(world.assets)
+    alone = fresh.rollout(start, one[None])
+    fresh.close()
+    for k in (0, 2):
+        np.testing.assert_allclose(together.positions[k], alone.positions[0], atol=2e-3)
+    np.testing.assert_array_equal(together.positions[:, 0], np.broadcast_to(start.poses.position, (3, 3, 3)))
+
+
+@pytest.mark.parametrize("action", [[0.31, 0, 0], [0, 0, 0.1], [0, float("nan"), 0]])
+def test_actions_beyond_the_limits_are_refused(start, simulated, action):
+    with pytest.raises(InvalidInput, match="action 1 of sequence 0"):
+        simulated.rollout(start, np.array([[[0, 0, 0], action]]))
