@@ -154,7 +154,7 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from osfcore.errors import FetchFailed
-from osfcore.objects.library import AssetLibrary
+from osfcore.objects.asset_library import AssetLibrary
 shelf = AssetLibrary(Path(sys.argv[1]))
 asset = shelf.load("toy")
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))

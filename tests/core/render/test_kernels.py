@@ -48,7 +48,7 @@ _CROWD = """
 import threading
 import numba
 import numpy as np
-from osfcore.fields.marching import march
+from osfcore.fields.ray_marching import march
 from osfcore.render.scene_renderer import SceneBatch, SceneRenderer
 from tests.core.render.scenes import ball, plain_table, state, view
 

@@ -30,7 +30,7 @@ def scene(data_dir, tmp_path):
 @pytest.fixture
 def untried(monkeypatch):
     """What is told before the work begins must be told without it."""
-    for place in ("first.estimate_first", "goal.estimate_goal"):
+    for place in ("first_frame.estimate_first", "goal_image.estimate_goal"):
         monkeypatch.setattr(f"osfcore.estimation.{place}", lambda *_: pytest.fail("the work began"))
 
 

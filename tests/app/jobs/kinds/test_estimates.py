@@ -53,7 +53,7 @@ def asked(monkeypatch):
         yield EstimateStep(Progress(2, 3, "Both"), "together", state(0.2), loss=0.25)
         yield EstimateStep(Progress(3, 3, "Done"), "done", state(), None, None, 1.0, (0.1,), 0.1, believed(state()))
 
-    for name in ("first.estimate_first", "goal.estimate_goal", "track.estimate_next"):
+    for name in ("first_frame.estimate_first", "goal_image.estimate_goal", "tracking.estimate_next"):
         monkeypatch.setattr(f"osfcore.estimation.{name}", steps)
     return asked
 

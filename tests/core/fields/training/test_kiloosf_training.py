@@ -90,7 +90,7 @@ def test_a_time_budget_is_kept(block_set, tmp_path):
 _KILLED = """
 import sys
 from pathlib import Path
-from osfcore.fields import training
+from osfcore.fields.training import kiloosf_training as training
 from tests.core.fields.rendered_sets import QUICK
 training._CHECKPOINT_S = training._REPORT_S = 0.2
 config = training.TrainField(Path(sys.argv[1]), Path(sys.argv[2]), iterations=240, device="cpu")
