@@ -24,11 +24,12 @@ from app.services.runner import Runner
 from app.viewer.nodes.episode_nodes import EpisodeDrawing
 from app.viewer.nodes.estimate_nodes import EstimateDrawing
 from app.viewer.nodes.scene_nodes import Client, SceneDrawing
-from app.viewer.panels.episode_panel import EpisodeView
-from app.viewer.panels.estimate_panel import EstimateView
-from app.viewer.panels.goal_panel import GoalView
-from app.viewer.panels.neural_panel import NeuralViews
-from app.viewer.panels.push_panel import PushView
+from app.viewer.panels.episode_panel import EpisodePanel
+from app.viewer.panels.estimate_panel import EstimatePanel
+from app.viewer.panels.goal_panel import GoalPanel
+from app.viewer.panels.neural_panel import NeuralPanel
+from app.viewer.panels.panel import Panel
+from app.viewer.panels.push_panel import PushPanel
 from app.viewer.playback import Playback
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
@@ -101,43 +102,16 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # the banner would tell the inner port
             self._server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
         self._drawing = SceneDrawing(self._server, self._runner.library, self._move_object, self._move_light)
-        self._neural_views = NeuralViews(self._neural, self._drawing.state, self._fields)
-        self._drawing.watch(self._neural_views.scene_moved)
         self._playback = Playback(self._drawing)
-        self._add_panel(self._server)
-        self._estimate_view = EstimateView(
-            self._server,
-            (self._drawing, EstimateDrawing(self._server, self._runner.library, self._drawing.has)),
-            self._estimates,
-            self._neural,
-            self._obey,
-            self._runner.jobs.cancel,
-        )
-        self._goal_view = GoalView(self._server, self._runner.library, self._goals, self._commands, self._obey)
-        self._episode_view = EpisodeView(
-            self._server,
-            (self._drawing, EpisodeDrawing(self._server, self._runner.library, self._drawing.has)),
-            self._runner.jobs,
-            self._obey,
-            self._estimate_view.forget,
-        )
-        self._push_view = PushView(self._server, self._runner.library, self._predictions, self._runner.act, self._obey)
-        self._server.on_client_connect(self._welcome)
-        self._server.on_client_disconnect(self._part)
-        self._neural_views.start()
+        self._add_controls(self._server)
+        self._panels = self._make_panels(self._server)
+        self._server.on_client_connect(self._add_client)
+        self._server.on_client_disconnect(self._remove_client)
         self._playback.start()
-        self._estimate_view.start(self._runner.current)
-        self._episode_view.start(self._runner.current)
-        self._goal_view.start(self._runner.current)
-        self._push_view.start(self._current_record())
-        self._undo = [
-            self._runner.hub.subscribe(self._playback.note),
-            self._runner.hub.subscribe(self._estimate_view.note),
-            self._runner.hub.subscribe(self._episode_view.note),
-            self._runner.hub.subscribe(self._goal_view.note),
-            self._runner.hub.subscribe(self._push_view.note),
-            self._runner.hub.subscribe(self._on_event),
-        ]
+        for panel in self._panels:
+            panel.start(self._current_record())
+        listeners = (self._playback.note, *(panel.show for panel in self._panels), self._on_event)
+        self._undo = [self._runner.hub.subscribe(listener) for listener in listeners]
         self._show_current()
 
     def stop(self) -> None:
@@ -147,24 +121,41 @@ class Viewer:
         for undo in self._undo:
             undo()
         self._playback.stop()
-        self._neural_views.stop()
-        self._estimate_view.stop()
-        self._episode_view.stop()
-        self._goal_view.stop()
-        self._push_view.stop()
+        for panel in self._panels:
+            panel.close()
         self._commands.shutdown(wait=False, cancel_futures=True)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
         self._server = None
 
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        self._runner.watch_frames(1)
-        self._neural_views.add(client)
-        self._estimate_view.visited()
+    def _make_panels(self, server: LoopbackViser) -> tuple[Panel, ...]:
+        """The panels, in the order of their folders."""
+        library, table, jobs = self._runner.library, self._drawing, self._runner.jobs
+        neural = NeuralPanel(self._neural, table.state, self._fields)
+        table.watch(neural.scene_moved)
+        estimate = EstimatePanel(
+            server,
+            (table, EstimateDrawing(server, library, table.has)),
+            self._estimates,
+            self._neural,
+            self._run_command,
+            jobs.cancel,
+        )
+        self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
+        drawings = table, EpisodeDrawing(server, library, table.has)
+        episode = EpisodePanel(server, drawings, jobs, self._run_command, estimate.forget)
+        push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
+        return neural, estimate, self._goal_panel, episode, push
 
-    def _part(self, client: viser.ClientHandle) -> None:
+    def _add_client(self, client: viser.ClientHandle) -> None:
+        self._runner.watch_frames(1)
+        for panel in self._panels:
+            panel.add_client(client)
+
+    def _remove_client(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(-1)
-        self._neural_views.remove(client)
+        for panel in self._panels:
+            panel.remove_client(client)
 
     def _show_current(self) -> None:
         self._playback.note(CurrentScene(self._current_record()))
@@ -173,7 +164,7 @@ class Viewer:
         current = self._runner.current
         return None if current is None else self._runner.scene(current)
 
-    def _add_panel(self, server: LoopbackViser) -> None:
+    def _add_controls(self, server: LoopbackViser) -> None:
         gui = server.gui
         gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
         gui.set_panel_label("Scene")
@@ -187,7 +178,7 @@ class Viewer:
 
         push.on_click(lambda event: self._push(event.target.value, event.client))
         reset.on_click(lambda event: self._on_current(self._runner.reset_scene, event.client))
-        new.on_click(lambda event: self._obey(self._runner.create_scene, event.client))
+        new.on_click(lambda event: self._run_command(self._runner.create_scene, event.client))
         self._wants_gizmos.on_update(lambda _: self._update_gizmos())
         cameras.on_update(lambda event: self._drawing.show_cameras(event.target.value))
         names.on_update(lambda event: self._drawing.show_names(event.target.value))
@@ -215,9 +206,9 @@ class Viewer:
     def _on_current(self, command: Callable[[str], object], client: Client) -> None:
         scene = self._runner.current
         if scene is not None:
-            self._obey(lambda: command(scene), client)
+            self._run_command(lambda: command(scene), client)
 
-    def _obey(self, command: Callable[[], object], client: Client) -> None:
+    def _run_command(self, command: Callable[[], object], client: Client) -> None:
         """Carry out a command; tell the one who gave it if it is refused."""
         try:
             command()
@@ -235,4 +226,4 @@ class Viewer:
         """Hands may move objects only while no job does, and while the handles are not those of a goal."""
         current = self._runner.current
         is_free = current is not None and self._runner.jobs.holder(current) is None
-        self._drawing.show_gizmos(self._wants_gizmos.value and is_free and not self._goal_view.is_composing)
+        self._drawing.show_gizmos(self._wants_gizmos.value and is_free and not self._goal_panel.is_composing)

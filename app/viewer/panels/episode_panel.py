@@ -18,9 +18,9 @@ from app.processes.messages import CurrentScene, SceneChanged
 from app.processes.plan_summary import PlanSketch
 from app.services.episodes import KIND
 from app.services.goals import DraftChanged
-from app.viewer.drawing_thread import DrawingThread
 from app.viewer.nodes.episode_nodes import EpisodeDrawing, Part
-from app.viewer.nodes.scene_nodes import Client, SceneDrawing
+from app.viewer.nodes.scene_nodes import SceneDrawing
+from app.viewer.panels.panel import RunCommand, ThreadedPanel
 from app.viewer.panels.status_line import status
 from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
 from osfcore.estimation.steps import EstimateStep
@@ -34,7 +34,6 @@ _SHOWN: tuple[tuple[Part, str, str], ...] = (
     ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
     ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
 )
-Obey = Callable[[Callable[[], object], Client], None]
 
 
 class Orders(Protocol):
@@ -113,14 +112,14 @@ class _Told:
                 return self
 
 
-class EpisodeView:
+class EpisodePanel(ThreadedPanel):
     """What visitors see and do about episodes; the same for all of them.
 
     Args:
         server: whose panel gets the folder.
         drawings: of the table, whose own lamp tells the truth, and of episodes.
         orders: to the job that runs one.
-        obey: carries out a command and tells its visitor if it is refused.
+        run_command: carries out a command and notifies its client if it is refused.
         make_room: called before an episode is drawn, to remove what would be in its way.
     """
 
@@ -129,51 +128,40 @@ class EpisodeView:
         server: viser.ViserServer,
         drawings: tuple[SceneDrawing, EpisodeDrawing],
         orders: Orders,
-        obey: Obey,
+        run_command: RunCommand,
         make_room: Callable[[], object],
     ) -> None:
+        super().__init__("episode-panel", DRAW_INTERVAL_S)
         self._table, self._drawing = drawings
         self._orders = orders
-        self._obey = obey
+        self._run_command = run_command
         self._make_room = make_room
-        self._thread = DrawingThread("episode-view", self._draw, DRAW_INTERVAL_S)
         self._told = _Told()
         self._current: str | None = None
         self._drawn = _Told()
         self._plan_at = 0.0
         self._add_panel(server.gui)
 
-    def start(self, current: str | None) -> None:
-        """Begin to draw; `current` is the scene on view."""
-        self._current = current
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread. Calling it again does nothing."""
-        self._thread.stop()
-
-    def note(self, event: object) -> None:
-        """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._thread.changed:
-            told = self._told
-            match event:
-                case JobSeen(job, seen) if job.kind == KIND:
-                    self._told = told.of(job).with_seen(seen)
-                case JobChanged(_, job) if job.kind == KIND and self._is_latest(job):
-                    self._told = told.of(job)
-                case CurrentScene(record):
-                    self._current = None if record is None else record.id
-                    if not told.is_live and not self._is_here(told):
-                        self._told = _Told()
-                case DraftChanged(draft) if draft is not None and not told.is_live:
-                    self._told = _Told()  # a new goal begins: the former one would be taken for it
-                case SceneChanged(record) if not told.is_live and self._is_of(told, record.id):
-                    self._told = replace(told, sight=None)  # hands have moved something: nobody believes that now
-                case JobSeen(_, EstimateStep()) if not told.is_live:
-                    self._told = replace(told, sight=None)
-                case _:
-                    return
-            self._thread.wake()
+    def _store(self, event: object) -> bool:
+        told = self._told
+        match event:
+            case JobSeen(job, seen) if job.kind == KIND:
+                self._told = told.of(job).with_seen(seen)
+            case JobChanged(_, job) if job.kind == KIND and self._is_latest(job):
+                self._told = told.of(job)
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+                if not told.is_live and not self._is_here(told):
+                    self._told = _Told()
+            case DraftChanged(draft) if draft is not None and not told.is_live:
+                self._told = _Told()  # a new goal begins: the former one would be taken for it
+            case SceneChanged(record) if not told.is_live and self._is_of(told, record.id):
+                self._told = replace(told, sight=None)  # hands have moved something: nobody believes that now
+            case JobSeen(_, EstimateStep()) if not told.is_live:
+                self._told = replace(told, sight=None)
+            case _:
+                return False
+        return True
 
     def _is_here(self, told: _Told) -> bool:
         """Whether it is about what is on view."""
@@ -204,9 +192,9 @@ class EpisodeView:
                 "Show true light", False, hint="The simulation's own light, which the estimator does not know."
             )
             clear = gui.add_button("Clear", hint="Remove what a finished episode has drawn.")
-        self._pause_button.on_click(lambda event: self._obey(self._toggle, event.client))
-        self._step_button.on_click(lambda event: self._obey(self._step, event.client))
-        self._cancel_button.on_click(lambda event: self._obey(self._cancel, event.client))
+        self._pause_button.on_click(lambda event: self._run_command(self._toggle, event.client))
+        self._step_button.on_click(lambda event: self._run_command(self._step, event.client))
+        self._cancel_button.on_click(lambda event: self._run_command(self._cancel, event.client))
         self._wants_truth.on_update(lambda _: self._draw_truth())
         clear.on_click(lambda _: self._forget())
 

@@ -21,10 +21,10 @@ from app.processes.messages import CurrentScene
 from app.processes.neural_client import Answer, NeuralLink
 from app.processes.neural_messages import Comparison
 from app.services.estimates import KIND, Asked, Estimates
-from app.viewer.drawing_thread import DrawingThread
 from app.viewer.nodes.estimate_nodes import EstimateDrawing
-from app.viewer.nodes.scene_nodes import Client, SceneDrawing
+from app.viewer.nodes.scene_nodes import SceneDrawing
 from app.viewer.panels.loss_curves import LossCurves
+from app.viewer.panels.panel import RunCommand, ThreadedPanel
 from osfcore.errors import OsfError
 from osfcore.estimation.steps import EstimateStep
 
@@ -33,10 +33,9 @@ PICTURE_INTERVAL_S = 0.7  # rendering takes time from the estimator
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
 _NO_PICTURE = np.full((32, 64, 3), 235, np.uint8)
 _IDLE = "Not asked yet"
-Obey = Callable[[Callable[[], object], Client], None]
 
 
-class EstimateView:
+class EstimatePanel(ThreadedPanel):
     """What visitors see and do about estimates; the same for all of them.
 
     Args:
@@ -44,7 +43,7 @@ class EstimateView:
         drawings: of the table, whose own lamp tells the truth, and of estimates.
         estimates: to ask for and to look at.
         neural: renders what a guess would look like.
-        obey: carries out a command and tells its visitor if it is refused.
+        run_command: carries out a command and notifies its client if it is refused.
         cancel: ends a job.
     """
 
@@ -54,16 +53,16 @@ class EstimateView:
         drawings: tuple[SceneDrawing, EstimateDrawing],
         estimates: Estimates,
         neural: NeuralLink,
-        obey: Obey,
+        run_command: RunCommand,
         cancel: Callable[[str], object],
     ) -> None:
+        super().__init__("estimate-panel", DRAW_INTERVAL_S)
         self._server = server
         self._estimates = estimates
         self._table, self._drawing = drawings
         self._neural = neural
-        self._obey = obey
+        self._run_command = run_command
         self._cancel = cancel
-        self._thread = DrawingThread("estimate-view", self._draw, DRAW_INTERVAL_S)
         self._job: Job | None = None
         self._steps: list[EstimateStep] = []  # not drawn yet
         self._current: str | None = None
@@ -76,18 +75,9 @@ class EstimateView:
         self._picture_of: object = None
         self._add_panel(server.gui)
 
-    def start(self, current: str | None) -> None:
-        """Begin to draw; `current` is the scene on view."""
-        self._current = current
-        self._thread.start()
-
-    def visited(self) -> None:
+    def add_client(self, client: viser.ClientHandle) -> None:
         """Somebody has come, for whom there may be a picture to make."""
         self._thread.wake()
-
-    def stop(self) -> None:
-        """End the thread. Calling it again does nothing."""
-        self._thread.stop()
 
     def forget(self) -> None:
         """Remove what a finished estimate has drawn. Any thread may call."""
@@ -96,22 +86,20 @@ class EstimateView:
                 self._job, self._steps = None, []
                 self._thread.wake()
 
-    def note(self, event: object) -> None:
-        """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._thread.changed:
-            match event:
-                case JobSeen(job, EstimateStep() as step) if job.kind == KIND and self._is_here(job):
-                    self._job = job
-                    self._steps.append(step)
-                case JobChanged(_, job) if job.kind == KIND and self._is_here(job) and self._is_latest(job):
-                    self._job = job
-                case CurrentScene(record):
-                    self._current = None if record is None else record.id
-                    if self._job is not None and not self._is_here(self._job):
-                        self._job, self._steps = None, []
-                case _:
-                    return
-            self._thread.wake()
+    def _store(self, event: object) -> bool:
+        match event:
+            case JobSeen(job, EstimateStep() as step) if job.kind == KIND and self._is_here(job):
+                self._job = job
+                self._steps.append(step)
+            case JobChanged(_, job) if job.kind == KIND and self._is_here(job) and self._is_latest(job):
+                self._job = job
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+                if self._job is not None and not self._is_here(self._job):
+                    self._job, self._steps = None, []
+            case _:
+                return False
+        return True
 
     def _is_here(self, job: Job) -> bool:
         """Whether it is about what is on view; uploads are shown on any table."""
@@ -137,8 +125,8 @@ class EstimateView:
             clear = gui.add_button("Clear", hint="Remove what an estimate has drawn.")
             self._camera = gui.add_dropdown("Camera", ("0",))
             self._image = gui.add_image(_NO_PICTURE, label="Observed, rendered", visible=False)
-        start.on_click(lambda event: self._obey(lambda: self._estimates.of_scene(Asked()), event.client))
-        self._stop_button.on_click(lambda event: self._obey(self._cancel_mine, event.client))
+        start.on_click(lambda event: self._run_command(lambda: self._estimates.of_scene(Asked()), event.client))
+        self._stop_button.on_click(lambda event: self._run_command(self._cancel_mine, event.client))
         self._wants_tried.on_update(lambda event: self._drawing.show_candidates(event.target.value))
         self._wants_truth.on_update(lambda _: self._draw_truth())
         self._camera.on_update(lambda _: self._look_again())

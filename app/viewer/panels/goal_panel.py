@@ -18,10 +18,10 @@ from PIL import Image
 
 from app.processes.messages import CurrentScene
 from app.services.goals import Draft, DraftChanged
-from app.viewer.drawing_thread import DrawingThread
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.scene_nodes import NO_TURN, Client
+from app.viewer.panels.panel import RunCommand, ThreadedPanel
 from app.viewer.panels.status_line import status
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose, quaternion_multiply
@@ -37,7 +37,6 @@ _STILL = 1e-6  # poses that differ by less are not sent again
 _NO_PICTURE = np.full((64, 64, 3), 235, np.uint8)
 _IDLE = "Lay the objects out as they should be, then save."
 _COMPOSING = "Drag the golden copies, or turn them by their rings."
-Obey = Callable[[Callable[[], object], Client], None]
 
 
 class Drafts(Protocol):
@@ -69,7 +68,7 @@ class Drafts(Protocol):
         ...
 
 
-class GoalView:
+class GoalPanel(ThreadedPanel):
     """What visitors see and do while a goal is composed; the same for all of them.
 
     Args:
@@ -77,19 +76,24 @@ class GoalView:
         library: knows the objects' shapes.
         goals: what is composed.
         commands: carries out what hands do; viser's loop must not wait for it.
-        obey: carries out a command and tells its visitor if it is refused.
+        run_command: carries out a command and notifies its client if it is refused.
     """
 
     def __init__(
-        self, server: viser.ViserServer, library: AssetLibrary, goals: Drafts, commands: Executor, obey: Obey
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        goals: Drafts,
+        commands: Executor,
+        run_command: RunCommand,
     ) -> None:
+        super().__init__("goal-panel")
         self._server = server
         self._library = library
         self._goals = goals
         self._commands = commands
-        self._obey = obey
-        self._thread = DrawingThread("goal-view", self._draw)
-        self._draft: Draft | None = None
+        self._run_command = run_command
+        self._draft = goals.draft
         self._current: str | None = None
         self._copies: dict[str, _Copy] = {}
         self._pictured: Draft | None = None
@@ -98,27 +102,15 @@ class GoalView:
         )
         self._add_panel(server.gui)
 
-    def start(self, current: str | None) -> None:
-        """Begin to draw; `current` is the scene on view."""
-        self._current, self._draft = current, self._goals.draft
-        self._thread.wake()
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread. Calling it again does nothing."""
-        self._thread.stop()
-
-    def note(self, event: object) -> None:
-        """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._thread.changed:
-            match event:
-                case DraftChanged(draft):
-                    self._draft = draft
-                case CurrentScene(record):
-                    self._current = None if record is None else record.id
-                case _:
-                    return
-            self._thread.wake()
+    def _store(self, event: object) -> bool:
+        match event:
+            case DraftChanged(draft):
+                self._draft = draft
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+            case _:
+                return False
+        return True
 
     @property
     def is_composing(self) -> bool:
@@ -136,9 +128,9 @@ class GoalView:
             self._keep_button = gui.add_button("Save as goal image", disabled=True)
             self._drop_button = gui.add_button("Stop composing", disabled=True, hint="Nothing is kept.")
             self._image = gui.add_image(_NO_PICTURE, label="As the goal camera sees it", visible=False)
-        self._begin_button.on_click(lambda event: self._obey(goals.begin_draft, event.client))
-        self._keep_button.on_click(lambda event: self._obey(lambda: goals.keep_draft(NAME), event.client))
-        self._drop_button.on_click(lambda event: self._obey(goals.drop_draft, event.client))
+        self._begin_button.on_click(lambda event: self._run_command(goals.begin_draft, event.client))
+        self._keep_button.on_click(lambda event: self._run_command(lambda: goals.keep_draft(NAME), event.client))
+        self._drop_button.on_click(lambda event: self._run_command(goals.drop_draft, event.client))
 
     # The thread
 
@@ -187,7 +179,7 @@ class GoalView:
                 copy.release(grip)
                 self._thread.wake()
 
-        self._commands.submit(self._obey, move, client)
+        self._commands.submit(self._run_command, move, client)
 
 
 class _Copy:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
@@ -15,6 +14,7 @@ import viser
 from app.processes.neural_client import Answer, NeuralLink
 from app.processes.neural_messages import DrawnView, DrawView
 from app.processes.render_cameras import view_camera
+from app.viewer.panels.panel import ThreadedPanel
 from app.viewer.panels.refinement import STEPS, Refinement, Ticket
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
@@ -38,7 +38,7 @@ class _Come:
 
 
 class Visitor:
-    """One browser: its switch, and what it is shown. All but the switch belongs to the thread of `NeuralViews`."""
+    """One browser: its switch, and what it is shown. All but the switch belongs to the thread of `NeuralPanel`."""
 
     def __init__(self, client: viser.ClientHandle, on_switch: Callable[[], None]) -> None:
         self.client = client
@@ -131,7 +131,7 @@ class Visitor:
             self._hidden[path] = self.client.scene.add_frame(path, show_axes=False, visible=False)
 
 
-class NeuralViews:
+class NeuralPanel(ThreadedPanel):
     """All visitors, and the thread that orders and shows their pictures.
 
     Args:
@@ -143,69 +143,55 @@ class NeuralViews:
     def __init__(
         self, link: NeuralLink, state: Callable[[], SceneState], fields: Callable[[], Collection[str]]
     ) -> None:
+        super().__init__("neural-panel")
         self._link = link
         self._state = state
         self._fields = fields
-        self._visitors: dict[int, Visitor] = {}
-        self._changed = threading.Condition()  # guards the visitors, their refinements and what has come for them
-        self._is_stopped = False
-        self._thread = threading.Thread(target=self._run, name="neural-views", daemon=True)
+        self._visitors: dict[int, Visitor] = {}  # guarded by `_thread.changed`, with what belongs to them
 
-    def start(self) -> None:
-        """Begin to look after visitors."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread. Calling it again does nothing."""
-        with self._changed:
-            self._is_stopped = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
-
-    def add(self, client: viser.ClientHandle) -> None:
+    def add_client(self, client: viser.ClientHandle) -> None:
         """Give a new visitor the switch."""
         visitor = Visitor(client, lambda: self._moved(visitor))
         client.camera.on_update(lambda _: self._moved(visitor))
-        with self._changed:
+        with self._thread.changed:
             self._visitors[client.client_id] = visitor
 
-    def remove(self, client: viser.ClientHandle) -> None:
+    def remove_client(self, client: viser.ClientHandle) -> None:
         """Forget a visitor who left."""
-        with self._changed:
+        with self._thread.changed:
             self._visitors.pop(client.client_id, None)
 
     def scene_moved(self) -> None:
         """What is drawn has changed. Any thread may call; it never waits for a picture."""
-        with self._changed:
+        with self._thread.changed:
             self._moved(*self._visitors.values())
 
     def _moved(self, *visitors: Visitor) -> None:
-        with self._changed:
+        with self._thread.changed:
             for visitor in visitors:
                 visitor.refinement.moved(time.monotonic())
-            self._changed.notify()
+            self._thread.wake()
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                if self._is_stopped:
-                    return
-                now = time.monotonic()
-                due = [(at, visitor) for visitor in self._visitors.values() if (at := visitor.due_at()) is not None]
-                ready = [visitor for at, visitor in due if at <= now]
-                if not ready:
-                    self._changed.wait(min((at - now for at, _ in due), default=None))
-                    continue
-            for visitor in ready:
-                try:
-                    self._look_after(visitor, now)
-                except Exception:  # a defect; the other visitors still get their pictures
-                    _log.exception("a visitor's neural pictures failed")
-                    self.remove(visitor.client)
+    def _store(self, event: object) -> bool:
+        return False  # what moves is told by `scene_moved`
+
+    def _draw(self) -> None:
+        now = time.monotonic()
+        with self._thread.changed:
+            due = [visitor for visitor in self._visitors.values() if (at := visitor.due_at()) is not None and at <= now]
+        for visitor in due:
+            try:
+                self._look_after(visitor, now)
+            except Exception:  # a defect; the other visitors still get their pictures
+                _log.exception("a visitor's neural pictures failed")
+                self.remove_client(visitor.client)
+        with self._thread.changed:
+            times = [at for visitor in self._visitors.values() if (at := visitor.due_at()) is not None]
+            if times:
+                self._thread.wake(max(min(times) - time.monotonic(), 0.0))
 
     def _look_after(self, visitor: Visitor, now: float) -> None:
-        with self._changed:
+        with self._thread.changed:
             come, visitor.come = visitor.come, []
         for answer in come:
             self._take(visitor, answer)
@@ -213,7 +199,7 @@ class NeuralViews:
             visitor.clear()
             return
         visitor.tell_late(now)
-        with self._changed:
+        with self._thread.changed:
             due_at = visitor.refinement.due_at()
             ticket = visitor.refinement.order() if due_at is not None and due_at <= now else None
         if ticket is not None:
@@ -223,7 +209,7 @@ class NeuralViews:
         step = STEPS[ticket.step]
         camera, (state, others) = visitor.camera(step.rows), self._split(self._state())
         if camera is None:
-            with self._changed:
+            with self._thread.changed:
                 visitor.refinement.give_up(ticket)
             return
         visitor.tell_meshes(others)
@@ -242,14 +228,14 @@ class NeuralViews:
         return SceneState(names, state.poses[rows], state.light, state.pusher), others
 
     def _came(self, visitor: Visitor, come: _Come) -> None:
-        with self._changed:
+        with self._thread.changed:
             visitor.come.append(come)
-            self._changed.notify()
+            self._thread.wake()
 
     def _take(self, visitor: Visitor, come: _Come) -> None:
         error = come.answer.exception()
         picture = None if error else come.answer.result()
-        with self._changed:
+        with self._thread.changed:
             is_wanted = visitor.refinement.came(come.ticket, is_there=picture is not None)
         if not visitor.is_on:
             return

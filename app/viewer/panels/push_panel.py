@@ -21,10 +21,10 @@ from app.processes.neural_client import Answer
 from app.processes.neural_messages import Predicted
 from app.services.predictions import Predictions
 from app.services.pushes import MAX_ACTIONS, along, outcomes, straight, toward_nearest, way
-from app.viewer.drawing_thread import DrawingThread
 from app.viewer.nodes.push_nodes import PushDrawing
 from app.viewer.nodes.scene_nodes import Client
 from app.viewer.nodes.waypoints import FEWEST, MOST, Waypoints
+from app.viewer.panels.panel import RunCommand, ThreadedPanel
 from app.viewer.panels.push_report import report
 from app.viewer.panels.push_trial import Trial
 from app.viewer.panels.status_line import status
@@ -44,7 +44,6 @@ _CHANGED = "The table has changed; predict again"
 _SPEED = (0.05, MAX_SPEED_M_S)
 _DEFAULT_STEPS = 6
 _FURTHER_M = 0.05
-Obey = Callable[[Callable[[], object], Client], None]
 Act = Callable[[str, list[np.ndarray]], SceneRecord]
 
 
@@ -62,7 +61,7 @@ class _Asked:
     answer: Future[Answer]
 
 
-class PushView:
+class PushPanel(ThreadedPanel):
     """What visitors ask and see about pushes; the same for all of them.
 
     Args:
@@ -70,17 +69,22 @@ class PushView:
         library: knows shapes, symmetries and labels.
         predictions: to ask for.
         act: carries actions out in a scene and tells what became of it.
-        obey: carries out a command and tells its visitor if it is refused.
+        run_command: carries out a command and notifies its client if it is refused.
     """
 
     def __init__(
-        self, server: viser.ViserServer, library: AssetLibrary, predictions: Predictions, act: Act, obey: Obey
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        predictions: Predictions,
+        act: Act,
+        run_command: RunCommand,
     ) -> None:
+        super().__init__("push-panel", TICK_S)
         self._library = library
         self._predictions = predictions
         self._act = act
-        self._obey = obey
-        self._thread = DrawingThread("push-view", self._draw_newest, TICK_S)
+        self._run_command = run_command
         self._drawing = PushDrawing(server, library)
         self._waypoints = Waypoints(server, self._replan)
         self._record: SceneRecord | None = None
@@ -95,29 +99,18 @@ class PushView:
         self._shown_s = 0.0
         self._add_panel(server.gui)
 
-    def start(self, record: SceneRecord | None) -> None:
-        """Begin to draw; `record` is the scene on view."""
-        self.note(CurrentScene(record))
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread. Calling it again does nothing."""
-        self._thread.stop()
-
-    def note(self, event: object) -> None:
-        """Take note of an event; those of other kinds are ignored. Any thread may call."""
-        with self._thread.changed:
-            match event:
-                case CurrentScene(record):
-                    self._record, self._ready, self._told = record, None, _IDLE
-                case SceneChanged(record, states) if self._record is not None and record.id == self._record.id:
-                    self._record = record
-                    if self._ready is not None:
-                        self._ready = self._ready.after(record, states, self._executing)
-                        self._told = _CHANGED if self._ready is None else self._told
-                case _:
-                    return
-            self._thread.wake()
+    def _store(self, event: object) -> bool:
+        match event:
+            case CurrentScene(record):
+                self._record, self._ready, self._told = record, None, _IDLE
+            case SceneChanged(record, states) if self._record is not None and record.id == self._record.id:
+                self._record = record
+                if self._ready is not None:
+                    self._ready = self._ready.after(record, states, self._executing)
+                    self._told = _CHANGED if self._ready is None else self._told
+            case _:
+                return False
+        return True
 
     # The panel
 
@@ -143,8 +136,8 @@ class PushView:
             control.on_update(lambda event: None if event.client is None else self._replan())
         self._kind.on_update(lambda _: self._choose_kind())
         self._compass.on_click(lambda event: self._turn(event.target.value))
-        predict.on_click(lambda event: self._obey(partial(self._predict, event.client), event.client))
-        self._execute_button.on_click(lambda event: self._obey(self._execute, event.client))
+        predict.on_click(lambda event: self._run_command(partial(self._predict, event.client), event.client))
+        self._execute_button.on_click(lambda event: self._run_command(self._execute, event.client))
         self._time.on_update(self._seek)
         self._play.on_click(lambda _: self._toggle_play())
         clear.on_click(lambda _: self._forget())
@@ -261,12 +254,12 @@ class PushView:
 
     # The thread
 
-    def _draw_newest(self) -> None:
+    def _draw(self) -> None:
         with self._thread.changed:
             come, self._come = self._come, None
         if come is not None:
             self._take(come)
-        self._draw()
+        self._draw_all()
 
     def _take(self, asked: _Asked) -> None:
         """Make an answer what is on view, unless the table has changed meanwhile."""
@@ -274,7 +267,7 @@ class PushView:
         answer = None if error else asked.answer.result()
         if isinstance(error, OsfError):
             self._tell(str(error))
-            self._obey(partial(_refuse, error), asked.client)
+            self._run_command(partial(_refuse, error), asked.client)
         elif error is not None:
             self._tell("The prediction failed; the log tells more")
             raise error
@@ -287,7 +280,7 @@ class PushView:
                 return
             self._ready = Trial(asked.record, asked.actions, answer.rollouts, answer.took_s)
 
-    def _draw(self) -> None:
+    def _draw_all(self) -> None:
         with self._thread.changed:
             record, ready, told = self._record, self._ready, self._told
         self._draw_plan(record)

@@ -1,35 +1,153 @@
-"""The drawing of a running service, with a scene of two objects."""
+"""A driver that stands for a browser, and the scene of two objects that a running service shows."""
+
+import asyncio
+import contextlib
+import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import viser
+from viser._gui_handles import GuiProgressBarHandle
 
+from app.viewer.viewer import LoopbackViser
 from tests.app.conftest import until
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 
 
-@pytest.fixture
-def drawing(live):
-    return live.services.viewer._drawing
+class ViewerDriver:
+    """What a browser shows of a viser server, and what people do in it.
+
+    viser can neither list the elements of its panel nor act as a browser, so its private state is read here, and only
+    here.
+
+    Args:
+        server: whose panel and scene are driven.
+        client: who acts, as callbacks are told.
+    """
+
+    def __init__(self, server, client=None):
+        self.server, self.client = server, client
+
+    def _elements(self, container, folder=""):
+        for element in list(container._children.values()):
+            yield folder, element
+            if isinstance(element, viser.GuiFolderHandle):
+                yield from self._elements(element, element.label)
+
+    def elements(self, what, folder=None):
+        """Elements with a label, or of a type; all, or those in a folder ("" for those in none)."""
+        return [
+            element
+            for of, element in self._elements(self.server.gui._container_handle_from_uuid["root"])
+            if folder in (None, of)
+            and (isinstance(element, what) if isinstance(what, type) else getattr(element, "label", None) == what)
+        ]
+
+    def element(self, what, folder=None):
+        (element,) = self.elements(what, folder)
+        return element
+
+    def progress(self, folder=None):
+        """Percent that a progress bar shows; None while there is none to see."""
+        (bar,) = self.elements(GuiProgressBarHandle, folder)
+        return bar.value if bar.visible else None
+
+    def text(self, folder=None):
+        """HTML that is visible."""
+        return "".join(html.content for html in self.elements(viser.GuiHtmlHandle, folder) if html.visible)
+
+    def says(self, words):
+        until(lambda: words in self.text())
+
+    def press(self, label, value=None, *, folder=None):
+        """Click a button, or the one of a group that is called `value`."""
+        button = self.element(label, folder)
+        self._tell(button, button if value is None else SimpleNamespace(value=value))
+
+    def set(self, label, value, *, folder=None):
+        """Give an element a value, which browsers do not check."""
+        element = self.element(label, folder)
+        element._impl.value = value
+        self._tell(element, element)
+
+    def _tell(self, element, target):
+        for callback in element._impl.update_cb:
+            callback(SimpleNamespace(client=self.client, target=target))
+
+    def drag(self, path, position=None, turn=None, *phases):
+        """Move the handles of a node."""
+        handles = self.node(path)
+        handles.position = np.array(handles.position if position is None else position, float)
+        handles.wxyz = np.array(handles.wxyz if turn is None else turn, float)
+        for phase in phases or ("start", "update", "end"):
+            for callback in handles._impl_aux.update_cb:
+                asyncio.run(callback(SimpleNamespace(client=self.client, target=handles, phase=phase)))
+
+    def node(self, path):
+        """A node of the scene; None if there is none."""
+        return self.server.scene.get_handle_by_name(path)
+
+    def below(self, path):
+        """Names of the nodes right below one."""
+        parents = [name.rpartition("/") for name in list(self.server.scene._handle_from_node_name)]
+        return {name for parent, _, name in parents if parent == path}
+
+    def shows(self, path):
+        """Whether a node is there and neither it nor one above it is hidden."""
+        parts = path.split("/")
+        above = [self.node("/".join(parts[:count])) for count in range(2, len(parts))]
+        node = self.node(path)
+        return node is not None and all(each.visible for each in (*above, node) if each is not None)
+
+    def table_agrees(self, scene):
+        """Whether everything on the table is where a scene of the REST interface says."""
+        objects = {o["name"]: o for o in scene["objects"]}
+        light = scene["light"]["position"]
+        places = {"/pusher": scene["pusher"]["position"], "/light": light, "/lamp": light}
+        places |= {f"/objects/{name}": o["position"] for name, o in objects.items()}
+        return (
+            self.below("/objects") == set(objects)
+            and all(np.allclose(self.node(path).position, at, atol=1e-5) for path, at in places.items())
+            and all(
+                np.allclose(self.node(f"/objects/{name}").wxyz, o["quaternion"], atol=1e-5)
+                for name, o in objects.items()
+            )
+        )
+
+
+@pytest.fixture(scope="session")
+def viser_server():
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 @pytest.fixture
-def shown(live, drawing):
+def server(viser_server):
+    """An empty viser server."""
+    yield viser_server
+    viser_server.gui.reset()
+    viser_server.scene.reset()
+
+
+@pytest.fixture
+def driver(server):
+    return ViewerDriver(server)
+
+
+@pytest.fixture
+def browser(live):
+    """A driver of the running service's view."""
+    return ViewerDriver(live.services.viewer.server)
+
+
+@pytest.fixture
+def shown(live, browser):
     _, scene = live.request("POST", "/api/scenes", {"seed": 1, "objects": [BOX, BOTTLE]})
-    until(lambda: set(drawing._bodies) == {BOX, BOTTLE})
+    until(lambda: browser.below("/objects") == {BOX, BOTTLE})
     yield scene
     live.request("DELETE", f"/api/scenes/{scene['id']}")
-
-
-def agrees(drawing, scene):
-    """Whether what is drawn is where the scene says."""
-    bodies = drawing._bodies
-    told = {o["name"]: o for o in scene["objects"]}
-    return (
-        set(told) == set(bodies)
-        and all(np.allclose(bodies[n].position, o["position"], atol=1e-5) for n, o in told.items())
-        and all(np.allclose(bodies[n].wxyz, o["quaternion"], atol=1e-5) for n, o in told.items())
-        and np.allclose(drawing._pusher.position, scene["pusher"]["position"], atol=1e-5)
-        and np.allclose(drawing._cube.position, scene["light"]["position"], atol=1e-5)
-        and np.allclose(drawing._lamp.position, scene["light"]["position"], atol=1e-5)
-    )

@@ -1,12 +1,8 @@
-import contextlib
-import io
-
 import numpy as np
 import pytest
 
 from app.processes.plan_summary import PlanSketch
 from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeDrawing, cost_colours
-from app.viewer.viewer import LoopbackViser
 from osfcore.control.events import Look, Looking
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
@@ -23,21 +19,9 @@ LIGHT = Light(np.array([0.6, 0, 0.8]))
 TURNS = np.tile([1.0, 0, 0, 0], (2, 1))
 
 
-@pytest.fixture(scope="module")
-def server():
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
-
-
 @pytest.fixture
 def drawing(server, library):
-    drawing = EpisodeDrawing(server, library)
-    yield drawing
-    drawing.clear()
-    server.scene.reset()
+    return EpisodeDrawing(server, library)
 
 
 def poses(x=0.1):
@@ -72,73 +56,81 @@ def is_red(colour):
     return colour[0] > 2 * max(colour[1], colour[2])
 
 
-def all_nodes(drawing):
-    estimates = (drawing._now, drawing._goal_look)
-    guesses = [node for estimate in estimates for node in estimate._guesses.values()]
-    return [*drawing._goal.values(), *drawing._future.nodes, drawing._ways, drawing._best, *guesses]
+def guess(driver, name=BOX, of="estimate"):
+    return driver.node(f"/episode/{of}/guess/{name}")
 
 
-def test_the_goal_is_drawn_in_one_colour_and_stays_the_same_nodes(drawing):
+def shows_plan(driver):
+    future = driver.below("/episode/plan/future")
+    return any(driver.shows(f"/episode/plan/{name}") for name in ("ways", "best", *(f"future/{n}" for n in future)))
+
+
+def goals(driver):
+    where = "/episode/goal/where"
+    return {name: driver.node(f"{where}/{name}") for name in driver.below(where)}
+
+
+def test_the_goal_is_drawn_in_one_colour_and_stays_the_same_nodes(drawing, driver):
     drawing.show_goal(PoseGoal(NAMES, poses()))
-    before = dict(drawing._goal)
+    before = goals(driver)
     assert set(before) == set(NAMES)
     np.testing.assert_allclose(before[BOX].position, [0.1, 0, 0.1], atol=1e-6)
     assert {tuple(node.color) for node in before.values()} == {GOAL}
     drawing.show_goal(PoseGoal(NAMES[::-1], poses()[::-1]))
-    assert drawing._goal == before
+    assert goals(driver) == before
     drawing.show_goal(PoseGoal(NAMES, poses(0.3)))
-    assert drawing._goal == before
+    assert goals(driver) == before
     np.testing.assert_allclose(before[BOX].position, [0.3, 0, 0.1], atol=1e-6)
     drawing.show_goal(PoseGoal((BOX,), poses()[:1]))
-    assert set(drawing._goal) == {BOX}
-    assert all(node._impl.removed for node in before.values())
+    assert set(goals(driver)) == {BOX}
+    assert goals(driver)[BOX] is not before[BOX]
 
 
-def test_a_look_at_the_goal_image_is_drawn_beside_the_table_until_the_goal_is_known(drawing):
+def test_a_look_at_the_goal_image_is_drawn_beside_the_table_until_the_goal_is_known(drawing, driver):
     drawing.show_look(look("first"))
     drawing.show_look(look("goal", x=0.4))
-    now, goal = drawing._now._guesses[BOX], drawing._goal_look._guesses[BOX]
+    now, goal = guess(driver), guess(driver, of="goal/look")
     np.testing.assert_allclose(now.batched_positions, [[0.1, 0, 0.1]], atol=1e-6)
     np.testing.assert_allclose(goal.batched_positions, [[0.4, 0, 0.1]], atol=1e-6)
     assert not np.array_equal(goal.batched_colors, now.batched_colors)
-    assert drawing._goal_look._lamp is None  # a second green cube would be taken for the table's
+    assert driver.node("/episode/goal/look/light") is None  # a second green cube would be taken for the table's
     drawing.show_goal(PoseGoal(NAMES, poses()))
-    assert drawing._goal_look.is_empty
-    assert not drawing._now.is_empty
+    assert guess(driver, of="goal/look") is None
+    assert guess(driver) is not None
 
 
-def test_estimates_follow_without_words_and_doubted_objects_have_another_colour(drawing):
+def test_estimates_follow_without_words_and_doubted_objects_have_another_colour(drawing, driver):
     drawing.show_look(look(candidates=Pose(np.zeros((4, 2, 3)), np.tile(TURNS, (4, 1, 1)))))
-    before = drawing._now._guesses[BOX]
-    assert drawing._now._tried[BOX].visible
+    before = guess(driver)
+    assert driver.shows(f"/episode/estimate/tried/{BOX}")
     drawing.show_estimate(estimated(0.2, "it is hardly visible"))
-    assert drawing._now._guesses[BOX] is before
+    assert guess(driver) is before
     np.testing.assert_allclose(before.batched_positions, [[0.2, 0, 0.1]], atol=1e-6)
-    assert not drawing._now._tried[BOX].visible
-    assert not np.array_equal(before.batched_colors, drawing._now._guesses[CAN].batched_colors)
-    assert drawing._now._verdicts == []
-    np.testing.assert_allclose(drawing._now._lamp[0].position, LIGHT.position)
+    assert not driver.shows(f"/episode/estimate/tried/{BOX}")
+    assert not np.array_equal(before.batched_colors, guess(driver, CAN).batched_colors)
+    assert driver.below(f"/episode/estimate/verdict/{BOX}") == set()
+    np.testing.assert_allclose(driver.node("/episode/estimate/light").position, LIGHT.position)
 
 
-def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(drawing):
+def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(drawing, driver):
     drawing.show_plan(sketch(ways=5, moments=11))
-    assert drawing._ways.points.shape == drawing._ways.colors.shape == (50, 2, 3)
-    assert is_green(drawing._ways.colors[0, 0])
-    assert is_red(drawing._ways.colors[-1, 1])
-    assert drawing._ways.points[0, 0, 2] > drawing._ways.points[-1, 0, 2]  # cheap ones lie above dear ones
-    np.testing.assert_allclose(drawing._ways.points[0, 1], drawing._ways.points[1, 0])
-    np.testing.assert_allclose(drawing._best.points[[0, -1], [0, 1], 0], [-0.2, 0.0], atol=1e-6)
-    assert drawing._best.points[..., 2].max() < 0.02  # on the table
-    before = drawing._ways
+    ways, best = driver.node("/episode/plan/ways"), driver.node("/episode/plan/best")
+    assert ways.points.shape == ways.colors.shape == (50, 2, 3)
+    assert is_green(ways.colors[0, 0])
+    assert is_red(ways.colors[-1, 1])
+    assert ways.points[0, 0, 2] > ways.points[-1, 0, 2]  # cheap ones lie above dear ones
+    np.testing.assert_allclose(ways.points[0, 1], ways.points[1, 0])
+    np.testing.assert_allclose(best.points[[0, -1], [0, 1], 0], [-0.2, 0.0], atol=1e-6)
+    assert best.points[..., 2].max() < 0.02  # on the table
     drawing.show_plan(sketch(ways=3, moments=4))
-    assert drawing._ways is before
-    assert drawing._ways.points.shape == drawing._ways.colors.shape == (9, 2, 3)
+    assert driver.node("/episode/plan/ways") is ways
+    assert ways.points.shape == ways.colors.shape == (9, 2, 3)
 
 
-def test_the_best_future_is_played_again_and_again_and_stands_at_its_end(drawing):
+def test_the_best_future_is_played_again_and_again_and_stands_at_its_end(drawing, driver):
     drawing.play(1.0)  # nothing to play yet
     drawing.show_plan(sketch(moments=11))
-    box = drawing._future.ghosts[BOX]
+    box = driver.node(f"/episode/plan/future/{BOX}")
     places = []
     for seconds in (0.0, 0.25 * PLAY_S, 0.5 * PLAY_S, PLAY_S, PLAY_S + 0.9 * REST_S, 1.5 * PLAY_S + REST_S):
         drawing.play(seconds)
@@ -149,35 +141,37 @@ def test_the_best_future_is_played_again_and_again_and_stands_at_its_end(drawing
     assert box.batched_positions[-1, 0] == pytest.approx(0.05)  # nobody sees it
     drawing.show_plan(None)
     drawing.play(0.0)
-    assert not any(node.visible for node in (drawing._ways, drawing._best, *drawing._future.nodes))
+    drawing.show_part("plan", True)
+    assert not shows_plan(driver)
 
 
-def test_parts_can_be_hidden_also_before_they_are_drawn(drawing):
+def test_parts_can_be_hidden_also_before_they_are_drawn(drawing, driver):
     for part in PARTS:
         drawing.show_part(part, False)
     drawing.show_goal(PoseGoal(NAMES, poses()))
     drawing.show_estimate(estimated())
     drawing.show_plan(sketch())
-    roots = {part: root.name for part, root in drawing._roots.items()}
-    assert all(any(node.name.startswith(f"{root}/") for root in roots.values()) for node in all_nodes(drawing))
-    assert not any(root.visible for root in drawing._roots.values())
+    assert not any(driver.shows(f"/episode/{part}") for part in PARTS)
+    assert not driver.shows(f"/episode/goal/where/{BOX}")
+    assert not driver.shows(f"/episode/estimate/guess/{BOX}")
+    assert not shows_plan(driver)
     assert not drawing.shows_light
     drawing.show_part("estimate", True)
     assert drawing.shows_light
-    assert [part for part, root in drawing._roots.items() if root.visible] == ["estimate"]
+    assert [part for part in PARTS if driver.shows(f"/episode/{part}")] == ["estimate"]
 
 
-def test_everything_can_be_removed(drawing):
+def test_everything_can_be_removed(drawing, driver):
     drawing.show_goal(PoseGoal(NAMES, poses()))
     drawing.show_look(look("goal"))
     drawing.show_estimate(estimated())
     drawing.show_plan(sketch())
     drawing.clear()
     assert not drawing.shows_light
-    assert drawing._goal == {}
-    assert drawing._now.is_empty
-    assert drawing._goal_look.is_empty
-    assert not any(node.visible for node in all_nodes(drawing))
+    assert goals(driver) == {}
+    assert guess(driver) is None
+    assert guess(driver, of="goal/look") is None
+    assert not shows_plan(driver)
 
 
 def test_one_way_that_goes_badly_wrong_does_not_paint_the_others_green():

@@ -7,15 +7,12 @@ import pytest
 
 from app.viewer.nodes.future_nodes import ON_THE_WAY, FutureDrawing, on_the_way
 from osfcore.geometry.poses import Pose, quaternion_exp
-from tests.app.viewer.nodes.test_episode_nodes import BOX, CAN, TURNS, server, sketch
-
-__all__ = ["server"]
+from tests.app.viewer.nodes.test_episode_nodes import BOX, CAN, TURNS, sketch
 
 
 @pytest.fixture
 def drawing(server, library):
-    yield FutureDrawing(server.scene, library, "/future", (190, 50, 210))
-    server.scene.reset()
+    return FutureDrawing(server.scene, library, "/future", (190, 50, 210))
 
 
 def test_what_moves_is_drawn_at_its_end_paler_on_the_way_and_once_more_where_it_begins(drawing):
@@ -36,7 +33,7 @@ def test_what_moves_is_drawn_at_its_end_paler_on_the_way_and_once_more_where_it_
     assert not any(node.visible for node in drawing.nodes)
 
 
-def test_one_copy_and_the_pusher_go_along_and_the_others_stay(drawing):
+def test_one_copy_and_the_pusher_go_along_and_the_others_stay(drawing, driver):
     drawing.at(2.0)  # nothing is shown yet
     assert drawing.steps == 0
     drawing.show(sketch(moments=11).best)
@@ -47,14 +44,13 @@ def test_one_copy_and_the_pusher_go_along_and_the_others_stay(drawing):
         after = drawing.ghosts[BOX].batched_positions
         np.testing.assert_allclose(after[:-1], before[:-1])
         assert after[-1, 0] == pytest.approx(x)
-        assert drawing._pusher.position[0] == pytest.approx(2 * x - 0.2)
+        assert driver.node("/future/pusher").position[0] == pytest.approx(2 * x - 0.2)
 
 
-def test_another_scene_has_other_ghosts(drawing):
+def test_another_scene_has_other_ghosts(drawing, driver):
     drawing.show(sketch().best)
-    before = drawing.ghosts[BOX]
     drawing.show(replace(sketch().best, names=("004_sugar_box", CAN)))
-    assert before._impl.removed
+    assert driver.node(f"/future/{BOX}") is None
     assert set(drawing.ghosts) == {"004_sugar_box", CAN}
 
 

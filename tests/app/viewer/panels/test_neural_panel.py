@@ -8,7 +8,7 @@ import pytest
 
 from app.processes.neural_client import NeuralUnavailable
 from app.processes.neural_messages import DrawnView
-from app.viewer.panels.neural_panel import NeuralViews
+from app.viewer.panels.neural_panel import NeuralPanel
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -103,7 +103,7 @@ class Room:
         self.fields = {A, B}
         self.light = Light(np.array([0, 0, 1.0]))
         self.renderer = Renderer()
-        self.views = NeuralViews(self.renderer, self.state, lambda: self.fields)
+        self.panel = NeuralPanel(self.renderer, self.state, lambda: self.fields)
 
     def state(self):
         poses = Pose(np.array([[0, 0, 0.1], [0.1, 0, 0.1]]), np.array([[1.0, 0, 0, 0]] * 2))
@@ -113,21 +113,21 @@ class Room:
 @pytest.fixture
 def room():
     room = Room()
-    room.views.start()
+    room.panel.start(None)
     yield room
-    room.views.stop()
-    room.views.stop()
+    room.panel.close()
+    room.panel.close()
 
 
 @pytest.fixture
 def browser(room):
     browser = Browser()
-    room.views.add(browser)
+    room.panel.add_client(browser)
     return browser
 
 
 def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, browser):
-    room.views.scene_moved()
+    room.panel.scene_moved()
     assert room.renderer.orders == []  # nobody asked
     browser.turn(True)
     orders = [room.renderer.answer(number) for number in range(3)]
@@ -161,7 +161,7 @@ def test_the_light_and_the_view_are_followed(room, browser):
     browser.turn(True)
     room.renderer.answer(0)
     room.light = Light(np.array([1.0, 0, 0.5]))
-    room.views.scene_moved()
+    room.panel.scene_moved()
     order = room.renderer.answer(1)
     np.testing.assert_allclose(order.state.light.direction, room.light.direction)
     assert not order.is_sharp
@@ -182,7 +182,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
     assert browser.note.value == A
     assert A in browser.notifications[0].body
     room.fields = {A, B}  # it was trained meanwhile
-    room.views.scene_moved()
+    room.panel.scene_moved()
     room.renderer.answer(1)
     until(lambda: f"/objects/{A}" in browser.hides())
     assert not browser.note.visible
@@ -211,10 +211,10 @@ def test_a_view_that_makes_no_sense_is_left_alone_until_it_does(room, browser):
 def test_who_left_gets_no_more_pictures(room, browser):
     browser.turn(True)
     until(lambda: room.renderer.orders)
-    room.views.remove(browser)
+    room.panel.remove_client(browser)
     room.renderer.answer(0)
     other = Browser()
-    room.views.add(other)
+    room.panel.add_client(other)
     other.turn(True)
     room.renderer.answer(1)
     until(lambda: other.pictures)

@@ -1,14 +1,11 @@
 """The folder in the panel, with predictions and pushes that are told by the test."""
 
-import contextlib
-import io
 from concurrent.futures import Future
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import viser
 
 from app.processes.messages import CurrentScene, Notice, SceneChanged, SceneRecord
 from app.processes.neural_client import NeuralUnavailable
@@ -16,8 +13,8 @@ from app.processes.neural_messages import Predicted
 from app.services.fields import MissingFields
 from app.services.pushes import MAX_ACTIONS
 from app.services.runner import SceneHeld
-from app.viewer.panels.push_panel import PATH, PushView
-from app.viewer.viewer import LoopbackViser
+from app.viewer.nodes.push_nodes import PushDrawing
+from app.viewer.panels.push_panel import PATH, PushPanel
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -25,6 +22,7 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from tests.app.conftest import until
+from tests.app.viewer.conftest import ViewerDriver
 
 BOX, CAN = "003_cracker_box", "005_tomato_soup_can"
 SOMEBODY = object()
@@ -52,8 +50,8 @@ class Room:
     def __init__(self, server, library):
         self.asked, self.acted, self.refused = [], [], []
         self.record, self.refusal, self.jumps_in, self.is_warm = RECORD, None, False, True
-        self.view = PushView(server, library, self, self.act, self.obey)
-        self.server = server
+        self.panel = PushPanel(server, library, self, self.act, self.run)
+        self.gui = ViewerDriver(server, SOMEBODY)
 
     def current(self):
         return self.record
@@ -76,9 +74,9 @@ class Room:
 
     def change(self, to=None, states=()):
         self.record = replace(self.record, state=to or self.record.state, revision=self.record.revision + 1)
-        self.view.note(SceneChanged(self.record, states, 0.1))
+        self.panel.show(SceneChanged(self.record, states, 0.1))
 
-    def obey(self, command, client):
+    def run(self, command, client):
         try:
             command()
         except OsfError as error:
@@ -88,198 +86,176 @@ class Room:
         asked = self.asked[number]
         asked.answer.set_result(Predicted(rollouts_of(asked.actions[0], goes_m), 0.02))
 
-    def press(self, label, value=None):
-        handles = self.server.gui._gui_input_handle_from_uuid.values()
-        (button,) = (h for h in handles if h.label == label and hasattr(h, "on_click"))
-        if isinstance(button, viser.GuiButtonHandle) and button.disabled:
-            return
-        (callback,) = button._impl.update_cb
-        callback(SimpleNamespace(client=SOMEBODY, target=button if value is None else SimpleNamespace(value=value)))
-
-    def set(self, handle, value):
-        """As a visitor does, who may send anything."""
-        handle._impl.value = value
-        for callback in handle._impl.update_cb:
-            callback(SimpleNamespace(client=SOMEBODY, target=handle))
-
     def predict(self, goes_m=0.04):
-        self.press("Predict")
+        self.gui.press("Predict")
         self.answer(goes_m)
-        self.says("predicted in")
+        self.gui.says("predicted in")
 
-    def says(self, words):
-        until(lambda: words in self.view._status.content)
+    def moving(self):
+        """Objects with a ghost."""
+        return self.gui.below("/push/ghost")
 
-
-@pytest.fixture(scope="module")
-def server():
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+    def ghost_x(self):
+        return self.gui.node(f"/push/ghost/{BOX}").batched_positions[0, 0]
 
 
 @pytest.fixture
 def room(server, library):
     room = Room(server, library)
-    room.view.start(RECORD)
-    until(lambda: room.view._laid is not None)
+    room.panel.start(RECORD)
+    until(lambda: room.panel.is_idle)
     yield room
-    room.view.stop()
-    room.view.stop()
-    server.gui.reset()
-    server.scene.reset()
+    room.panel.close()
+    room.panel.close()
 
 
 def test_it_begins_with_a_push_that_reaches_the_nearest_object_and_draws_nothing(room):
-    assert room.view._heading.value == 0
-    assert room.view._steps.value == 3  # 10 cm, and 5 more
-    assert not room.view._drawing._plan.visible
-    assert room.view._execute_button.disabled
+    assert room.gui.element("Heading, °").value == 0
+    assert room.gui.element("Steps").value == 3  # 10 cm, and 5 more
+    assert not room.gui.shows("/push/plan")
+    assert room.gui.element("Execute").disabled
 
 
 def test_from_a_direction_to_ghosts_and_from_there_to_the_error(room):
-    room.press("Direction", "↑")
-    until(lambda: room.view._heading.value == 90)
-    until(lambda: room.view._drawing._plan.visible)
+    room.gui.press("Direction", "↑")
+    until(lambda: room.gui.element("Heading, °").value == 90)
+    until(lambda: room.gui.shows("/push/plan"))
     room.is_warm = False
-    room.press("Predict")
-    room.says("Loading the network")
+    room.gui.press("Predict")
+    room.gui.says("Loading the network")
     (asked,) = room.asked
     np.testing.assert_allclose(asked.actions, np.tile([0, 0.25, 0], (1, 3, 1)), atol=1e-9)
     assert asked.state is RECORD.state
     room.answer()
-    room.says("1 object will move; predicted in 20 ms")
-    assert room.view._drawing.moving == (BOX,)
-    assert "40 mm" in room.view._report.content
-    until(lambda: not room.view._execute_button.disabled)
-    room.press("Execute")
-    room.says("Executed")
+    room.gui.says("1 object will move; predicted in 20 ms")
+    assert room.moving() == {BOX}
+    assert "40 mm" in room.gui.text()
+    until(lambda: not room.gui.element("Execute").disabled)
+    room.gui.press("Execute")
+    room.gui.says("Executed")
     ((scene, actions),) = room.acted
     assert scene == "s"
     np.testing.assert_array_equal(actions, asked.actions[0])
-    until(lambda: "Off by" in room.view._report.content)
-    assert "<b>10 mm<br>0.0°</b>" in room.view._report.content
-    assert room.view._drawing.moving == (BOX,)  # the ghosts stay
-    assert room.view._drawing._true_ways.visible
-    until(lambda: room.view._execute_button.disabled)
-    room.press("Clear")
-    until(lambda: room.view._drawing.moving == ())
-    assert not room.view._report.visible
+    until(lambda: "Off by" in room.gui.text())
+    assert "<b>10 mm<br>0.0°</b>" in room.gui.text()
+    assert room.moving() == {BOX}  # the ghosts stay
+    assert room.gui.shows("/push/true_ways")
+    until(lambda: room.gui.element("Execute").disabled)
+    room.gui.press("Clear")
+    until(lambda: room.moving() == set())
+    assert "push-report" not in room.gui.text()
 
 
 def test_waypoints_become_actions(room):
-    room.set(room.view._kind, PATH)
-    until(lambda: room.view._waypoints._handles[2].visible)
-    assert not room.view._heading.visible
+    room.gui.set("Push", PATH)
+    until(lambda: room.gui.shows("/push/waypoints/2"))
+    assert not room.gui.element("Heading, °").visible
     for number, place in enumerate([(-0.1, 0.05, 0), (0.0, 0.05, 0)]):
-        room.view._waypoints._handles[number].position = place
-    room.set(room.view._count, 2)
-    until(lambda: not room.view._waypoints._handles[2].visible)
-    room.press("Predict")
+        room.gui.node(f"/push/waypoints/{number}").position = place
+    room.gui.set("Waypoints", 2)
+    until(lambda: not room.gui.shows("/push/waypoints/2"))
+    room.gui.press("Predict")
     np.testing.assert_allclose(room.asked[0].actions, [[[0, 0.25, 0], [0.25, 0, 0], [0.25, 0, 0]]], atol=1e-9)
 
 
 def test_time_is_sought_and_played(room):
     room.predict()
-    ghost = room.view._drawing._ghosts[BOX]
-    np.testing.assert_allclose(ghost.batched_positions[0, 0], 0.04, atol=1e-6)
-    room.set(room.view._time, 0.0)
-    until(lambda: np.allclose(ghost.batched_positions[0, 0], 0, atol=1e-6))
-    room.press("Play")
-    until(lambda: room.view._play.label == "Pause")
-    until(lambda: np.allclose(ghost.batched_positions[0, 0], 0.04, atol=1e-6))
-    until(lambda: room.view._play.label == "Play")
-    assert room.view._time.value == pytest.approx(0.6)
-    room.press("Play")  # from the beginning again
-    until(lambda: room.view._play.label == "Pause")
+    np.testing.assert_allclose(room.ghost_x(), 0.04, atol=1e-6)
+    room.gui.set("Time, s", 0.0)
+    until(lambda: np.allclose(room.ghost_x(), 0, atol=1e-6))
+    room.gui.press("Play")
+    until(lambda: room.gui.elements("Pause"))
+    until(lambda: np.allclose(room.ghost_x(), 0.04, atol=1e-6))
+    until(lambda: room.gui.elements("Play"))
+    assert room.gui.element("Time, s").value == pytest.approx(0.6)
+    room.gui.press("Play")  # from the beginning again
+    until(lambda: room.gui.elements("Pause"))
 
 
 def test_a_prediction_is_dropped_when_the_table_changes_or_another_push_is_chosen(room):
     room.predict()
     room.change()
-    room.says("has changed")
-    until(lambda: room.view._drawing.moving == ())
-    room.press("Predict")
+    room.gui.says("has changed")
+    until(lambda: room.moving() == set())
+    room.gui.press("Predict")
     room.change()
     room.answer()
-    room.says("has changed")
-    assert room.view._drawing.moving == ()
+    room.gui.says("has changed")
+    assert room.moving() == set()
     room.predict()
-    room.set(room.view._speed, 0.1)
-    until(lambda: room.view._drawing.moving == ())
+    room.gui.set("Speed, m/s", 0.1)
+    until(lambda: room.moving() == set())
     room.predict()
-    room.view.note(CurrentScene(None))
-    until(lambda: room.view._drawing.moving == ())
-    until(lambda: not room.view._drawing._plan.visible)
-    room.view.note(Notice("info", "of no concern here"))
+    room.panel.show(CurrentScene(None))
+    until(lambda: room.moving() == set())
+    until(lambda: not room.gui.shows("/push/plan"))
+    room.panel.show(Notice("info", "of no concern here"))
 
 
 def test_after_the_comparison_another_change_ends_it(room):
     room.predict()
-    room.press("Execute")
-    room.says("Executed")
+    room.gui.press("Execute")
+    room.gui.says("Executed")
     room.change()
-    room.says("has changed")
-    assert not room.view._report.visible
+    room.gui.says("has changed")
+    assert "push-report" not in room.gui.text()
 
 
 def test_what_somebody_else_does_at_the_same_time_is_not_taken_for_the_push(room):
     room.predict()
     room.jumps_in = True
-    room.press("Execute")
-    room.says("has changed")
-    assert not room.view._drawing._true_ways.visible
+    room.gui.press("Execute")
+    room.gui.says("has changed")
+    assert not room.gui.shows("/push/true_ways")
 
 
 @pytest.mark.parametrize("refusal", [MissingFields(["my_thing"]), SceneHeld("s", "j")])
 def test_refusals_are_told_to_who_asked_and_in_the_panel(room, refusal):
     room.predict()
     room.refusal = refusal
-    room.press("Execute" if isinstance(refusal, SceneHeld) else "Predict")
+    room.gui.press("Execute" if isinstance(refusal, SceneHeld) else "Predict")
     assert room.refused == [(str(refusal), SOMEBODY)]
-    room.says(str(refusal)[:30])
+    room.gui.says(str(refusal)[:30])
 
 
 def test_an_answer_may_be_a_refusal_or_overtaken(room):
-    room.press("Predict")
-    room.press("Predict")
+    room.gui.press("Predict")
+    room.gui.press("Predict")
     assert {asked.key for asked in room.asked} == {"viewer"}
     room.asked[0].answer.set_result(None)
     room.asked[1].answer.set_exception(NeuralUnavailable("predictor", "stopped unexpectedly"))
-    room.says("stopped unexpectedly")
+    room.gui.says("stopped unexpectedly")
     assert room.refused[0][1] is SOMEBODY
 
 
 def test_executing_needs_a_new_prediction(room):
-    with pytest.raises(OsfError, match="Predict first"):
-        room.view._execute()
+    room.gui.press("Execute")
+    assert "Predict first" in room.refused.pop()[0]
     room.predict()
-    room.press("Execute")
-    with pytest.raises(OsfError, match="Predict first"):
-        room.view._execute()
+    room.gui.press("Execute")
+    assert room.refused == []
+    room.gui.press("Execute")
+    assert "Predict first" in room.refused.pop()[0]
     assert len(room.acted) == 1
 
 
 @pytest.mark.parametrize("nonsense", [float("nan"), 1e12, -1e12])
 def test_numbers_beyond_the_sliders_do_no_harm(room, nonsense):
-    for handle in (room.view._heading, room.view._speed, room.view._steps, room.view._count):
-        room.set(handle, nonsense)
-    room.press("Direction", "sideways")
-    room.press("Predict")
+    for label in ("Heading, °", "Speed, m/s", "Steps", "Waypoints"):
+        room.gui.set(label, nonsense)
+    room.gui.press("Direction", "sideways")
+    room.gui.press("Predict")
     assert 1 <= room.asked[0].actions.shape[1] <= MAX_ACTIONS
     room.answer()
-    room.says("predicted in")
-    room.set(room.view._time, nonsense)
-    until(lambda: np.isfinite(room.view._drawing._ghosts[BOX].batched_positions).all())
+    room.gui.says("predicted in")
+    room.gui.set("Time, s", nonsense)
+    until(lambda: np.isfinite(room.ghost_x()))
 
 
 def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
-    show = room.view._drawing.show
-    monkeypatch.setattr(room.view._drawing, "show", lambda _: 1 / 0)
-    room.press("Predict")
-    room.answer()
-    until(lambda: room.view._thread.is_idle)
-    monkeypatch.setattr(room.view._drawing, "show", show)
+    with monkeypatch.context() as broken:
+        broken.setattr(PushDrawing, "show", lambda *_: 1 / 0)
+        room.gui.press("Predict")
+        room.answer()
+        until(lambda: room.panel.is_idle)
     room.predict()
