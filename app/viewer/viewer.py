@@ -21,9 +21,9 @@ from app.services.estimates import Estimates
 from app.services.goals import DraftChanged, Goals
 from app.services.predictions import Predictions
 from app.services.runner import Runner
-from app.viewer.nodes.episode_nodes import EpisodeDrawing
-from app.viewer.nodes.estimate_nodes import EstimateDrawing
-from app.viewer.nodes.scene_nodes import Client, SceneDrawing
+from app.viewer.nodes.episode_nodes import EpisodeNodes
+from app.viewer.nodes.estimate_nodes import EstimateNodes
+from app.viewer.nodes.scene_nodes import Client, SceneNodes
 from app.viewer.panels.episode_panel import EpisodePanel
 from app.viewer.panels.estimate_panel import EstimatePanel
 from app.viewer.panels.goal_panel import GoalPanel
@@ -101,7 +101,7 @@ class Viewer:
         """Open the loopback server and draw what there is."""
         with contextlib.redirect_stdout(io.StringIO()):  # the banner would tell the inner port
             self._server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
-        self._drawing = SceneDrawing(self._server, self._runner.library, self._move_object, self._move_light)
+        self._drawing = SceneNodes(self._server, self._runner.library, self._move_object, self._move_light)
         self._playback = Playback(self._drawing)
         self._add_controls(self._server)
         self._panels = self._make_panels(self._server)
@@ -135,14 +135,14 @@ class Viewer:
         table.watch(neural.scene_moved)
         estimate = EstimatePanel(
             server,
-            (table, EstimateDrawing(server, library, table.has)),
+            (table, EstimateNodes(server, library, table.has)),
             self._estimates,
             self._neural,
             self._run_command,
             jobs.cancel,
         )
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
-        drawings = table, EpisodeDrawing(server, library, table.has)
+        drawings = table, EpisodeNodes(server, library, table.has)
         episode = EpisodePanel(server, drawings, jobs, self._run_command, estimate.forget)
         push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
         return neural, estimate, self._goal_panel, episode, push

@@ -12,8 +12,8 @@ import viser
 from jaxtyping import Float, UInt8
 
 from app.processes.plan_summary import PlanSketch
-from app.viewer.nodes.estimate_nodes import Colour, EstimateDrawing
-from app.viewer.nodes.future_nodes import FutureDrawing
+from app.viewer.nodes.estimate_nodes import Colour, EstimateNodes
+from app.viewer.nodes.future_nodes import FutureNodes
 from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.push_nodes import PREDICTED
 from osfcore.control.events import Looking
@@ -35,7 +35,7 @@ _DEAREST_Z_M, _CHEAPEST_Z_M, _BEST_Z_M = 0.003, 0.006, 0.008  # cheap ways lie a
 _NOWHERE = np.zeros((1, 2, 3), np.float32)
 
 
-class EpisodeDrawing:
+class EpisodeNodes:
     """Nodes below /episode. Any thread may call.
 
     Args:
@@ -53,12 +53,12 @@ class EpisodeDrawing:
         self._lock = threading.RLock()
         # What is below a hidden node is hidden with it.
         self._roots = {part: self._scene.add_frame(f"/episode/{part}", show_axes=False) for part in PARTS}
-        self._now = EstimateDrawing(server, library, is_named, root="/episode/estimate")
-        self._goal_look = EstimateDrawing(
+        self._now = EstimateNodes(server, library, is_named, root="/episode/estimate")
+        self._goal_look = EstimateNodes(
             server, library, is_named, root="/episode/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
-        self._future = FutureDrawing(server.scene, library, "/episode/plan/future", _linear(PREDICTED))
+        self._future = FutureNodes(server.scene, library, "/episode/plan/future", _linear(PREDICTED))
         add = self._scene.add_line_segments
         # Lines that begin in one colour for all would stay white once each has its own.
         each = np.array([[_linear(CHEAP)] * 2], np.uint8)

@@ -34,7 +34,7 @@ _AWAY_M = -0.5  # an object that was not looked at yet is put far below the tabl
 Colour = tuple[int, int, int]
 
 
-class EstimateDrawing:
+class EstimateNodes:
     """Nodes below one of their own. Any thread may call.
 
     Args:
@@ -217,7 +217,7 @@ class EstimateDrawing:
             pose, doubt = estimate.state.poses[n], estimate.doubts[n]
             self._mark(name, doubt)
             self._add_verdict(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
-        within = f"± {_told(np.rad2deg(_SIGMAS * estimate.light_std))}°"
+        within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}°"
         self._show_light(estimate.state.light, None, f"estimated light {within}")
 
     def _mark(self, name: str, doubt: str) -> None:
@@ -232,7 +232,9 @@ class EstimateDrawing:
         turn_rad = float(np.clip(_SIGMAS * rotation_std, _LEAST_TURN_RAD, _MOST_TURN_RAD))
         reach_m = footprint_m(vertices, pose.quaternion)
         flat = sector(heading_rad(pose.quaternion), turn_rad, reach_m + _RING_M[0], reach_m + _RING_M[1])
-        text = f"± {_told(1000 * _SIGMAS * position_std)} mm, ± {_told(np.rad2deg(_SIGMAS * rotation_std))}°"
+        text = (
+            f"± {_two_digits(1000 * _SIGMAS * position_std)} mm, ± {_two_digits(np.rad2deg(_SIGMAS * rotation_std))}°"
+        )
         text = f"DOUBTFUL: {doubt}" if doubt else text
         text = text if self._is_named(name) else f"{self._label(name)}: {text}"
         self._verdicts += [
@@ -271,6 +273,6 @@ def _put(node: viser.BatchedMeshHandle, poses: Pose) -> None:
     node.batched_wxyzs = poses.quaternion.astype(np.float32)
 
 
-def _told(value: float) -> str:
+def _two_digits(value: float) -> str:
     """Two digits, or words for what is without bounds."""
     return f"{value:.2g}" if np.isfinite(value) else "any"

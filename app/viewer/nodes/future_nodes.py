@@ -18,7 +18,7 @@ _OPACITY, _PALE = 0.45, 0.3  # the latter is a share of the former
 _SCALE = 1.008  # or ghosts and the surfaces below them would flicker
 
 
-class FutureDrawing:
+class FutureNodes:
     """One future of the objects that move in it.
 
     Args:

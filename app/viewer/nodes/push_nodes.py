@@ -29,7 +29,7 @@ _MOVED_M = 5e-4
 _NOWHERE = np.zeros((1, 2, 3), np.float32)
 
 
-class PushDrawing:
+class PushNodes:
     """Nodes below /push. Any thread may call.
 
     Args:

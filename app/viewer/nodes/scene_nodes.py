@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
 
 
-class SceneDrawing:
+class SceneNodes:
     """The nodes of one viser scene. Nodes are made once; afterwards only what changes is assigned."""
 
     def __init__(

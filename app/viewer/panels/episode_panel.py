@@ -1,6 +1,6 @@
-"""Episodes in the 3D view: the folder in the panel, and the thread that draws the newest of what one tells.
+"""Episodes in the 3D view: the folder in the panel, and the thread that draws the newest events.
 
-Events come from the jobs' thread and are only noted there; drawing, at most some times a second, happens here.
+Events come from the jobs' thread and are only stored there; drawing, at most some times a second, happens here.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from app.processes.messages import CurrentScene, SceneChanged
 from app.processes.plan_summary import PlanSketch
 from app.services.episodes import KIND
 from app.services.goals import DraftChanged
-from app.viewer.nodes.episode_nodes import EpisodeDrawing, Part
-from app.viewer.nodes.scene_nodes import SceneDrawing
+from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
+from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.panel import RunCommand, ThreadedPanel
 from app.viewer.panels.status_line import status
 from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
@@ -36,8 +36,8 @@ _SHOWN: tuple[tuple[Part, str, str], ...] = (
 )
 
 
-class Orders(Protocol):
-    """What a job can be told."""
+class JobCommands(Protocol):
+    """Commands to the job that runs an episode."""
 
     def pause(self, job: str) -> object:
         """Let it rest."""
@@ -57,17 +57,17 @@ class Orders(Protocol):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Told:
-    """What an episode has told, as far as it is drawn. Newer news replace older ones of their kind, and no others.
+class _EpisodeState:
+    """The newest events of an episode, as far as they are drawn; one replaces the older ones of its kind only.
 
     Attributes:
-        job: that runs it.
-        goal: where everything should be.
-        sight: an estimator at work, or what the last one has found.
+        job: that runs the episode.
+        goal: target poses.
+        sight: a step of an estimator at work, or the last estimate.
         plan: the last round of planning.
-        left: how far the objects are from the goal.
-        notice: what a person should know.
-        end: how it ended.
+        left: largest remaining distance to the goal, in words.
+        notice: last warning.
+        end: how the episode ended, in words.
     """
 
     job: Job | None = None
@@ -83,27 +83,27 @@ class _Told:
         """Whether there is more to come."""
         return self.job is not None and not self.job.is_finished
 
-    def of(self, job: Job) -> _Told:
-        """What is known once the job is like this; nothing yet if it is another one."""
+    def with_job(self, job: Job) -> _EpisodeState:
+        """The state after a change of the job; empty for another job."""
         if self.job is None or self.job.id != job.id:
-            return _Told(job)
+            return _EpisodeState(job)
         if not job.is_finished:
             return replace(self, job=job)
         return replace(self, job=job, plan=None, sight=None if isinstance(self.sight, Looking) else self.sight)
 
-    def with_seen(self, seen: object) -> _Told:
-        """What is known once something has happened."""
-        match seen:
+    def with_event(self, event: object) -> _EpisodeState:
+        """The state after an event."""
+        match event:
             case Looking(look="next", step=EstimateStep(candidates=None)):
-                return self  # over before anybody has seen it
+                return self  # too short to be seen
             case Looking():
-                return replace(self, sight=seen)
+                return replace(self, sight=event)
             case GoalFound(goal):
                 return replace(self, goal=goal)
             case PlanSketch():
-                return replace(self, plan=seen)
+                return replace(self, plan=event)
             case Stepped(estimate=estimate):
-                return replace(self, sight=estimate, left=_far(seen))
+                return replace(self, sight=estimate, left=_far(event))
             case Noticed(number, _, text):
                 return replace(self, notice=f"Step {number}: {text}")
             case Finished(text=text):
@@ -113,12 +113,12 @@ class _Told:
 
 
 class EpisodePanel(ThreadedPanel):
-    """What visitors see and do about episodes; the same for all of them.
+    """The folder and the nodes of episodes; the same in all browsers.
 
     Args:
         server: whose panel gets the folder.
-        drawings: of the table, whose own lamp tells the truth, and of episodes.
-        orders: to the job that runs one.
+        nodes: of the table, whose own light is the true one, and of episodes.
+        commands: to the job that runs one.
         run_command: carries out a command and notifies its client if it is refused.
         make_room: called before an episode is drawn, to remove what would be in its way.
     """
@@ -126,55 +126,55 @@ class EpisodePanel(ThreadedPanel):
     def __init__(
         self,
         server: viser.ViserServer,
-        drawings: tuple[SceneDrawing, EpisodeDrawing],
-        orders: Orders,
+        nodes: tuple[SceneNodes, EpisodeNodes],
+        commands: JobCommands,
         run_command: RunCommand,
         make_room: Callable[[], object],
     ) -> None:
         super().__init__("episode-panel", DRAW_INTERVAL_S)
-        self._table, self._drawing = drawings
-        self._orders = orders
+        self._table, self._nodes = nodes
+        self._commands = commands
         self._run_command = run_command
         self._make_room = make_room
-        self._told = _Told()
+        self._state = _EpisodeState()
         self._current: str | None = None
-        self._drawn = _Told()
+        self._drawn = _EpisodeState()
         self._plan_at = 0.0
         self._add_panel(server.gui)
 
     def _store(self, event: object) -> bool:
-        told = self._told
+        state = self._state
         match event:
             case JobSeen(job, seen) if job.kind == KIND:
-                self._told = told.of(job).with_seen(seen)
+                self._state = state.with_job(job).with_event(seen)
             case JobChanged(_, job) if job.kind == KIND and self._is_latest(job):
-                self._told = told.of(job)
+                self._state = state.with_job(job)
             case CurrentScene(record):
                 self._current = None if record is None else record.id
-                if not told.is_live and not self._is_here(told):
-                    self._told = _Told()
-            case DraftChanged(draft) if draft is not None and not told.is_live:
-                self._told = _Told()  # a new goal begins: the former one would be taken for it
-            case SceneChanged(record) if not told.is_live and self._is_of(told, record.id):
-                self._told = replace(told, sight=None)  # hands have moved something: nobody believes that now
-            case JobSeen(_, EstimateStep()) if not told.is_live:
-                self._told = replace(told, sight=None)
+                if not state.is_live and not self._is_here(state):
+                    self._state = _EpisodeState()
+            case DraftChanged(draft) if draft is not None and not state.is_live:
+                self._state = _EpisodeState()  # a new goal begins: the former one would be taken for it
+            case SceneChanged(record) if not state.is_live and self._is_of(state, record.id):
+                self._state = replace(state, sight=None)  # somebody has moved something: the estimate is outdated
+            case JobSeen(_, EstimateStep()) if not state.is_live:
+                self._state = replace(state, sight=None)
             case _:
                 return False
         return True
 
-    def _is_here(self, told: _Told) -> bool:
+    def _is_here(self, state: _EpisodeState) -> bool:
         """Whether it is about what is on view."""
-        return self._current is not None and self._is_of(told, self._current)
+        return self._current is not None and self._is_of(state, self._current)
 
     @staticmethod
-    def _is_of(told: _Told, scene: str) -> bool:
-        return told.job is not None and told.job.params["scene"] == scene
+    def _is_of(state: _EpisodeState, scene: str) -> bool:
+        return state.job is not None and state.job.params["scene"] == scene
 
     def _is_latest(self, job: Job) -> bool:
         """One that waits does not take the view from one that runs."""
-        mine = self._told.job
-        return mine is None or mine.id == job.id or job.state == "running" or not self._told.is_live
+        mine = self._state.job
+        return mine is None or mine.id == job.id or job.state == "running" or not self._state.is_live
 
     # The panel
 
@@ -202,95 +202,95 @@ class EpisodePanel(ThreadedPanel):
         box = gui.add_checkbox(label, True, hint=hint)
 
         def show(_: object) -> None:
-            self._drawing.show_part(part, box.value)
+            self._nodes.show_part(part, box.value)
             self._draw_truth()
 
         box.on_update(show)
 
     def _toggle(self) -> None:
-        job = self._told.job
+        job = self._state.job
         if job is not None and job.state == "paused":
-            self._orders.resume(job.id)
+            self._commands.resume(job.id)
         elif job is not None:
-            self._orders.pause(job.id)
+            self._commands.pause(job.id)
 
     def _step(self) -> None:
-        job = self._told.job
+        job = self._state.job
         if job is not None:
-            self._orders.step(job.id)
+            self._commands.step(job.id)
 
     def _cancel(self) -> None:
-        job = self._told.job
+        job = self._state.job
         if job is not None:
-            self._orders.cancel(job.id)
+            self._commands.cancel(job.id)
 
     def _forget(self) -> None:
         with self._thread.changed:
-            if not self._told.is_live:
-                self._told = _Told()
+            if not self._state.is_live:
+                self._state = _EpisodeState()
                 self._thread.wake()
 
     # The thread
 
     def _draw(self) -> None:
         with self._thread.changed:
-            told = self._told if self._is_here(self._told) else _Told()
-        if told is not self._drawn:
-            self._draw_news(told)
-        if told.plan is not None:
-            self._drawing.play(time.monotonic() - self._plan_at)
+            state = self._state if self._is_here(self._state) else _EpisodeState()
+        if state is not self._drawn:
+            self._draw_changes(state)
+        if state.plan is not None:
+            self._nodes.play(time.monotonic() - self._plan_at)
             self._thread.wake(DRAW_INTERVAL_S)
 
-    def _draw_news(self, told: _Told) -> None:
+    def _draw_changes(self, state: _EpisodeState) -> None:
         drawn = self._drawn
-        if _id(told.job) != _id(drawn.job):
-            self._drawing.clear()
-            drawn = _Told(told.job)
-            if told.is_live:
+        if _id(state.job) != _id(drawn.job):
+            self._nodes.clear()
+            drawn = _EpisodeState(state.job)
+            if state.is_live:
                 self._make_room()
-        if told.sight is not drawn.sight:
-            if isinstance(told.sight, Looking):
-                self._drawing.show_look(told.sight)
+        if state.sight is not drawn.sight:
+            if isinstance(state.sight, Looking):
+                self._nodes.show_look(state.sight)
             else:
-                self._drawing.show_estimate(told.sight)
-        if told.goal is not drawn.goal:  # after what was seen while it was looked for
-            self._drawing.show_goal(told.goal)
-        if told.plan is not drawn.plan:
-            self._drawing.show_plan(told.plan)
+                self._nodes.show_estimate(state.sight)
+        if state.goal is not drawn.goal:  # after what was seen while it was looked for
+            self._nodes.show_goal(state.goal)
+        if state.plan is not drawn.plan:
+            self._nodes.show_plan(state.plan)
             self._plan_at = time.monotonic()
         self._draw_truth()
-        self._draw_state(told)
-        self._drawn = told
+        self._draw_state(state)
+        self._drawn = state
 
     def _draw_truth(self) -> None:
         """While an estimate is on view, the green cube is its own; the lamp is shown on demand, in another colour."""
-        if self._drawing.shows_light:
+        if self._nodes.shows_light:
             self._table.show_lamp(is_on=self._wants_truth.value, name="true light", by=KIND)
         else:
             self._table.show_lamp(is_on=True, by=KIND)
 
-    def _draw_state(self, told: _Told) -> None:
-        job = told.job
+    def _draw_state(self, state: _EpisodeState) -> None:
+        job = state.job
         is_paused = job is not None and job.state == "paused"
         can_pause = job is not None and job.state in ("running", "paused")
-        self._bar.visible = told.is_live
+        self._bar.visible = state.is_live
         if job is not None:
             self._bar.value = 100.0 * job.done / max(job.total, 1)
         self._pause_button.label = "Resume" if is_paused else "Pause"
         self._pause_button.disabled = not can_pause
         self._step_button.disabled = not is_paused
-        self._cancel_button.disabled = not told.is_live
-        self._status.content = status("episode", _says(told))
-        self._notice.content, self._notice.visible = status("episode", told.notice), bool(told.notice)
+        self._cancel_button.disabled = not state.is_live
+        self._status.content = status("episode", _sentence(state))
+        self._notice.content, self._notice.visible = status("episode", state.notice), bool(state.notice)
 
 
 def _id(job: Job | None) -> str | None:
     return None if job is None else job.id
 
 
-def _says(told: _Told) -> str:
-    """How it is, for a person."""
-    job = told.job
+def _sentence(state: _EpisodeState) -> str:
+    """The state in words."""
+    job = state.job
     if job is None:
         return _IDLE
     match job.state:
@@ -299,10 +299,10 @@ def _says(told: _Told) -> str:
         case "cancelled":
             return "Cancelled"
         case "done":
-            return told.end or "Done"
+            return state.end or "Done"
         case "running" | "paused":
-            told_now = [f"Paused: {job.note}" if job.state == "paused" else job.note, told.left]
-            return " · ".join(text for text in told_now if text)
+            parts = [f"Paused: {job.note}" if job.state == "paused" else job.note, state.left]
+            return " · ".join(text for text in parts if text)
         case _:
             return job.error or job.note
 

@@ -1,6 +1,6 @@
 """Estimates in the 3D view: the folder in the panel, and the thread that draws the newest step.
 
-Steps come from the jobs' thread and are only noted there; drawing, at most some times a second, happens here.
+Steps come from the jobs' thread and are only stored there; drawing, at most some times a second, happens here.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from app.processes.messages import CurrentScene
 from app.processes.neural_client import Answer, NeuralLink
 from app.processes.neural_messages import Comparison
 from app.services.estimates import KIND, Asked, Estimates
-from app.viewer.nodes.estimate_nodes import EstimateDrawing
-from app.viewer.nodes.scene_nodes import SceneDrawing
+from app.viewer.nodes.estimate_nodes import EstimateNodes
+from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.loss_curves import LossCurves
 from app.viewer.panels.panel import RunCommand, ThreadedPanel
 from osfcore.errors import OsfError
@@ -36,13 +36,13 @@ _IDLE = "Not asked yet"
 
 
 class EstimatePanel(ThreadedPanel):
-    """What visitors see and do about estimates; the same for all of them.
+    """The folder and the nodes of estimates; the same in all browsers.
 
     Args:
         server: whose panel gets the folder.
-        drawings: of the table, whose own lamp tells the truth, and of estimates.
-        estimates: to ask for and to look at.
-        neural: renders what a guess would look like.
+        nodes: of the table, whose own light is the true one, and of estimates.
+        estimates: starts estimates, and compares them with their images.
+        neural: renders the comparisons.
         run_command: carries out a command and notifies its client if it is refused.
         cancel: ends a job.
     """
@@ -50,7 +50,7 @@ class EstimatePanel(ThreadedPanel):
     def __init__(
         self,
         server: viser.ViserServer,
-        drawings: tuple[SceneDrawing, EstimateDrawing],
+        nodes: tuple[SceneNodes, EstimateNodes],
         estimates: Estimates,
         neural: NeuralLink,
         run_command: RunCommand,
@@ -59,7 +59,7 @@ class EstimatePanel(ThreadedPanel):
         super().__init__("estimate-panel", DRAW_INTERVAL_S)
         self._server = server
         self._estimates = estimates
-        self._table, self._drawing = drawings
+        self._table, self._nodes = nodes
         self._neural = neural
         self._run_command = run_command
         self._cancel = cancel
@@ -76,7 +76,7 @@ class EstimatePanel(ThreadedPanel):
         self._add_panel(server.gui)
 
     def add_client(self, client: viser.ClientHandle) -> None:
-        """Somebody has come, for whom there may be a picture to make."""
+        """Draw again: comparisons are rendered only while somebody is connected."""
         self._thread.wake()
 
     def forget(self) -> None:
@@ -127,7 +127,7 @@ class EstimatePanel(ThreadedPanel):
             self._image = gui.add_image(_NO_PICTURE, label="Observed, rendered", visible=False)
         start.on_click(lambda event: self._run_command(lambda: self._estimates.of_scene(Asked()), event.client))
         self._stop_button.on_click(lambda event: self._run_command(self._cancel_mine, event.client))
-        self._wants_tried.on_update(lambda event: self._drawing.show_candidates(event.target.value))
+        self._wants_tried.on_update(lambda event: self._nodes.show_candidates(event.target.value))
         self._wants_truth.on_update(lambda _: self._draw_truth())
         self._camera.on_update(lambda _: self._look_again())
         clear.on_click(lambda _: self.forget())
@@ -152,16 +152,16 @@ class EstimatePanel(ThreadedPanel):
         if steps:
             for step in steps:
                 self._curves = self._curves.with_step(step)
-            self._drawing.show(steps[-1])
-            self._drawing.show_candidates(self._wants_tried.value)
+            self._nodes.show(steps[-1])
+            self._nodes.show_candidates(self._wants_tried.value)
             self._draw_curves()
         self._draw_truth()
         self._draw_state(job)
-        if job is not None and self._drawn_job == job.id and not self._drawing.is_empty:
+        if job is not None and self._drawn_job == job.id and not self._nodes.is_empty:
             self._draw_picture(job)
 
     def _clear(self, job: Job | None) -> None:
-        self._drawing.clear()
+        self._nodes.clear()
         self._image.visible = False
         self._curves = LossCurves(() if job is None else tuple(job.params["names"]))
         self._drawn_job = None if job is None else job.id
@@ -170,7 +170,7 @@ class EstimatePanel(ThreadedPanel):
 
     def _draw_truth(self) -> None:
         """While a guess is on view, the green cube is the guess; the lamp itself is shown on demand, in its colour."""
-        if self._drawing.is_empty:
+        if self._nodes.is_empty:
             self._table.show_lamp(is_on=True, by=KIND)
         else:
             self._table.show_lamp(is_on=self._wants_truth.value, name="true light", by=KIND)
@@ -184,9 +184,9 @@ class EstimatePanel(ThreadedPanel):
             return
         self._bar.value = 100.0 * job.done / max(job.total, 1)
         trusted = (job.result or {}).get("trusted")
-        told = {"failed": job.error or job.note, "cancelled": "Cancelled", "queued": "Waiting for other jobs"}
+        texts = {"failed": job.error or job.note, "cancelled": "Cancelled", "queued": "Waiting for other jobs"}
         done = "Done, trusted" if trusted else "Done, NOT trusted; see the orange objects"
-        self._status.value = done if job.state == "done" else told.get(job.state, job.note)
+        self._status.value = done if job.state == "done" else texts.get(job.state, job.note)
 
     def _draw_curves(self) -> None:
         names = [*(name.split("_", 1)[-1].replace("_", " ") for name in self._curves.names), "whole"]
@@ -214,9 +214,9 @@ class EstimatePanel(ThreadedPanel):
     # Observed beside rendered
 
     def _draw_picture(self, job: Job) -> None:
-        """Ask for a newer picture if one is wanted, none is on its way, and the last one is old enough."""
-        wanted = (job.id, len(self._curves.rows), self._camera.value)
-        if self._picture is not None or self._picture_of == wanted or not self._server.get_clients():
+        """Request a comparison if something has changed, none is on its way, and the last one is old enough."""
+        key = (job.id, len(self._curves.rows), self._camera.value)
+        if self._picture is not None or self._picture_of == key or not self._server.get_clients():
             return
         wait_s = self._picture_at + PICTURE_INTERVAL_S - time.monotonic()
         if wait_s > 0:
@@ -226,14 +226,14 @@ class EstimatePanel(ThreadedPanel):
             order = self._estimates.comparison(job, job.params["cameras"].index(self._camera.value))
         except (OsfError, ValueError):  # nothing to show yet, or a camera of another estimate
             return
-        self._picture_at, self._picture_of = time.monotonic(), wanted
+        self._picture_at, self._picture_of = time.monotonic(), key
         self._picture = self._neural.submit(order)
-        self._picture.add_done_callback(partial(self._came, job.id))
+        self._picture.add_done_callback(partial(self._receive, job.id))
 
-    def _came(self, job: str, answer: Future[Answer]) -> None:
+    def _receive(self, job: str, answer: Future[Answer]) -> None:
         self._picture = None
-        if answer.exception() is None and isinstance(found := answer.result(), Comparison) and job == self._drawn_job:
-            with Image.open(io.BytesIO(found.comparison)) as picture:
+        if answer.exception() is None and isinstance(result := answer.result(), Comparison) and job == self._drawn_job:
+            with Image.open(io.BytesIO(result.comparison)) as picture:
                 pixels = np.asarray(picture.convert("RGB"))
             self._image.image = pixels[:, : 2 * pixels.shape[1] // 3]
             self._image.visible = True

@@ -1,6 +1,6 @@
 """Composing a goal in the 3D view: golden copies of the objects with handles, and the folder in the panel.
 
-Drafts come from whoever changes them and are only noted; drawing happens in the thread. Hands are answered by the
+Drafts come from whoever changes them and are only stored; drawing happens in the thread. Hands are answered by the
 simulation, so what they moved is on its way for a moment: until then it stays where it was let go.
 """
 
@@ -40,7 +40,7 @@ _COMPOSING = "Drag the golden copies, or turn them by their rings."
 
 
 class Drafts(Protocol):
-    """The goal that is being composed, one for all visitors."""
+    """The goal that is being composed, one for all browsers."""
 
     @property
     def draft(self) -> Draft | None:
@@ -69,7 +69,7 @@ class Drafts(Protocol):
 
 
 class GoalPanel(ThreadedPanel):
-    """What visitors see and do while a goal is composed; the same for all of them.
+    """The folder and the nodes of a goal that is being composed; the same in all browsers.
 
     Args:
         server: to draw in, and whose panel gets the folder.

@@ -1,4 +1,4 @@
-"""Neural pictures in the 3D view: a switch for each visitor, and a thread that keeps the pictures up to date."""
+"""Neural renderings in the 3D view: a switch for each browser, and a thread that keeps its picture up to date."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.processes.neural_client import Answer, NeuralLink
 from app.processes.neural_messages import DrawnView, DrawView
 from app.processes.render_cameras import view_camera
 from app.viewer.panels.panel import ThreadedPanel
-from app.viewer.panels.refinement import STEPS, Refinement, Ticket
+from app.viewer.panels.refinement import STEPS, Refinement, RenderTicket
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
@@ -29,22 +29,28 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Come:
-    """An answer, with what was asked."""
+class _Answer:
+    """The answer to a rendering request.
 
-    ticket: Ticket
+    Attributes:
+        ticket: of the request.
+        names: of the objects that are rendered.
+        future: the answer itself.
+    """
+
+    ticket: RenderTicket
     names: tuple[str, ...]
-    answer: Future[Answer]
+    future: Future[Answer]
 
 
-class Visitor:
-    """One browser: its switch, and what it is shown. All but the switch belongs to the thread of `NeuralPanel`."""
+class ClientView:
+    """One browser: its switch, and the picture on view. All but the switch belongs to the thread of `NeuralPanel`."""
 
     def __init__(self, client: viser.ClientHandle, on_switch: Callable[[], None]) -> None:
         self.client = client
         self.refinement = Refinement()
-        self.come: list[_Come] = []
-        self.asked_at: float | None = None  # since when a first picture is waited for
+        self.answers: list[_Answer] = []
+        self.waiting_since: float | None = None  # for a first picture
         self._hidden: dict[str, viser.SceneNodeHandle] = {}
         self._waiting: viser.NotificationHandle | None = None
         self._meshes: tuple[str, ...] = ()
@@ -57,21 +63,21 @@ class Visitor:
 
     @property
     def is_on(self) -> bool:
-        """Whether neural pictures are wanted."""
+        """Whether neural pictures are switched on."""
         return bool(self._switch.value)
 
     def due_at(self) -> float | None:
         """When there is something to do; None if there is nothing."""
         if not self.is_on:
             return None if self._is_clear else 0.0
-        if self.come:
+        if self.answers:
             return 0.0
-        late_at = None if self.asked_at is None or self._waiting else self.asked_at + _TELL_AFTER_S
+        late_at = None if self.waiting_since is None or self._waiting else self.waiting_since + _TELL_AFTER_S
         times = [at for at in (self.refinement.due_at(), late_at) if at is not None]
         return min(times, default=None)
 
     def camera(self, rows: int) -> Camera | None:
-        """The view now; None while what the browser tells makes no sense."""
+        """The view now; None while the browser's numbers make no sense."""
         view = self.client.camera
         if view.image_height < 1:
             return None
@@ -104,7 +110,7 @@ class Visitor:
 
     def tell_late(self, now: float) -> None:
         """Say that the renderer takes its time, if it does."""
-        if self.asked_at is not None and self._waiting is None and now >= self.asked_at + _TELL_AFTER_S:
+        if self.waiting_since is not None and self._waiting is None and now >= self.waiting_since + _TELL_AFTER_S:
             self._waiting = self.client.add_notification("Neural render", WARM_UP, loading=True)
 
     def tell_meshes(self, names: tuple[str, ...]) -> None:
@@ -118,13 +124,13 @@ class Visitor:
             self.client.add_notification("Neural render", text, auto_close_seconds=8.0)
 
     def _stop_waiting(self) -> None:
-        self.asked_at = None
+        self.waiting_since = None
         if self._waiting is not None:
             self._waiting.remove()
             self._waiting = None
 
     def _hide(self, paths: set[str]) -> None:
-        """Hide nodes from this visitor alone: its own, invisible node of the same name takes their place."""
+        """Hide nodes in this browser alone: its own, invisible node of the same name takes their place."""
         for path in set(self._hidden) - paths:
             self._hidden.pop(path).remove()
         for path in paths - set(self._hidden):
@@ -132,7 +138,7 @@ class Visitor:
 
 
 class NeuralPanel(ThreadedPanel):
-    """All visitors, and the thread that orders and shows their pictures.
+    """The views of all browsers, and the thread that requests and shows their pictures.
 
     Args:
         link: to the renderer.
@@ -147,77 +153,77 @@ class NeuralPanel(ThreadedPanel):
         self._link = link
         self._state = state
         self._fields = fields
-        self._visitors: dict[int, Visitor] = {}  # guarded by `_thread.changed`, with what belongs to them
+        self._views: dict[int, ClientView] = {}  # guarded by `_thread.changed`, with what belongs to them
 
     def add_client(self, client: viser.ClientHandle) -> None:
-        """Give a new visitor the switch."""
-        visitor = Visitor(client, lambda: self._moved(visitor))
-        client.camera.on_update(lambda _: self._moved(visitor))
+        """Give a new browser the switch."""
+        view = ClientView(client, lambda: self._moved(view))
+        client.camera.on_update(lambda _: self._moved(view))
         with self._thread.changed:
-            self._visitors[client.client_id] = visitor
+            self._views[client.client_id] = view
 
     def remove_client(self, client: viser.ClientHandle) -> None:
-        """Forget a visitor who left."""
+        """Forget a browser that has left."""
         with self._thread.changed:
-            self._visitors.pop(client.client_id, None)
+            self._views.pop(client.client_id, None)
 
     def scene_moved(self) -> None:
         """What is drawn has changed. Any thread may call; it never waits for a picture."""
         with self._thread.changed:
-            self._moved(*self._visitors.values())
+            self._moved(*self._views.values())
 
-    def _moved(self, *visitors: Visitor) -> None:
+    def _moved(self, *views: ClientView) -> None:
         with self._thread.changed:
-            for visitor in visitors:
-                visitor.refinement.moved(time.monotonic())
+            for view in views:
+                view.refinement.moved(time.monotonic())
             self._thread.wake()
 
     def _store(self, event: object) -> bool:
-        return False  # what moves is told by `scene_moved`
+        return False  # movements come by `scene_moved`
 
     def _draw(self) -> None:
         now = time.monotonic()
         with self._thread.changed:
-            due = [visitor for visitor in self._visitors.values() if (at := visitor.due_at()) is not None and at <= now]
-        for visitor in due:
+            due = [view for view in self._views.values() if (at := view.due_at()) is not None and at <= now]
+        for view in due:
             try:
-                self._look_after(visitor, now)
-            except Exception:  # a defect; the other visitors still get their pictures
-                _log.exception("a visitor's neural pictures failed")
-                self.remove_client(visitor.client)
+                self._look_after(view, now)
+            except Exception:  # a defect; the other browsers still get their pictures
+                _log.exception("the neural pictures of a browser failed")
+                self.remove_client(view.client)
         with self._thread.changed:
-            times = [at for visitor in self._visitors.values() if (at := visitor.due_at()) is not None]
+            times = [at for view in self._views.values() if (at := view.due_at()) is not None]
             if times:
                 self._thread.wake(max(min(times) - time.monotonic(), 0.0))
 
-    def _look_after(self, visitor: Visitor, now: float) -> None:
+    def _look_after(self, view: ClientView, now: float) -> None:
         with self._thread.changed:
-            come, visitor.come = visitor.come, []
-        for answer in come:
-            self._take(visitor, answer)
-        if not visitor.is_on:
-            visitor.clear()
+            answers, view.answers = view.answers, []
+        for answer in answers:
+            self._take(view, answer)
+        if not view.is_on:
+            view.clear()
             return
-        visitor.tell_late(now)
+        view.tell_late(now)
         with self._thread.changed:
-            due_at = visitor.refinement.due_at()
-            ticket = visitor.refinement.order() if due_at is not None and due_at <= now else None
+            due_at = view.refinement.due_at()
+            ticket = view.refinement.order() if due_at is not None and due_at <= now else None
         if ticket is not None:
-            self._order(visitor, ticket, now)
+            self._order(view, ticket, now)
 
-    def _order(self, visitor: Visitor, ticket: Ticket, now: float) -> None:
+    def _order(self, view: ClientView, ticket: RenderTicket, now: float) -> None:
         step = STEPS[ticket.step]
-        camera, (state, others) = visitor.camera(step.rows), self._split(self._state())
+        camera, (state, others) = view.camera(step.rows), self._split(self._state())
         if camera is None:
             with self._thread.changed:
-                visitor.refinement.give_up(ticket)
+                view.refinement.give_up(ticket)
             return
-        visitor.tell_meshes(others)
-        if not self._link.is_warm and visitor.asked_at is None:
-            visitor.asked_at = now
-        order = DrawView(f"view-{visitor.client.client_id}", state, camera, step.is_sharp)
-        answer = self._link.submit(order)
-        answer.add_done_callback(lambda done: self._came(visitor, _Come(ticket, state.names, done)))
+        view.tell_meshes(others)
+        if not self._link.is_warm and view.waiting_since is None:
+            view.waiting_since = now
+        order = DrawView(f"view-{view.client.client_id}", state, camera, step.is_sharp)
+        future = self._link.submit(order)
+        future.add_done_callback(lambda done: self._receive(view, _Answer(ticket, state.names, done)))
 
     def _split(self, state: SceneState) -> tuple[SceneState, tuple[str, ...]]:
         """What can be rendered, and the names of the other objects."""
@@ -227,21 +233,21 @@ class NeuralPanel(ThreadedPanel):
         names = tuple(state.names[row] for row in rows)
         return SceneState(names, state.poses[rows], state.light, state.pusher), others
 
-    def _came(self, visitor: Visitor, come: _Come) -> None:
+    def _receive(self, view: ClientView, answer: _Answer) -> None:
         with self._thread.changed:
-            visitor.come.append(come)
+            view.answers.append(answer)
             self._thread.wake()
 
-    def _take(self, visitor: Visitor, come: _Come) -> None:
-        error = come.answer.exception()
-        picture = None if error else come.answer.result()
+    def _take(self, view: ClientView, answer: _Answer) -> None:
+        error = answer.future.exception()
+        picture = None if error else answer.future.result()
         with self._thread.changed:
-            is_wanted = visitor.refinement.came(come.ticket, is_there=picture is not None)
-        if not visitor.is_on:
+            is_current = view.refinement.accept(answer.ticket, is_there=picture is not None)
+        if not view.is_on:
             return
         if isinstance(error, OsfError):
-            visitor.refuse(str(error))
+            view.refuse(str(error))
         elif error is not None:
             raise error
-        elif is_wanted and isinstance(picture, DrawnView):
-            visitor.show(picture, come.names)
+        elif is_current and isinstance(picture, DrawnView):
+            view.show(picture, answer.names)

@@ -1,12 +1,10 @@
-"""What will a push do? The folder in the panel, and the thread that draws predictions and compares them with the truth.
+"""Predicted pushes in the 3D view: the folder in the panel, and the thread that draws them and compares with the truth.
 
-Whatever comes from browsers, the simulation and the process that predicts is only noted; drawing happens in the thread.
+What comes from browsers, the simulation and the process that predicts is only stored; drawing happens in the thread.
 """
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -20,30 +18,24 @@ from app.processes.messages import CurrentScene, SceneChanged, SceneRecord
 from app.processes.neural_client import Answer
 from app.processes.neural_messages import Predicted
 from app.services.predictions import Predictions
-from app.services.pushes import MAX_ACTIONS, along, outcomes, straight, toward_nearest, way
-from app.viewer.nodes.push_nodes import PushDrawing
+from app.services.pushes import outcomes
+from app.viewer.nodes.push_nodes import PushNodes
 from app.viewer.nodes.scene_nodes import Client
-from app.viewer.nodes.waypoints import FEWEST, MOST, Waypoints
 from app.viewer.panels.panel import RunCommand, ThreadedPanel
+from app.viewer.panels.push_controls import PushControls
+from app.viewer.panels.push_player import TICK_S, PushPlayer
+from app.viewer.panels.push_prediction import PushPrediction
 from app.viewer.panels.push_report import report
-from app.viewer.panels.push_trial import Trial
 from app.viewer.panels.status_line import status
 from osfcore.errors import OsfError
-from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
+from osfcore.geometry.workspace import STEP_S
 from osfcore.objects.asset_library import AssetLibrary
 
-STRAIGHT, PATH = "Straight", "Waypoints"
-COMPASS = {"→": 0, "↗": 45, "↑": 90, "↖": 135, "←": 180, "↙": 225, "↓": 270, "↘": 315}
-TICK_S = 0.03  # between two pictures of a moving ghost
 _KEY = "viewer"
 _INTRO = "Starts from the **true poses** in the simulator."
 _IDLE = "Choose a push, then Predict"
 _EXECUTED = "Executed. Purple: predicted; black: the true ways"
 _CHANGED = "The table has changed; predict again"
-_SPEED = (0.05, MAX_SPEED_M_S)
-_DEFAULT_STEPS = 6
-_FURTHER_M = 0.05
 Act = Callable[[str, list[np.ndarray]], SceneRecord]
 
 
@@ -52,8 +44,8 @@ class CannotExecute(OsfError):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Asked:
-    """A question and, once it is there, its answer."""
+class _Request:
+    """A requested prediction and, once it is there, its answer."""
 
     record: SceneRecord
     actions: Float[np.ndarray, "T 3"]
@@ -62,13 +54,13 @@ class _Asked:
 
 
 class PushPanel(ThreadedPanel):
-    """What visitors ask and see about pushes; the same for all of them.
+    """The folder and the nodes of predicted pushes; the same in all browsers.
 
     Args:
         server: whose panel gets the folder.
         library: knows shapes, symmetries and labels.
-        predictions: to ask for.
-        act: carries actions out in a scene and tells what became of it.
+        predictions: predicts pushes.
+        act: executes actions in a scene and returns the scene afterwards.
         run_command: carries out a command and notifies its client if it is refused.
     """
 
@@ -85,277 +77,190 @@ class PushPanel(ThreadedPanel):
         self._predictions = predictions
         self._act = act
         self._run_command = run_command
-        self._drawing = PushDrawing(server, library)
-        self._waypoints = Waypoints(server, self._replan)
+        self._nodes = PushNodes(server, library)
         self._record: SceneRecord | None = None
-        self._ready: Trial | None = None
-        self._drawn: Trial | None = None
-        self._come: _Asked | None = None
-        self._told = _IDLE
-        self._executing: Trial | None = None
+        self._prediction: PushPrediction | None = None
+        self._drawn: PushPrediction | None = None
+        self._answered: _Request | None = None
+        self._message = _IDLE
+        self._executing: PushPrediction | None = None
         self._has_plan = False  # whether anybody has begun to choose a push
-        self._laid: tuple[str, tuple[float, ...]] | None = None  # the scene and the pusher, as handles were laid for
-        self._playing_since: float | None = None
-        self._shown_s = 0.0
-        self._add_panel(server.gui)
+        self._add_panel(server)
 
     def _store(self, event: object) -> bool:
         match event:
             case CurrentScene(record):
-                self._record, self._ready, self._told = record, None, _IDLE
+                self._record, self._prediction, self._message = record, None, _IDLE
             case SceneChanged(record, states) if self._record is not None and record.id == self._record.id:
                 self._record = record
-                if self._ready is not None:
-                    self._ready = self._ready.after(record, states, self._executing)
-                    self._told = _CHANGED if self._ready is None else self._told
+                if self._prediction is not None:
+                    self._prediction = self._prediction.after(record, states, self._executing)
+                    self._message = _CHANGED if self._prediction is None else self._message
             case _:
                 return False
         return True
 
     # The panel
 
-    def _add_panel(self, gui: viser.GuiApi) -> None:
+    def _add_panel(self, server: viser.ViserServer) -> None:
+        gui = server.gui
         with gui.add_folder("What will a push do?", expand_by_default=False):
             gui.add_markdown(_INTRO)
-            self._kind = gui.add_dropdown("Push", (STRAIGHT, PATH), hint="Straight ahead, or along handles to drag.")
-            self._compass = gui.add_button_group("Direction", tuple(COMPASS), hint="As seen from above, +y up.")
-            self._heading = gui.add_slider("Heading, °", 0, 355, 5, 0, hint="From +x toward +y.")
-            self._speed = gui.add_slider("Speed, m/s", *_SPEED, 0.01, 0.25)
-            self._steps = gui.add_slider("Steps", 1, MAX_ACTIONS, 1, _DEFAULT_STEPS, hint=f"Of {STEP_S} s each.")
-            self._count = gui.add_slider("Waypoints", FEWEST, MOST, 1, 3, visible=False)
+            self._controls = PushControls(server, self._replan)
             predict = gui.add_button("Predict", color="violet")
             self._execute_button = gui.add_button(
                 "Execute", disabled=True, hint="Carry out these very actions in the simulator, and compare."
             )
             self._status = gui.add_html(status("push", _IDLE))
             self._report = gui.add_html("", visible=False)
-            self._time = gui.add_slider("Time, s", 0.0, 1.0, 0.05, 0.0, visible=False)
-            self._play = gui.add_button("Play", visible=False)
+            self._player = PushPlayer(gui, self._thread)
             clear = gui.add_button("Clear", hint="Remove what is drawn of a push.")
-        for control in (self._heading, self._speed, self._steps, self._count):
-            control.on_update(lambda event: None if event.client is None else self._replan())
-        self._kind.on_update(lambda _: self._choose_kind())
-        self._compass.on_click(lambda event: self._turn(event.target.value))
         predict.on_click(lambda event: self._run_command(partial(self._predict, event.client), event.client))
         self._execute_button.on_click(lambda event: self._run_command(self._execute, event.client))
-        self._time.on_update(self._seek)
-        self._play.on_click(lambda _: self._toggle_play())
         clear.on_click(lambda _: self._forget())
-
-    def _choose_kind(self) -> None:
-        is_path = self._is_path
-        for control in (self._compass, self._heading, self._steps):
-            control.visible = not is_path
-        self._count.visible = is_path
-        self._replan()
-
-    @property
-    def _is_path(self) -> bool:
-        return self._kind.value == PATH
-
-    def _turn(self, arrow: str) -> None:
-        if arrow in COMPASS:  # clients may send anything
-            self._heading.value = COMPASS[arrow]
-            self._replan()
 
     def _replan(self) -> None:
         """Another push is chosen: what was predicted, or executed, is about a former one."""
         with self._thread.changed:
             self._has_plan = True
             if self._executing is None:
-                self._ready, self._told = None, _IDLE
-            self._thread.wake()
-
-    def _seek(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-        if event.client is None:  # the player's own
-            return
-        with self._thread.changed:
-            self._shown_s, self._playing_since = _number(event.target.value, 0.0, MAX_ACTIONS * STEP_S), None
-            self._thread.wake()
-
-    def _toggle_play(self) -> None:
-        with self._thread.changed:
-            if self._ready is None:
-                return
-            if self._playing_since is not None:
-                self._playing_since = None
-            else:
-                end_s = len(self._ready.actions) * STEP_S
-                begin_s = 0.0 if self._shown_s >= end_s - 1e-6 else self._shown_s
-                self._playing_since = time.monotonic() - begin_s
+                self._prediction, self._message = None, _IDLE
             self._thread.wake()
 
     def _forget(self) -> None:
         with self._thread.changed:
-            self._ready, self._told, self._has_plan = None, _IDLE, False
+            self._prediction, self._message, self._has_plan = None, _IDLE, False
             self._thread.wake()
 
     # Predicting and executing; called in viser's pool
 
-    def _actions(self, state: SceneState) -> Float[np.ndarray, "T 3"]:
-        """What is chosen now; numbers from browsers may be anything."""
-        start = np.zeros(2) if state.pusher is None else state.pusher[:2]
-        speed = _number(self._speed.value, *_SPEED)
-        if self._is_path:
-            return along(start, self._waypoints.places(self._waypoint_count), speed)
-        heading = math.radians(_number(self._heading.value, 0.0, 360.0))
-        return straight(heading, speed, int(_number(self._steps.value, 1, MAX_ACTIONS)))
-
-    @property
-    def _waypoint_count(self) -> int:
-        return int(_number(self._count.value, FEWEST, MOST))
-
     def _predict(self, client: Client) -> None:
         try:
             record = self._predictions.current()
-            actions = self._actions(record.state)
+            actions = self._controls.actions(record.state)
             is_warm = self._predictions.is_warm
             answer = self._predictions.submit(record.state, actions[None], _KEY)
         except OsfError as error:
-            self._tell(str(error))
+            self._say(str(error))
             raise
-        self._tell("Predicting" if is_warm else "Loading the network, some seconds the first time")
+        self._say("Predicting" if is_warm else "Loading the network, some seconds the first time")
         with self._thread.changed:
             self._has_plan = True
-        asked = _Asked(record, actions, client, answer)
-        answer.add_done_callback(lambda _: self._note_answer(asked))
+        request = _Request(record, actions, client, answer)
+        answer.add_done_callback(lambda _: self._note_answer(request))
 
-    def _note_answer(self, asked: _Asked) -> None:
+    def _note_answer(self, request: _Request) -> None:
         with self._thread.changed:
-            self._come = asked
+            self._answered = request
             self._thread.wake()
 
-    def _tell(self, text: str) -> None:
+    def _say(self, text: str) -> None:
         with self._thread.changed:
-            self._told = text
+            self._message = text
             self._thread.wake()
 
     def _execute(self) -> None:
         with self._thread.changed:
-            ready = self._ready
-            if ready is None or ready.is_executed or self._executing is not None:
+            prediction = self._prediction
+            if prediction is None or prediction.is_executed or self._executing is not None:
                 raise CannotExecute("There is no new prediction to execute; press Predict first.")
-            self._executing, self._told = ready, "Executing"
+            self._executing, self._message = prediction, "Executing"
             self._thread.wake()
-        told = ""
+        message = ""
         try:
-            done = self._act(ready.record.id, list(ready.actions))
-            told = _EXECUTED if done.revision == ready.last_revision else _CHANGED
+            done = self._act(prediction.record.id, list(prediction.actions))
+            message = _EXECUTED if done.revision == prediction.last_revision else _CHANGED
         except OsfError as error:
-            told = str(error)
+            message = str(error)
             raise
         finally:
             with self._thread.changed:
                 self._executing = None
-                self._told = told or "Not executed; the log tells more"
-                if told == _CHANGED:
-                    self._ready = None
+                self._message = message or "Not executed; the log tells more"
+                if message == _CHANGED:
+                    self._prediction = None
                 self._thread.wake()
 
     # The thread
 
     def _draw(self) -> None:
         with self._thread.changed:
-            come, self._come = self._come, None
-        if come is not None:
-            self._take(come)
+            answered, self._answered = self._answered, None
+        if answered is not None:
+            self._take(answered)
         self._draw_all()
 
-    def _take(self, asked: _Asked) -> None:
+    def _take(self, request: _Request) -> None:
         """Make an answer what is on view, unless the table has changed meanwhile."""
-        error = asked.answer.exception()
-        answer = None if error else asked.answer.result()
+        error = request.answer.exception()
+        answer = None if error else request.answer.result()
         if isinstance(error, OsfError):
-            self._tell(str(error))
-            self._run_command(partial(_refuse, error), asked.client)
+            self._say(str(error))
+            self._run_command(partial(_refuse, error), request.client)
         elif error is not None:
-            self._tell("The prediction failed; the log tells more")
+            self._say("The prediction failed; the log tells more")
             raise error
         with self._thread.changed:
             now = self._record
-            if not isinstance(answer, Predicted):  # overtaken by a newer question
+            if not isinstance(answer, Predicted):  # overtaken by a newer request
                 return
-            if now is None or (now.id, now.revision) != (asked.record.id, asked.record.revision):
-                self._told = _CHANGED
+            if now is None or (now.id, now.revision) != (request.record.id, request.record.revision):
+                self._message = _CHANGED
                 return
-            self._ready = Trial(asked.record, asked.actions, answer.rollouts, answer.took_s)
+            self._prediction = PushPrediction(request.record, request.actions, answer.rollouts, answer.took_s)
 
     def _draw_all(self) -> None:
         with self._thread.changed:
-            record, ready, told = self._record, self._ready, self._told
+            record, prediction, message = self._record, self._prediction, self._message
         self._draw_plan(record)
-        if ready is not self._drawn:
-            told = self._draw_ready(ready) if ready else self._draw_none(told)
-            self._drawn = ready
-        self._draw_time(ready)
-        if self._status.content != status("push", told):
-            self._status.content = status("push", told)
-        is_idle = ready is None or ready.is_executed or self._executing is not None
+        if prediction is not self._drawn:
+            message = self._draw_prediction(prediction) if prediction else self._draw_none(message)
+            self._drawn = prediction
+        if prediction is not None:
+            self._nodes.at(self._player.advance() / STEP_S)
+        if self._status.content != status("push", message):
+            self._status.content = status("push", message)
+        is_idle = prediction is None or prediction.is_executed or self._executing is not None
         if self._execute_button.disabled != is_idle:
             self._execute_button.disabled = is_idle
 
     def _draw_plan(self, record: SceneRecord | None) -> None:
-        pusher = None if record is None else record.state.pusher
-        if record is None or pusher is None:
-            self._waypoints.show(0)
-            self._drawing.plan(None)
-            return
-        laid = (record.id, tuple(pusher[:2]))
-        if laid != self._laid:
-            if self._laid is None or self._laid[0] != record.id or not self._has_plan:
-                self._aim(record.state)
-            self._waypoints.lay(pusher[:2], toward_nearest(record.state)[0])
-            self._laid = laid
-        has_plan = self._has_plan
-        self._waypoints.show(self._waypoint_count if has_plan and self._is_path else 0)
-        if not has_plan or self._is_done():
-            self._drawing.plan(None)
-        elif self._is_path:  # straight through the handles, even where that takes too many actions
-            self._drawing.plan(np.concatenate([pusher[None, :2], self._waypoints.places(self._waypoint_count)]))
-        else:
-            self._drawing.plan(way(pusher[:2], self._actions(record.state)))
+        path = None
+        if record is not None:
+            self._controls.follow(record, is_chosen=self._has_plan)
+            path = self._controls.path(record.state) if self._has_plan else None
+        self._controls.show_waypoints(path is not None)
+        # Once executed, the plan would only lead on from there.
+        is_done = self._prediction is not None and self._prediction.is_executed
+        self._nodes.plan(None if is_done else path)
 
-    def _aim(self, state: SceneState) -> None:
-        """Begin with a push that reaches the nearest object, and goes on."""
-        heading_rad, far_m = toward_nearest(state)
-        self._heading.value = int(5 * round(math.degrees(heading_rad) / 5)) % 360
-        step_m = STEP_S * _number(self._speed.value, *_SPEED)
-        self._steps.value = min(max(math.ceil((far_m + _FURTHER_M) / step_m - 1e-9), 1), MAX_ACTIONS)
+    def _draw_none(self, message: str) -> str:
+        self._report.visible = False
+        self._player.close()
+        self._nodes.clear()
+        return message
 
-    def _is_done(self) -> bool:
-        """Whether what is on view has been executed: the plan would only lead on from there."""
-        ready = self._ready
-        return ready is not None and ready.is_executed
-
-    def _draw_none(self, told: str) -> str:
-        self._time.visible = self._play.visible = self._report.visible = False
-        self._playing_since = None
-        self._drawing.clear()
-        return told
-
-    def _draw_ready(self, ready: Trial) -> str:
-        """Draw a prediction, or what came of it; tells what to say of it."""
+    def _draw_prediction(self, prediction: PushPrediction) -> str:
+        """Draw a prediction, or what came of it; returns the status message."""
         drawn = self._drawn
-        if drawn is None or drawn.rollouts is not ready.rollouts:
-            self._drawing.show(ready.rollouts)
-            end_s = len(ready.actions) * STEP_S
-            self._time.max = end_s
-            self._shown_s, self._playing_since = end_s, None
-        if ready.truth:
-            self._drawing.show_truth(ready.truth)
-        after = ready.truth[-1] if ready.is_executed else None
-        found = outcomes(ready.record.state, ready.rollouts, after, self._library)
-        self._report.content = report(found, self._labels(ready.rollouts.names))
-        self._time.visible = self._play.visible = self._report.visible = True
-        moving = len(self._drawing.moving)
-        said = f"{moving} object{'s' * (moving != 1)} will move" if moving else "Nothing will move"
-        told = f"{said}; predicted in {1000 * ready.took_s:.0f} ms"
-        if ready.truth:
-            told = _EXECUTED if ready.is_executed else "Executing"
+        if drawn is None or drawn.rollouts is not prediction.rollouts:
+            self._nodes.show(prediction.rollouts)
+            self._player.open(len(prediction.actions) * STEP_S)
+        if prediction.truth:
+            self._nodes.show_truth(prediction.truth)
+        after = prediction.truth[-1] if prediction.is_executed else None
+        rows = outcomes(prediction.record.state, prediction.rollouts, after, self._library)
+        self._report.content = report(rows, self._labels(prediction.rollouts.names))
+        self._report.visible = True
+        moving = len(self._nodes.moving)
+        text = f"{moving} object{'s' * (moving != 1)} will move" if moving else "Nothing will move"
+        message = f"{text}; predicted in {1000 * prediction.took_s:.0f} ms"
+        if prediction.truth:
+            message = _EXECUTED if prediction.is_executed else "Executing"
         with self._thread.changed:
-            if self._ready is ready:  # else there is something newer to tell
-                self._told = told
-            return self._told
+            if self._prediction is prediction:  # else there is something newer to tell
+                self._message = message
+            return self._message
 
     def _labels(self, names: tuple[str, ...]) -> Mapping[str, str]:
         labels = {}
@@ -366,34 +271,6 @@ class PushPanel(ThreadedPanel):
                 labels[name] = name
         return labels
 
-    def _draw_time(self, ready: Trial | None) -> None:
-        if ready is None:
-            return
-        with self._thread.changed:
-            if self._playing_since is not None:
-                end_s = len(ready.actions) * STEP_S
-                self._shown_s = min(time.monotonic() - self._playing_since, end_s)
-                if self._shown_s >= end_s:
-                    self._playing_since = None
-            shown_s, is_playing = self._shown_s, self._playing_since is not None
-            if is_playing:
-                self._thread.wake(TICK_S)
-        label = "Pause" if is_playing else "Play"
-        if self._play.label != label:
-            self._play.label = label
-        if abs(float(self._time.value) - shown_s) > 1e-6:
-            self._time.value = shown_s
-        self._drawing.at(shown_s / STEP_S)
-
 
 def _refuse(error: OsfError) -> None:
     raise error
-
-
-def _number(value: object, low: float, high: float) -> float:
-    """A number that a browser sent, within bounds; the lower one for what is none."""
-    try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, OverflowError):
-        return low
-    return min(max(number, low), high) if math.isfinite(number) else low

@@ -28,16 +28,16 @@ def report(outcomes: Iterable[Outcome], labels: Mapping[str, str]) -> str:
 
 
 def _line(row: Outcome, label: str) -> str:
-    cells = [_told(row.predicted_mm, row.predicted_deg)]
+    cells = [_motion(row.predicted_mm, row.predicted_deg)]
     if row.went_mm is not None and row.turned_deg is not None:
-        cells.append(_told(row.went_mm, row.turned_deg))
+        cells.append(_motion(row.went_mm, row.turned_deg))
     if row.off_mm is not None and row.off_deg is not None:
-        cells.append(f"<b>{_told(row.off_mm, row.off_deg)}</b>")
+        cells.append(f"<b>{_motion(row.off_mm, row.off_deg)}</b>")
     data = "".join(f'<td style="{_CELL}">{cell}</td>' for cell in cells)
     return f'<tr data-object="{escape(row.name)}"><td>{escape(label)}</td>{data}</tr>'
 
 
-def _told(shift_mm: float, turn_deg: float) -> str:
+def _motion(shift_mm: float, turn_deg: float) -> str:
     if shift_mm < 0.05 and turn_deg < 0.05:
         return "still"
     return f"{_digits(shift_mm)} mm<br>{_digits(turn_deg)}°"

@@ -9,7 +9,12 @@ REST_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One stage of refinement."""
+    """One stage of refinement.
+
+    Attributes:
+        rows: height of the picture [px].
+        is_sharp: whether it is rendered with fine sampling and with depth.
+    """
 
     rows: int
     is_sharp: bool
@@ -19,8 +24,13 @@ STEPS = (Step(112, is_sharp=False), Step(256, is_sharp=True), Step(480, is_sharp
 
 
 @dataclass(frozen=True, slots=True)
-class Ticket:
-    """A picture that was ordered: of which movement it is, and which step."""
+class RenderTicket:
+    """A requested picture.
+
+    Attributes:
+        movement: number of the movement after which it was requested.
+        step: index into `STEPS`.
+    """
 
     movement: int
     step: int
@@ -33,7 +43,7 @@ class Refinement:
         self._movement = 0
         self._moved_at = 0.0
         self._step = 0
-        self._ordered: Ticket | None = None
+        self._ordered: RenderTicket | None = None
 
     def moved(self, now: float) -> None:
         """Something that the view shows has moved, or the view itself."""
@@ -50,12 +60,12 @@ class Refinement:
             return None
         return self._moved_at if self._step == 0 else self._moved_at + REST_S
 
-    def order(self) -> Ticket:
+    def order(self) -> RenderTicket:
         """Note that the next picture is being made; whatever was ordered before does not count any more."""
-        self._ordered = Ticket(self._movement, self._step)
+        self._ordered = RenderTicket(self._movement, self._step)
         return self._ordered
 
-    def came(self, ticket: Ticket, *, is_there: bool) -> bool:
+    def accept(self, ticket: RenderTicket, *, is_there: bool) -> bool:
         """Note the answer to an order, with a picture or without; tells whether the picture should be shown."""
         if ticket != self._ordered:
             return False
@@ -65,7 +75,7 @@ class Refinement:
             self._step = ticket.step + 1
         return is_there and (is_fresh or ticket.step == 0)
 
-    def give_up(self, ticket: Ticket) -> None:
+    def give_up(self, ticket: RenderTicket) -> None:
         """Note that no picture can be made before something moves."""
         if ticket == self._ordered:
             self._ordered, self._step = None, len(STEPS)

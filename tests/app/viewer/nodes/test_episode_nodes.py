@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from app.processes.plan_summary import PlanSketch
-from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeDrawing, cost_colours
+from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeNodes, cost_colours
 from osfcore.control.events import Look, Looking
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
@@ -21,7 +21,7 @@ TURNS = np.tile([1.0, 0, 0, 0], (2, 1))
 
 @pytest.fixture
 def drawing(server, library):
-    return EpisodeDrawing(server, library)
+    return EpisodeNodes(server, library)
 
 
 def poses(x=0.1):

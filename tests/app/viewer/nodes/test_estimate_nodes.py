@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.viewer.nodes.estimate_nodes import GHOSTS, EstimateDrawing
+from app.viewer.nodes.estimate_nodes import GHOSTS, EstimateNodes
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -16,7 +16,7 @@ UPRIGHT = np.array([1.0, 0, 0, 0])
 
 @pytest.fixture
 def drawing(server, library):
-    return EstimateDrawing(server, library)
+    return EstimateNodes(server, library)
 
 
 def state(names=(BOX, UNKNOWN), z=0.1):
@@ -128,7 +128,7 @@ def test_doubted_objects_are_drawn_in_another_colour_with_the_reason(drawing, dr
 
 
 def test_what_is_not_on_the_table_is_named(server, driver, library):
-    drawing = EstimateDrawing(server, library, lambda name: name != BOX)
+    drawing = EstimateNodes(server, library, lambda name: name != BOX)
     drawing.show(step(estimate=judged("it is hardly visible")))
     texts = [node.text for node in verdicts(driver, "words")]
     assert texts[0] == "Cracker box: DOUBTFUL: it is hardly visible"
@@ -160,7 +160,7 @@ def test_estimates_of_things_on_their_way_are_drawn_without_a_word(drawing, driv
 
 
 def test_another_drawing_has_its_own_nodes_and_colour_and_may_do_without_light(server, driver, library):
-    drawing = EstimateDrawing(server, library, root="/elsewhere", colour=(1, 2, 3), has_light=False)
+    drawing = EstimateNodes(server, library, root="/elsewhere", colour=(1, 2, 3), has_light=False)
     drawing.show(step(candidates=tried(4), lights=np.array([[0, 0, 1.0]]), estimate=judged()))
     assert driver.below("/elsewhere/guess") == driver.below("/elsewhere/tried") == {BOX, UNKNOWN}
     assert driver.below("/estimate") == set()

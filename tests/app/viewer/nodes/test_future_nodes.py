@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.viewer.nodes.future_nodes import ON_THE_WAY, FutureDrawing, on_the_way
+from app.viewer.nodes.future_nodes import ON_THE_WAY, FutureNodes, on_the_way
 from osfcore.geometry.poses import Pose, quaternion_exp
 from tests.app.viewer.nodes.test_episode_nodes import BOX, CAN, TURNS, sketch
 
 
 @pytest.fixture
 def drawing(server, library):
-    return FutureDrawing(server.scene, library, "/future", (190, 50, 210))
+    return FutureNodes(server.scene, library, "/future", (190, 50, 210))
 
 
 def test_what_moves_is_drawn_at_its_end_paler_on_the_way_and_once_more_where_it_begins(drawing):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.viewer.nodes.push_nodes import TRAIL, PushDrawing
+from app.viewer.nodes.push_nodes import TRAIL, PushNodes
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
@@ -13,7 +13,7 @@ COUNT = 11
 
 @pytest.fixture
 def drawing(server, library):
-    return PushDrawing(server, library)
+    return PushNodes(server, library)
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.viewer.nodes.scene_nodes import SceneDrawing, light_toward
+from app.viewer.nodes.scene_nodes import SceneNodes, light_toward
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import quaternion_multiply
 from tests.app.conftest import until
@@ -80,7 +80,7 @@ def test_a_dragged_light_lights_the_scene_when_let_go(live, browser, shown):
 
 @pytest.fixture
 def table(server, library):
-    return SceneDrawing(server, library, lambda *_: None, lambda *_: None)
+    return SceneNodes(server, library, lambda *_: None, lambda *_: None)
 
 
 def test_the_lamp_can_be_hidden_or_named_and_still_follows(table, driver):

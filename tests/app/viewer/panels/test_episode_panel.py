@@ -9,8 +9,8 @@ import pytest
 from app.jobs.job import Job, JobChanged, JobSeen, State
 from app.processes.messages import CurrentScene, SceneChanged
 from app.services.goals import Draft, DraftChanged
-from app.viewer.nodes.episode_nodes import PARTS, EpisodeDrawing
-from app.viewer.nodes.scene_nodes import SceneDrawing
+from app.viewer.nodes.episode_nodes import PARTS, EpisodeNodes
+from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.episode_panel import DRAW_INTERVAL_S, EpisodePanel
 from osfcore.control.events import Acted, Finished, GoalFound, Noticed, Stepped
 from osfcore.geometry.cameras import goal_camera
@@ -41,8 +41,8 @@ class Room:
     def __init__(self, server, library):
         self.gui = ViewerDriver(server)
         self.ordered, self.rooms_made = [], 0
-        self.table = SceneDrawing(server, library, lambda *_: None, lambda *_: None)
-        self.drawing = EpisodeDrawing(server, library)
+        self.table = SceneNodes(server, library, lambda *_: None, lambda *_: None)
+        self.drawing = EpisodeNodes(server, library)
         self.panel = EpisodePanel(server, (self.table, self.drawing), self, self.run, self.make_room)
 
     def run(self, command, client):

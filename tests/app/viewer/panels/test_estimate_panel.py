@@ -12,8 +12,8 @@ from PIL import Image
 from app.jobs.job import Job, JobChanged, JobSeen
 from app.processes.messages import CurrentScene
 from app.processes.neural_messages import Comparison
-from app.viewer.nodes.estimate_nodes import EstimateDrawing
-from app.viewer.nodes.scene_nodes import SceneDrawing
+from app.viewer.nodes.estimate_nodes import EstimateNodes
+from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.estimate_panel import EstimatePanel
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
@@ -56,8 +56,8 @@ class Room:
     def __init__(self, server, library):
         self.gui = ViewerDriver(server)
         self.asked, self.cancelled = [], []
-        self.table = SceneDrawing(server, library, lambda *_: None, lambda *_: None)
-        self.drawing = EstimateDrawing(server, library)
+        self.table = SceneNodes(server, library, lambda *_: None, lambda *_: None)
+        self.drawing = EstimateNodes(server, library)
         self.renderer = Renderer()
         estimates = SimpleNamespace(of_scene=self.asked.append, comparison=lambda job, view: (job.id, view))
         self.panel = EstimatePanel(

@@ -13,8 +13,9 @@ from app.processes.neural_messages import Predicted
 from app.services.fields import MissingFields
 from app.services.pushes import MAX_ACTIONS
 from app.services.runner import SceneHeld
-from app.viewer.nodes.push_nodes import PushDrawing
-from app.viewer.panels.push_panel import PATH, PushPanel
+from app.viewer.nodes.push_nodes import PushNodes
+from app.viewer.panels.push_controls import PATH
+from app.viewer.panels.push_panel import PushPanel
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -254,7 +255,7 @@ def test_numbers_beyond_the_sliders_do_no_harm(room, nonsense):
 
 def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
     with monkeypatch.context() as broken:
-        broken.setattr(PushDrawing, "show", lambda *_: 1 / 0)
+        broken.setattr(PushNodes, "show", lambda *_: 1 / 0)
         room.gui.press("Predict")
         room.answer()
         until(lambda: room.panel.is_idle)

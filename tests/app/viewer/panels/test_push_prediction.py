@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.viewer.panels.push_trial import Trial
+from app.viewer.panels.push_prediction import PushPrediction
 from osfcore.geometry.rollouts import Rollouts
 from tests.app.storage.test_database import record
 
@@ -10,7 +10,7 @@ NOTHING = Rollouts(("x", "y"), np.zeros((1, 3, 2, 3)), np.zeros((1, 3, 2, 4)), n
 
 
 def trial():
-    return Trial(record(revision=5), np.zeros((2, 3)), NOTHING, 0.1)
+    return PushPrediction(record(revision=5), np.zeros((2, 3)), NOTHING, 0.1)
 
 
 def test_it_follows_its_own_execution_action_by_action():

@@ -1,4 +1,4 @@
-"""A prediction on view, and what came of it: when it still counts, and when the table has moved on."""
+"""A predicted push, what came of its execution, and when a change of the scene makes it outdated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from osfcore.geometry.states import SceneState
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Trial:
+class PushPrediction:
     """A push that was predicted, and perhaps executed.
 
     Attributes:
@@ -37,7 +37,9 @@ class Trial:
         """Of the scene once it has been executed: the simulation counts actions."""
         return self.record.revision + len(self.actions)
 
-    def after(self, record: SceneRecord, states: tuple[SceneState, ...], executing: Trial | None) -> Trial | None:
+    def after(
+        self, record: SceneRecord, states: tuple[SceneState, ...], executing: PushPrediction | None
+    ) -> PushPrediction | None:
         """What is left of it after a change: it outlives the execution of its own actions, and nothing else.
 
         Args:
