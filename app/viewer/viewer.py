@@ -64,12 +64,12 @@ class Viewer:
         """Prepare the view.
 
         Args:
-            runner: carries out what people do.
-            neural: renders what they see.
-            fields: names of the objects that have one.
-            estimates: finds poses and light in what the cameras see.
-            predictions: tells what pushes would do.
-            goals: what tables should become.
+            runner: executes commands on scenes.
+            neural: renders fields.
+            fields: names of the objects that have a field.
+            estimates: estimates poses and light from images.
+            predictions: predicts pushes.
+            goals: goal images, and the draft of one.
         """
         self._goals = goals
         self._estimates = estimates
@@ -209,7 +209,7 @@ class Viewer:
             self._run_command(lambda: command(scene), client)
 
     def _run_command(self, command: Callable[[], object], client: Client) -> None:
-        """Carry out a command; tell the one who gave it if it is refused."""
+        """Carry out a command; notify the client if it is refused."""
         try:
             command()
         except OsfError as error:
@@ -223,7 +223,7 @@ class Viewer:
             self._update_gizmos()
 
     def _update_gizmos(self) -> None:
-        """Hands may move objects only while no job does, and while the handles are not those of a goal."""
+        """Objects can be dragged while no job holds the scene and no goal is being composed."""
         current = self._runner.current
         is_free = current is not None and self._runner.jobs.holder(current) is None
         self._drawing.show_gizmos(self._wants_gizmos.value and is_free and not self._goal_panel.is_composing)

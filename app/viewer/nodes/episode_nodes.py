@@ -1,10 +1,9 @@
-"""The nodes that show an episode in the 3D view: the goal, what is believed, what is planned and what it leads to."""
+"""The nodes that show an episode in the 3D view: the goal, the estimate, the plan and the future that it predicts."""
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -12,6 +11,7 @@ import viser
 from jaxtyping import Float, UInt8
 
 from app.processes.plan_summary import PlanSketch
+from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.estimate_nodes import Colour, EstimateNodes
 from app.viewer.nodes.future_nodes import FutureNodes
 from app.viewer.nodes.ghosts import mesh_of
@@ -40,8 +40,8 @@ class EpisodeNodes:
 
     Args:
         server: to draw in.
-        library: knows the objects' shapes.
-        is_named: tells whether an object is drawn with its name already, since it is on the table.
+        library: meshes of the objects.
+        is_named: whether an object is labelled already, since it is on the table.
     """
 
     def __init__(
@@ -76,8 +76,8 @@ class EpisodeNodes:
             self._roots[part].visible = is_on
 
     def show_goal(self, goal: PoseGoal | None) -> None:
-        """Show where everything should be, in place of what was taken for that before."""
-        with self._lock, self._changes():
+        """Show the target poses in place of the former ones, or none."""
+        with self._lock, atomic(self._server):
             poses = {} if goal is None else {name: goal.pose(name) for name in goal.names}
             if set(poses) != set(self._goal):
                 _remove(self._goal)
@@ -91,8 +91,8 @@ class EpisodeNodes:
         (self._goal_look if look.look == "goal" else self._now).show(look.step)
 
     def show_estimate(self, estimate: EstimatedState | None) -> None:
-        """Show where everything is believed to be, and the light."""
-        with self._lock, self._changes():
+        """Show the estimated poses and light, or none."""
+        with self._lock, atomic(self._server):
             if estimate is None:
                 self._now.clear()
             else:
@@ -101,7 +101,7 @@ class EpisodeNodes:
 
     def show_plan(self, sketch: PlanSketch | None) -> None:
         """Show a round of planning in place of the one before: ways of the pusher, and the best future."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             self._future.show(None if sketch is None else sketch.best)
             self._ways.visible = self._best.visible = sketch is not None
             if sketch is not None:
@@ -111,22 +111,15 @@ class EpisodeNodes:
         """Let the best future be as it is some time after it began; over and over, faster than it would be."""
         with self._lock:
             if self._future.steps and self._roots["plan"].visible:
-                with self._changes():
+                with atomic(self._server):
                     self._future.at(self._future.steps * min(seconds % (PLAY_S + REST_S) / PLAY_S, 1.0))
 
     def clear(self) -> None:
         """Remove everything."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             self.show_goal(None)
             self.show_estimate(None)
             self.show_plan(None)
-
-    @contextlib.contextmanager
-    def _changes(self) -> Iterator[None]:
-        """All at once in the browser."""
-        with self._server.atomic():
-            yield
-        self._server.flush()
 
     def _draw_ways(self, sketch: PlanSketch) -> None:
         count, moments, _ = sketch.ways.shape

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import viser
 
+from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.ghosts import Mesh, box, footprint_m, heading_rad, mesh_of, sector, spread, top_m
 from app.viewer.nodes.scene_nodes import LIGHT_COLOUR, LIGHT_CUBE_M
 from osfcore.errors import OsfError
@@ -39,8 +39,8 @@ class EstimateNodes:
 
     Args:
         server: to draw in.
-        library: knows the objects' shapes.
-        is_named: tells whether an object is drawn with its name already, since it is on the table.
+        library: meshes of the objects.
+        is_named: whether an object is labelled already, since it is on the table.
         root: the node.
         colour: of the guess.
         has_light: whether the light is drawn, too.
@@ -80,7 +80,7 @@ class EstimateNodes:
 
     def show(self, step: EstimateStep) -> None:
         """Draw a step in place of the one before; the last one with its verdict."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             if step.guess.names != self._names:
                 self._begin(step.guess.names)
             self._clear_verdicts()
@@ -93,7 +93,7 @@ class EstimateNodes:
 
     def follow(self, estimate: EstimatedState) -> None:
         """Draw one of many estimates of things on their way: where they are, and which are doubted, without a word."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             if estimate.state.names != self._names:
                 self._begin(estimate.state.names)
             self._clear_verdicts()
@@ -112,19 +112,12 @@ class EstimateNodes:
 
     def clear(self) -> None:
         """Remove everything."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             self._begin(())
             self._clear_verdicts()
             for node in self._lamp or ():
                 node.remove()
             self._lamp, self._tried_lights.visible = None, False
-
-    @contextlib.contextmanager
-    def _changes(self) -> Iterator[None]:
-        """All at once in the browser."""
-        with self._server.atomic():
-            yield
-        self._server.flush()
 
     def _begin(self, names: tuple[str, ...]) -> None:
         for node in (*self._tried.values(), *self._guesses.values()):

@@ -1,4 +1,4 @@
-"""The nodes that show where a plan leads: ghosts on the way and at its end, and one that goes there with the pusher."""
+"""The nodes that show the predicted future of a plan: ghosts on the way, at its end, and moving with the pusher."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FutureNodes:
 
     Args:
         scene: to draw in.
-        library: knows the objects' shapes.
+        library: meshes of the objects.
         root: of its nodes.
         colour: of the ghosts, as batches of meshes take it.
     """

@@ -1,4 +1,4 @@
-"""Shapes of what is only believed: coarse meshes for many copies, sectors for orientations, small cubes for lights."""
+"""Geometry of estimates and predictions: coarse meshes for copies, sectors for orientations, cubes for lights."""
 
 from __future__ import annotations
 
@@ -48,6 +48,11 @@ def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
 
     What is recognised by its field needs no mesh on this machine, and what is on a table may have been removed since:
     such an object is a cube.
+
+    Args:
+        library: meshes of the objects.
+        name: of the object.
+        cells: along its longest side.
     """
     try:
         mesh = library.load(name).mesh

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
+from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.ghosts import Mesh, between, mesh_of, moves, pose_at, top_m, way_of
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
@@ -34,7 +34,7 @@ class PushNodes:
 
     Args:
         server: to draw in.
-        library: knows the objects' shapes.
+        library: meshes of the objects.
     """
 
     def __init__(self, server: viser.ViserServer, library: AssetLibrary) -> None:
@@ -67,7 +67,7 @@ class PushNodes:
 
     def show(self, rollouts: Rollouts) -> None:
         """Show the first of some rollouts in place of the one before, at its end."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             self._remove()
             self._rollouts = rollouts
             lines = []
@@ -83,12 +83,12 @@ class PushNodes:
         """Move the ghosts to where things are after some actions; in between, halfway."""
         with self._lock:
             if step != self._step:
-                with self._changes():
+                with atomic(self._server):
                     self._at(step)
 
     def show_truth(self, states: Sequence[SceneState]) -> None:
-        """Show the ways that predicted objects, and others that moved, truly went."""
-        with self._lock, self._changes():
+        """Show the ways that predicted objects, and others that moved, went in the simulation."""
+        with self._lock, atomic(self._server):
             lines = []
             for name in states[0].names if states else ():
                 poses = Pose(
@@ -101,16 +101,9 @@ class PushNodes:
 
     def clear(self) -> None:
         """Remove the prediction and the truth beside it; the plan stays."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             self._remove()
             self._pusher.visible = self._ways.visible = self._true_ways.visible = False
-
-    @contextlib.contextmanager
-    def _changes(self) -> Iterator[None]:
-        """All at once in the browser."""
-        with self._server.atomic():
-            yield
-        self._server.flush()
 
     def _remove(self) -> None:
         for node in (*self._ghosts.values(), *self._trails):
@@ -119,7 +112,7 @@ class PushNodes:
         self._true_ways.visible = False
 
     def _add_object(self, name: str, poses: Pose) -> np.ndarray:
-        """Ghost and trail of an object; tells where to draw its way."""
+        """Ghost and trail of an object; returns the line of its way (T, 3) [m]."""
         mesh = self._mesh(name)
         rows = _spaced(poses, TRAIL)
         if len(rows):

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import viser
 
 from app.processes.messages import SceneRecord
+from app.viewer.nodes.atomic import atomic
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
@@ -33,7 +33,14 @@ Client = viser.ClientHandle | None
 
 
 class SceneNodes:
-    """The nodes of one viser scene. Nodes are made once; afterwards only what changes is assigned."""
+    """The nodes of one viser scene. Nodes are made once; afterwards only what changes is assigned.
+
+    Args:
+        server: to draw in.
+        library: meshes, sizes and labels of the objects.
+        on_move: called on viser's loop with name, pose [m, world] and client when an object was let go.
+        on_light: called on viser's loop with light and client when the light was let go.
+    """
 
     def __init__(
         self,
@@ -58,7 +65,7 @@ class SceneNodes:
         self._is_light_held = False
         self._has_names = True
         self._has_gizmos = False
-        self._lamp_wishes: dict[str, tuple[bool, str]] = {}
+        self._light_requests: dict[str, tuple[bool, str]] = {}
         self._has_lamp = True
         self._add_room()
         self._add_light()
@@ -85,11 +92,11 @@ class SceneNodes:
         self._on_change()
 
     def watch(self, on_change: Callable[[], None]) -> None:
-        """Call a function, which must be quick, whenever something has moved."""
+        """Call a function, which must be quick, whenever something has moved. Any thread may call it back."""
         self._on_change = on_change
 
     def state(self) -> SceneState:
-        """What is on view, hands and all."""
+        """The poses on view, also those of objects that are being dragged."""
         with self._lock:
             names = tuple(self._bodies)
             positions = np.array([self._bodies[name].position for name in names], float).reshape(-1, 3)
@@ -99,7 +106,7 @@ class SceneNodes:
 
     def place(self, state: SceneState) -> None:
         """Move everything to where it is in a state."""
-        with self._lock, self._changes():
+        with self._lock, atomic(self._server):
             for name in state.names:
                 if name in self._bodies and name not in self._grabbed:
                     self._place_object(name, state.pose(name))
@@ -127,13 +134,18 @@ class SceneNodes:
             frustum.visible = is_on
 
     def show_lamp(self, *, is_on: bool, name: str = "", by: str = "") -> None:
-        """Show or hide the scene's own light; with a name, in another colour, so that it is not taken for a guess.
+        """Show or hide the scene's own light; with a name, in another colour than estimated lights.
 
-        Each view that draws guesses has its say: the lamp is as usual once none of them wants it otherwise.
+        Each panel that draws estimates has a request of its own: the light is as usual once all requests are the usual.
+
+        Args:
+            is_on: whether it is visible.
+            name: text beside it.
+            by: the panel that requests it.
         """
         with self._lock:
-            self._lamp_wishes[by] = is_on, name
-            others = [wish for wish in self._lamp_wishes.values() if wish != (True, "")]
+            self._light_requests[by] = is_on, name
+            others = [request for request in self._light_requests.values() if request != (True, "")]
             is_on, name = max(others, default=(True, ""))
             self._cube.visible = self._light_gizmo.visible = self._has_lamp = is_on
             self._ray.visible = is_on and self._pusher.visible
@@ -155,13 +167,6 @@ class SceneNodes:
                 self._has_gizmos = is_on
                 for gizmo in self._gizmos.values():
                     gizmo.visible = is_on
-
-    @contextlib.contextmanager
-    def _changes(self) -> Iterator[None]:
-        """All at once in the browser."""
-        with self._server.atomic():
-            yield
-        self._server.flush()
 
     def _add_room(self) -> None:
         scene = self._scene
@@ -290,11 +295,11 @@ class SceneNodes:
 
 
 def _nothing() -> None:
-    """For as long as nobody watches."""
+    """The callback until `watch` is called."""
 
 
 def _ray_from(position: np.ndarray) -> np.ndarray:
-    """A stretch of the line along which the light falls, which leads the eye to a lamp that is out of view."""
+    """A stretch of the line along which the light falls, so that a light outside the view can be found."""
     return np.stack([0.55 * position, position])[None].astype(np.float32)
 
 

@@ -18,6 +18,7 @@ from PIL import Image
 
 from app.processes.messages import CurrentScene
 from app.services.goals import Draft, DraftChanged
+from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.scene_nodes import NO_TURN, Client
@@ -73,7 +74,7 @@ class GoalPanel(ThreadedPanel):
 
     Args:
         server: to draw in, and whose panel gets the folder.
-        library: knows the objects' shapes.
+        library: meshes of the objects.
         goals: what is composed.
         commands: carries out what hands do; viser's loop must not wait for it.
         run_command: carries out a command and notifies its client if it is refused.
@@ -143,7 +144,7 @@ class GoalPanel(ThreadedPanel):
     def _draw_draft(self, draft: Draft | None) -> None:
         poses = {} if draft is None else dict(draft.poses)
         problem = "" if draft is None else draft.problem
-        with self._server.atomic():
+        with atomic(self._server):
             for name in set(self._copies) - set(poses):
                 self._copies.pop(name).remove()
             for name, pose in poses.items():
@@ -152,7 +153,6 @@ class GoalPanel(ThreadedPanel):
                 self._copies[name].place(pose)
                 self._copies[name].colour(WRONG if problem else GOAL)
             self._words.text, self._words.visible = problem, bool(problem)
-        self._server.flush()
         self._status.content = status("goal", _IDLE if draft is None else problem or _COMPOSING)
         self._begin_button.disabled = draft is not None
         self._keep_button.disabled = self._drop_button.disabled = draft is None
@@ -187,7 +187,7 @@ class _Copy:
 
     Args:
         scene: to draw in.
-        library: knows its shape.
+        library: meshes of the objects.
         name: of the object.
         on_release: called on viser's loop when somebody has let it go, with the number of the grip; must be quick.
     """

@@ -112,7 +112,13 @@ class PushControls:
 
 
 def number_between(value: object, low: float, high: float) -> float:
-    """A number that a browser sent, clipped to [low, high]; `low` for what is not a finite number."""
+    """A number that a browser sent, clipped to [low, high].
+
+    Args:
+        value: which may be anything.
+        low: of the range, and the result for what is not a finite number.
+        high: of the range.
+    """
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):

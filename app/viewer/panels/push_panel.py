@@ -58,7 +58,7 @@ class PushPanel(ThreadedPanel):
 
     Args:
         server: whose panel gets the folder.
-        library: knows shapes, symmetries and labels.
+        library: meshes, symmetries and labels of the objects.
         predictions: predicts pushes.
         act: executes actions in a scene and returns the scene afterwards.
         run_command: carries out a command and notifies its client if it is refused.
