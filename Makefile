@@ -1,4 +1,5 @@
-# make demo   build everything and open the page      make test   the test suite
+# make demo   build everything and open the page      make test   the quick tests (minutes)
+# make test-all   every test, browser included
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
@@ -12,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 DATA := $(if $(DATA_DIR),--data-dir $(DATA_DIR),)
 OFFLINE := echo "make: the packages could not be installed; see the lines above (is there a network connection?)" >&2
 
-.PHONY: demo install dev test lint soak bench clean
+.PHONY: demo install dev test test-all lint soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch $(DATA)
@@ -38,6 +39,9 @@ $(VENV)/.dev-installed: $(VENV)/.installed
 
 test: dev
 	$(BIN)/pytest
+
+test-all: dev
+	$(BIN)/pytest -m 'not soak'
 
 lint: dev
 	$(BIN)/ruff check

@@ -31,6 +31,7 @@ def test_make_targets_exist():
         assert done.returncode == 0, target
 
 
+@pytest.mark.slow
 def test_commands_run(data_dir, tmp_path):
     commands = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(("osf ", "echo "))]
     assert len(commands) >= 7
@@ -52,6 +53,7 @@ def seen(library, tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_rest_examples_run(data_dir, tmp_path):
     with live_service(data_dir) as url:  # each block goes on where the one before ended
         program = "".join(blocks("python")).replace("http://127.0.0.1:8000", url)
@@ -88,6 +90,7 @@ def drive_with_curl(url, place):
     assert set(ids) == {"GOAL", "EPISODE"}
 
 
+@pytest.mark.slow
 def test_an_observation_is_sent_as_written(data_dir, tmp_path, seen):
     if shutil.which("curl") is None:
         pytest.skip("curl is not on this machine")

@@ -75,6 +75,7 @@ def place(library, tmp_path):
     return tmp_path / "data"
 
 
+@pytest.mark.slow
 def test_what_was_done_is_there_after_the_worker_and_after_the_service_was_killed(place):
     port = free_port()
     service = start_service(place, port)
@@ -103,6 +104,7 @@ def test_what_was_done_is_there_after_the_worker_and_after_the_service_was_kille
         stop_service(service)
 
 
+@pytest.mark.slow
 def test_a_disk_that_refuses_ends_an_episode_with_a_clear_error_and_nothing_half_written(place):
     port = free_port()
     service = start_service(place, port)

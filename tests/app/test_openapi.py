@@ -114,6 +114,7 @@ def reach(case, made):
                 case.body[key] = made[key]
 
 
+@pytest.mark.slow
 @schema.parametrize()
 @settings(
     max_examples=EXAMPLES,

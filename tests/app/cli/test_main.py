@@ -51,6 +51,7 @@ def test_json_is_the_last_line_and_keys_are_stable(data_dir):
     assert keys <= set(result["objects"][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -208,6 +208,7 @@ def empty_mask():
     return observation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("observation", "asked", "kind", "words"),
     [
@@ -234,6 +235,7 @@ def larger_image(folder):
     shutil.copy(folder.parent / "large" / "image_2.png", folder / "image_2.png")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "words"),
     [

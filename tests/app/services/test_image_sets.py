@@ -61,6 +61,7 @@ def broken(tmp_path: Path, damage) -> bytes:
     return zipped(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -140,6 +141,7 @@ def test_uploads_at_the_same_time_do_not_overrun_the_limit(sets, archive, tmp_pa
     assert len(sets.all()) == len(list((tmp_path / "sets").iterdir())) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [

@@ -115,6 +115,7 @@ def test_the_limit_holds_for_scenes_made_at_the_same_time(open_runner):
     assert len(made) == len(runner.scenes()) == 2
 
 
+@pytest.mark.slow
 def test_a_busy_stage_is_not_taken_for_a_hanging_one(open_runner):
     """Each answer comes in time, the last one long after the limit for one answer."""
     runner = open_runner(demo_scene=False)

@@ -65,6 +65,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
         asyncio.run(save(chunks(b"x"), tmp_path / "file" / "new" / "upload"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("look", "words", "kind"),
     [

@@ -60,6 +60,7 @@ def begun(world, goal, settings=SMALL, **more) -> Episode:
     return Episode(world, KNOWN, goal, settings, np.random.default_rng(0), **more)
 
 
+@pytest.mark.slow
 def test_the_table_becomes_what_was_asked_for(world, told):
     goal = toward_middle(world)
     events = list(begun(world, goal).run())
@@ -140,6 +141,7 @@ def test_a_plan_serves_for_as_many_actions_as_asked(world, told):
     assert sum(isinstance(event, Acted) for event in events) == 5
 
 
+@pytest.mark.slow
 def test_settings_count_from_the_next_step_on(world, told):
     episode = begun(world, toward_middle(world, length=0.15))
     for event in episode.run():

@@ -8,6 +8,7 @@ from osfcore.geometry.poses import Pose
 from tests.core.control.scenes import CAN, GELATIN, knowledge, sure, table
 
 
+@pytest.mark.slow
 def test_what_is_lost_is_found_anywhere_on_the_table(library):
     world = table(library)
     truth, observation = world.truth(), world.observe()

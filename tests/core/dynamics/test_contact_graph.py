@@ -101,6 +101,7 @@ def test_a_can_is_touched_where_the_sweep_comes_close(shapes, table, away):
         torch.testing.assert_close(graph.pusher.halfway.normal, torch.tensor([[0.0, -1.0]]), atol=0.05, rtol=0)
 
 
+@pytest.mark.slow
 @given(angle=st.floats(-3.1, 3.1), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
 def test_in_the_headings_frame_a_scene_looks_the_same_wherever_it_is(shapes, table, angle, x, y):
     state = crowd(shapes)

@@ -58,6 +58,7 @@ def test_a_pushed_object_looks_along_its_push(shapes, table):
     assert found.edges[0, 0] == 1
 
 
+@pytest.mark.slow
 @given(angle=st.floats(-3.1, 3.1), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1), speed=st.floats(0.1, 0.3))
 def test_a_scene_turned_and_shifted_gives_the_same_numbers(shapes, table, angle, x, y, speed):
     state = crowd(shapes)

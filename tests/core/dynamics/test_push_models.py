@@ -40,6 +40,7 @@ def trained(tmp_path):
     return FieldLibrary(tmp_path)
 
 
+@pytest.mark.slow
 def test_shipped_parts_are_those_of_the_shipped_fields(monkeypatch):
     monkeypatch.setattr(
         "osfcore.dynamics.push_models.field_parts", lambda _: pytest.fail("parts do not fit their field")
@@ -48,6 +49,7 @@ def test_shipped_parts_are_those_of_the_shipped_fields(monkeypatch):
     assert {name for name, count in counts.items() if count} == HOLLOW
 
 
+@pytest.mark.slow
 def test_shipped_parts_can_be_made_again():
     kept = load_shapes(None, FIELDS, [BANANA])[BANANA].parts
     parts = field_parts(FIELDS.load(BANANA))

@@ -60,6 +60,7 @@ def test_progress_goes_on_to_its_end(steps):
     check_progress(steps)
 
 
+@pytest.mark.slow
 def test_where_the_prior_has_them_plays_no_part(models, steps, seen, truth):
     far = replace(truth, poses=Pose(truth.poses.position + [0.1, 0.1, 0], truth.poses.quaternion))
     found = steps_of(models, seen, far)[-1].estimate
@@ -67,6 +68,7 @@ def test_where_the_prior_has_them_plays_no_part(models, steps, seen, truth):
     assert shift.max() < 0.002
 
 
+@pytest.mark.slow
 def test_an_object_that_lies_another_way_is_found_too(models):
     prior = scene({BOX: lying(models, BOX, 30, 0.1, 0.1)})
     goal = scene({BOX: lying(models, BOX, 150, -0.03, 0.0)}, (0.2, 0.3, 0.9))
@@ -78,6 +80,7 @@ def test_an_object_that_lies_another_way_is_found_too(models):
     assert np.rad2deg(turn[0]) < 6
 
 
+@pytest.mark.slow
 def test_an_object_that_is_not_there_is_doubted(models, truth):
     alone = observe(models, scene({BOX: truth.pose(BOX)}), [goal_camera(64)], masks=False)
     estimate = steps_of(models, replace(alone, names=truth.names), truth, QUICK)[-1].estimate
@@ -85,6 +88,7 @@ def test_an_object_that_is_not_there_is_doubted(models, truth):
     assert not estimate.trusted
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_elsewhere_shows_nothing(models, truth):
     away = Camera.look_at("goal", (0, -0.45, 0.8), (0, -3.0, 3.0), size=48)
     steps = steps_of(models, observe(models, truth, [away], masks=False), truth)

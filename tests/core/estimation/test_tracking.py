@@ -93,6 +93,7 @@ def test_a_moved_lamp_is_noticed(models, truth):
     assert np.rad2deg(turn).max() < 2
 
 
+@pytest.mark.slow
 def test_a_vanished_object_is_doubted(models, truth):
     away = truth.poses.position.copy()
     away[0] = 3.0, 0.0, 0.0

@@ -65,6 +65,7 @@ def test_dents_are_measured():
     assert 0.025 < dent_depth_m(ring.vertices, ring.faces) < 0.045  # the middle of the lid is 40 mm from the ring
 
 
+@pytest.mark.slow
 def test_a_ring_stays_open_and_is_the_same_each_time():
     ring = as_textured(trimesh.creation.annulus(0.04, 0.05, 0.05, sections=48))
     parts = convex_parts(ring.vertices, ring.faces)

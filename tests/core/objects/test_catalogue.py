@@ -32,6 +32,7 @@ def test_discrete_symmetries_form_a_group():
         assert distinct.min() > 0.5, info.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["024_bowl", "036_wood_block", "061_foam_brick"])
 def test_symmetries_map_the_mesh_onto_itself(name, ycb_folder):
     from scipy.spatial import KDTree

@@ -132,6 +132,7 @@ def test_what_was_executed_is_dropped(shapes, start):
     assert planned(planner, start, goal)[-1].actions.shape == (20, 3)
 
 
+@pytest.mark.slow
 def test_a_can_is_brought_to_its_goal_by_the_shipped_network(shapes, start):
     """Planned and executed in the network's own world; the way there leads around the can."""
     model = load_push_model(None, FIELDS, (APPLE, CAN))

@@ -70,6 +70,7 @@ print(numba.threading_layer())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", ["workqueue", "default"])
 def test_no_threading_layer_ends_the_process_when_threads_meet(layer):
     """Numba's own layer, which machines without OpenMP get, aborts when two calls overlap."""

@@ -314,6 +314,7 @@ def _episodes(library, policy_seeds: range) -> tuple[float, float, float]:
     return fastest, highest, lowest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 200, 50))
 def test_episodes_of_random_pushes_never_explode(library, first):
     fastest, highest, lowest = _episodes(library, range(first, first + 50))

@@ -101,6 +101,7 @@ def test_images_of_steps_come_closer_to_what_was_observed(service, scene, first)
     is_problem(service.get(f"{address}/0.png", params={"kind": "sketch"}), 422)
 
 
+@pytest.mark.slow
 def test_later_frames_and_goals_begin_with_an_estimate(service, scene, first):
     for mode, views in (("next", 4), ("goal", 1)):
         accepted = service.post("/api/estimates", json={"scene": scene["id"], "mode": mode})
@@ -138,6 +139,7 @@ def test_an_uploaded_folder_is_estimated_without_errors_against_a_truth(service,
     assert np.linalg.norm(apart) < 0.01
 
 
+@pytest.mark.slow
 def test_masks_that_show_something_else_make_a_doubtful_estimate(service, folder, tmp_path):
     observation = read_observation(folder)
     masks = np.zeros_like(observation.masks)

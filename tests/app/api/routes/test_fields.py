@@ -69,6 +69,7 @@ def test_an_upload_may_be_larger_than_other_requests_but_not_without_end(library
         assert list((tmp_path / "limits" / "sets").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_from_a_mesh_to_a_field_that_can_be_seen_and_deleted(service, services):
     accepted = train(service, GELATIN, {"mesh": GELATIN}, images=60)
     assert accepted.status_code == 202
@@ -94,6 +95,7 @@ def test_from_a_mesh_to_a_field_that_can_be_seen_and_deleted(service, services):
     assert not (services.settings.data_dir / "fields" / GELATIN).exists()
 
 
+@pytest.mark.slow
 def test_from_a_set_to_a_field_that_needs_a_mesh_for_scenes(service, archive):
     made = upload(service, archive).json()
     accepted = train(service, "my_mug", {"set": made["id"]})
@@ -170,6 +172,7 @@ def test_damaged_sets_do_not_hide_the_list(service, services):
     shutil.rmtree(folder)
 
 
+@pytest.mark.slow
 def test_what_lies_in_the_data_directory_is_listed(service, services, archive):
     made = upload(service, archive).json()
     job = finished(service, train(service, "one", {"set": made["id"]}).headers["location"], 240)

@@ -108,6 +108,7 @@ def test_no_number_but_finite_ones(service, number):
     assert "/actions/0/0/0" in answer.json()["detail"]
 
 
+@pytest.mark.slow
 def test_without_a_scene_or_with_an_object_that_has_no_field(library, tmp_path):
     library_name = "my_box"
     with running(library, tmp_path) as client:

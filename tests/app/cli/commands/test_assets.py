@@ -33,6 +33,7 @@ def test_list_before_anything_was_fetched(tmp_path, capsys):
     json.dumps(result)
 
 
+@pytest.mark.slow
 def test_fetch_list_and_json(data_dir, ycb_folder, capsys):
     result = AssetsFetch(("009_gelatin_box",), source=str(ycb_folder), force=True, data_dir=data_dir, json=True).run()
     assert result["objects"] == ["009_gelatin_box"]

@@ -26,6 +26,7 @@ def fields_dir(data_dir, library, monkeypatch):
     return data_dir
 
 
+@pytest.mark.slow
 def test_figures_are_the_last_line_as_json_and_a_file(fields_dir, tmp_path, capsys):
     arguments = ["bench", "render", "--data-dir", str(fields_dir), "--scenes", "2", "--repeats", "1"]
     assert main([*arguments, "--out", str(tmp_path / "out"), "--json"]) == 0
@@ -97,6 +98,7 @@ def test_the_command_explains_itself(capsys):
     assert "render" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_rollouts_are_timed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench_dynamics, "SEQUENCES", 20)
     arguments = ["bench", "dynamics", "--data-dir", str(tmp_path / "empty"), "--out", str(tmp_path)]

@@ -71,6 +71,7 @@ def oracle(fields_dir, monkeypatch):
     return oracle
 
 
+@pytest.mark.slow
 def test_estimators_are_measured(fields_dir, oracle, capsys):
     arguments = ["--data-dir", str(fields_dir), "--names", *SOLIDS, "--tasks", "2", "--objects", "2", "--bad", "1"]
     assert main(["eval", "estimate", *arguments, "--json"]) == 0
@@ -137,6 +138,7 @@ def test_a_mistake_is_one_sentence(fields_dir, tmp_path, capsys, arguments, word
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_predicted_pushes_are_measured(data_dir, library, monkeypatch, capsys):
     monkeypatch.setattr(dynamics, "_STEPS", 34)
     monkeypatch.setattr(dynamics, "COUNTS", (2, 3))

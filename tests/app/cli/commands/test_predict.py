@@ -170,6 +170,7 @@ def test_the_scenes_own_cameras_can_look(files, state, data_dir, capsys):
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["psnr"]
 
 
+@pytest.mark.slow
 def test_every_shipped_field_has_a_shape():
     code = "from osfcore.dynamics.push_models import load_push_model; "
     code += "from osfcore.fields.field_library import FieldLibrary; "

@@ -86,6 +86,7 @@ def test_it_tells_one_address_and_leaves_at_once_with_streams_open(serve, data_d
     stream.close()
 
 
+@pytest.mark.slow
 def test_a_killed_service_leaves_no_process_and_can_start_again(serve, data_dir):
     process = serve(data_dir)
     address(process)

@@ -31,6 +31,7 @@ def test_a_field_is_written_with_what_it_reaches(image_set, tmp_path, capsys):
     assert "left" in told.err  # progress
 
 
+@pytest.mark.slow
 def test_a_killed_training_goes_on_when_the_same_command_is_run_again(image_set, tmp_path):
     out, log = tmp_path / "egg.safetensors", tmp_path / "log"
     command = [sys.executable, "-m", "app.cli", "train", "field", "--data", str(image_set), "--out", str(out)]
@@ -54,6 +55,7 @@ def test_a_killed_training_goes_on_when_the_same_command_is_run_again(image_set,
     assert not out.with_suffix(".partial").exists()
 
 
+@pytest.mark.slow
 def test_the_table_has_a_training_of_its_own(tmp_path, capsys):
     from osfcore.world.collection.collect_images import CollectTable, collect_table
 
@@ -75,6 +77,7 @@ def test_mistakes_are_told_before_anything_is_trained(image_set, tmp_path):
     assert not (tmp_path / "egg.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_pushes_are_learned_from_collected_ones(library, tmp_path, capsys):
     pushes = tmp_path / "pushes.h5"
     config = CollectPushes(pushes, episodes=14, steps=8, policy="directed", seed=1)

@@ -51,6 +51,7 @@ def trained(monkeypatch):
     return runs
 
 
+@pytest.mark.slow
 def test_from_a_mesh_images_are_taken_first_and_the_field_is_put_in_place(place, trained):
     steps = list(train_field_job(ORDER, place))
     done = [step.done for step in steps]
@@ -70,6 +71,7 @@ def test_from_a_mesh_images_are_taken_first_and_the_field_is_put_in_place(place,
     json.dumps(dataclasses.asdict(steps[-1]))
 
 
+@pytest.mark.slow
 def test_after_a_kill_the_same_order_uses_the_images_that_are_there(place, trained):
     first = train_field_job(ORDER, place)
     next(step for step in first if step.previews)
@@ -86,6 +88,7 @@ def test_after_a_kill_the_same_order_uses_the_images_that_are_there(place, train
     assert "Image 1 of 60" in next(other).note
 
 
+@pytest.mark.slow
 def test_a_kill_between_training_and_putting_in_place_trains_nothing_twice(place, trained):
     first = train_field_job(ORDER, place)
     next(step for step in first if step.psnr_full == 30.5)

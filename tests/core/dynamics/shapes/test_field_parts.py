@@ -106,6 +106,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
         write_parts(tmp_path / "file" / "parts.safetensors", (), "abc")
 
 
+@pytest.mark.slow
 def test_parts_of_a_real_drill_fill_it_but_for_its_hollows():
     field = FieldLibrary(None).load("035_power_drill")
     parts = field_parts(field)

@@ -105,6 +105,7 @@ def test_an_abandoned_run_goes_on_and_ends_as_a_whole_one(data, tmp_path, shapes
     assert_same_weights(whole.out, parts.out)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("damage", ["other settings", "cut short", "rubbish"])
 def test_a_checkpoint_that_does_not_fit_is_not_gone_on_with(data, tmp_path, shapes, damage):

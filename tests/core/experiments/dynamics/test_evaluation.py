@@ -19,6 +19,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(bench_dynamics, "SEQUENCES", 10)
 
 
+@pytest.mark.slow
 def test_an_evaluation_collects_once_and_tells_everything(quick, library, tmp_path):
     config = EvaluateDynamics(tmp_path, tasks=1, seed=4, names=NAMES)
     steps = list(evaluate_dynamics(config, FieldLibrary(None), library))

@@ -84,6 +84,7 @@ def test_what_was_measured_is_taken_over(evaluated, solids, library, oracle):
     assert not oracle.asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "asked"),
     [
@@ -112,6 +113,7 @@ def test_a_killed_evaluation_goes_on(solids, library, tmp_path, oracle):
     assert all(len(track.seconds) == 2 for track in report.tracks)
 
 
+@pytest.mark.slow
 def test_a_refused_first_frame_is_a_result_too(solids, library, tmp_path, oracle):
     oracle.refuses = 1
     report = last(evaluate_estimate(quick(tmp_path, tasks=2), solids, library)).report

@@ -23,6 +23,7 @@ def runner(solids, library, tmp_path, oracle):
     return TaskRunner(quick(tmp_path), SOLIDS, solids, library)
 
 
+@pytest.mark.slow
 def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_path):
     config = quick(tmp_path, objects=1, names=SOLIDS[:1], steps=1, size=32)
     runner = TaskRunner(config, SOLIDS[:1], solids, library)
@@ -77,6 +78,7 @@ def test_ablations_see_fewer_cameras_or_hold_the_light(runner, oracle):
     assert forward[0][:2] @ forward[1][:2] < 0  # they face each other
 
 
+@pytest.mark.slow
 def test_bad_cases_are_judged_by_what_is_there(runner, oracle):
     scores = {kind: BadScore.from_json(runner.bad(n).figures["score"]) for n, kind in enumerate(KINDS)}
     assert [scores[kind].kind for kind in KINDS] == list(KINDS)

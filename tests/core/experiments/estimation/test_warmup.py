@@ -10,6 +10,7 @@ from tests.core.experiments.oracle import Oracle
 from tests.core.experiments.solids import SOLIDS
 
 
+@pytest.mark.slow
 def test_every_kind_of_estimate_is_made_once(solids, library, monkeypatch):
     made, found = [], []
 

@@ -127,6 +127,7 @@ def test_a_killed_evaluation_goes_on_and_new_weights_are_measured_anew(library, 
     assert second.objects[SOLIDS[1]] == first.objects[SOLIDS[1]]
 
 
+@pytest.mark.slow
 def test_another_mesh_is_measured_anew_alone_and_in_scenes(solids, library, tmp_path, monkeypatch):
     assets = AssetLibrary(shutil.copytree(library.root, tmp_path / "objects"))
     config = EvaluateFields(tmp_path / "out", SOLIDS, tasks=1, size=32)

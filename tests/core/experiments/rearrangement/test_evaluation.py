@@ -139,6 +139,7 @@ def test_a_killed_evaluation_goes_on(library, tmp_path, runs):
     assert [number for _, number, _ in runs] == [0, 1, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "made"),
     [

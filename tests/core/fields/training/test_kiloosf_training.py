@@ -79,6 +79,7 @@ def test_longer_training_does_not_hurt(block_set, tmp_path):
     assert long.psnr_full > short.psnr_full + 1
 
 
+@pytest.mark.slow
 def test_a_time_budget_is_kept(block_set, tmp_path):
     config = TrainField(block_set, tmp_path / "a.safetensors", minutes=0.05)
     steps = run(config)
@@ -99,6 +100,7 @@ for step in training.train_field(config, QUICK):
 """
 
 
+@pytest.mark.slow
 def test_killed_training_goes_on_where_it_was(block_set, tmp_path, monkeypatch):
     """SIGKILL in the middle: the same command takes up the checkpoint and ends as an undisturbed run does."""
     config = TrainField(block_set, tmp_path / "a.safetensors", iterations=240, device="cpu")

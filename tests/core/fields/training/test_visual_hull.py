@@ -78,6 +78,7 @@ def test_wrong_camera_conventions_are_found(image_set, turn, words):
         silhouette_box(read_image_set(image_set, "train"), where=image_set)
 
 
+@pytest.mark.slow
 def test_images_upside_down_are_found(library, tmp_path):
     """Far away this mirrors the object at its centre and all silhouettes agree; perspective tells it apart."""
     folder = tmp_path / "drill"

@@ -64,6 +64,7 @@ def test_disturbed_states_are_kept_where_they_are_asked_for(library, tmp_path):
     assert sum(len(e.disturbed.step) for e in both) > 0
 
 
+@pytest.mark.slow
 def test_content_does_not_depend_on_the_number_of_workers(library, tmp_path):
     alone = collect(library, tmp_path / "alone.h5")
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
@@ -86,6 +87,7 @@ def test_abandoned_collection_goes_on_where_it_was(library, tmp_path):
     assert_same(collect(library, config.out), whole)
 
 
+@pytest.mark.slow
 def test_killed_collection_loses_and_repeats_nothing(library, tmp_path):
     whole = collect(library, tmp_path / "whole.h5", episodes=8, steps=30)
     out = tmp_path / "killed.h5"

@@ -21,6 +21,7 @@ def run(library, policy_name: str, seeds: range) -> float:
     return float(np.mean(contacts))
 
 
+@pytest.mark.slow
 def test_directed_policy_has_sustained_contact_where_the_paper_policy_rarely_has(library):
     paper, directed = run(library, "paper", range(8)), run(library, "directed", range(8))
     assert directed > 0.4

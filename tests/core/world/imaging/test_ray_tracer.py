@@ -160,6 +160,7 @@ def test_views_in_threads_equal_views_one_by_one():
         np.testing.assert_array_equal(x.rgb, y.rgb)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [16, 32, 64, 95, 128])
 def test_default_quality_is_within_38_db_of_supersampling(library, size):
     names = ("006_mustard_bottle", "003_cracker_box", "035_power_drill")
