@@ -9,7 +9,19 @@ import numpy as np
 import viser
 
 from app.viewer.nodes.atomic import atomic
-from app.viewer.nodes.ghosts import Mesh, box, footprint_m, heading_rad, mesh_of, sector, spread, top_m
+from app.viewer.nodes.ghosts import (
+    Mesh,
+    add_ghosts,
+    below_table,
+    box,
+    footprint_m,
+    heading_rad,
+    mesh_of,
+    move_ghosts,
+    sector,
+    spread,
+    top_m,
+)
 from app.viewer.nodes.scene_nodes import LIGHT_COLOUR, LIGHT_CUBE_M
 from osfcore.errors import OsfError
 from osfcore.estimation.steps import EstimateStep
@@ -148,33 +160,28 @@ class EstimateNodes:
         opacity: float = 0.2,
         is_wire: bool = False,
     ) -> viser.BatchedMeshHandle:
-        vertices, faces = mesh
-        return self._scene.add_batched_meshes_simple(
+        return add_ghosts(
+            self._scene,
             path,
-            vertices,
-            faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            np.tile([0.0, 0.0, -1.0], (count, 1)),
+            mesh,
+            below_table(count),
             batched_scales=np.full(count, _WIRE_SCALE if is_wire else 1.0),
             batched_colors=colour,
             wireframe=is_wire,
             opacity=opacity,
-            lod="off",
             side="double" if is_wire else "front",
-            cast_shadow=False,
-            receive_shadow=False,
             visible=False,
         )
 
     def _show_guess(self, name: str, pose: Pose, opacity: float) -> None:
         self._guesses[name].opacity = opacity
-        _put(self._guesses[name], Pose(pose.position[None], pose.quaternion[None]))
+        move_ghosts(self._guesses[name], Pose(pose.position[None], pose.quaternion[None]))
         self._guesses[name].visible = bool(pose.position[2] > _AWAY_M)
 
     def _show_tried(self, name: str, candidates: Pose | None) -> None:
         node = self._tried[name]
         if candidates is not None:
-            _put(node, spread(candidates, GHOSTS))
+            move_ghosts(node, spread(candidates, GHOSTS))
         node.visible = candidates is not None and self._has_candidates
 
     def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
@@ -186,7 +193,7 @@ class EstimateNodes:
         label.text = text
         if tried is not None:
             turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(tried), 1))
-            _put(self._tried_lights, spread(Pose(np.asarray(tried, float), turns), GHOSTS))
+            move_ghosts(self._tried_lights, spread(Pose(np.asarray(tried, float), turns), GHOSTS))
         self._tried_lights.visible = tried is not None and self._has_candidates
 
     def _add_lamp(self) -> tuple[viser.BoxHandle, viser.LineSegmentsHandle, viser.LabelHandle]:
@@ -259,11 +266,6 @@ class EstimateNodes:
         self._verdicts = []
         for guess in self._guesses.values():
             guess.batched_colors = np.array(self._colour, np.uint8)
-
-
-def _put(node: viser.BatchedMeshHandle, poses: Pose) -> None:
-    node.batched_positions = poses.position.astype(np.float32)
-    node.batched_wxyzs = poses.quaternion.astype(np.float32)
 
 
 def _two_digits(value: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import viser
 
-from app.viewer.nodes.ghosts import between, mesh_of, moves, pose_at, way_of
+from app.viewer.nodes.ghosts import add_ghosts, below_table, between, mesh_of, move_ghosts, moves, pose_at, way_of
 from app.viewer.nodes.push_nodes import pusher_ghost
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
@@ -73,28 +73,22 @@ class FutureNodes:
                 poses = way_of(future, n)
                 now = pose_at(poses, step)
                 still = poses[[*on_the_way(poses, ON_THE_WAY), -1]]
-                node = self.ghosts[name]
-                node.batched_positions = np.vstack([still.position, now.position]).astype(np.float32)
-                node.batched_wxyzs = np.vstack([still.quaternion, now.quaternion]).astype(np.float32)
+                positions = np.vstack([still.position, now.position])
+                move_ghosts(self.ghosts[name], Pose(positions, np.vstack([still.quaternion, now.quaternion])))
         self._pusher.position = between(future.pusher[0], step)
 
     def _copies(self, name: str) -> viser.BatchedMeshHandle:
         """Ghosts of one object: on the way, at the end, and the one that goes."""
-        vertices, faces = mesh_of(self._library, name, _CELLS)
         count = ON_THE_WAY + 2
-        return self._scene.add_batched_meshes_simple(
+        return add_ghosts(
+            self._scene,
             f"{self._root}/{name}",
-            vertices,
-            faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            np.tile([0.0, 0.0, -1.0], (count, 1)),
+            mesh_of(self._library, name, _CELLS),
+            below_table(count),
             batched_scales=np.full(count, _SCALE),
             batched_colors=self._colour,
             batched_opacities=np.array([*[_PALE] * ON_THE_WAY, 1.0, 1.0]),
             opacity=_OPACITY,
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
         )
 
 

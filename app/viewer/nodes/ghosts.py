@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
+import viser
 from jaxtyping import Float, Int
 
 from osfcore.errors import OsfError
@@ -18,6 +20,18 @@ _UNKNOWN_M = 0.05
 _MOVED_M, _TURNED = 5e-4, 1e-3
 _log = logging.getLogger(__name__)
 Mesh = tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]
+
+
+class GhostStyle(TypedDict, total=False):
+    """Arguments of viser's `add_batched_meshes_simple` that differ among copies of meshes."""
+
+    batched_scales: Float[np.ndarray, "N"]
+    batched_colors: tuple[int, int, int]
+    batched_opacities: Float[np.ndarray, "N"]
+    opacity: float
+    wireframe: bool
+    side: Literal["front", "double"]
+    visible: bool
 
 
 def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], cells: int = CELLS) -> Mesh:
@@ -60,6 +74,36 @@ def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
         _log.info("%s is drawn as a cube: %s", name, error)
         return box(_UNKNOWN_M)
     return coarse(mesh.vertices, mesh.faces, cells)
+
+
+def add_ghosts(
+    scene: viser.SceneApi, path: str, mesh: Mesh, poses: Pose, **style: Unpack[GhostStyle]
+) -> viser.BatchedMeshHandle:
+    """A node with translucent copies of a mesh, which cast no shadows.
+
+    Args:
+        scene: to draw in.
+        path: of the node.
+        mesh: vertices [m] and faces.
+        poses: of the copies, a batch (N,).
+        style: how the copies look.
+    """
+    vertices, faces = mesh
+    turns, places = poses.quaternion.astype(np.float32), poses.position.astype(np.float32)
+    return scene.add_batched_meshes_simple(
+        path, vertices, faces, turns, places, lod="off", cast_shadow=False, receive_shadow=False, **style
+    )
+
+
+def move_ghosts(node: viser.BatchedMeshHandle, poses: Pose) -> None:
+    """Move the copies of a node to a batch of poses (N,)."""
+    node.batched_positions = poses.position.astype(np.float32)
+    node.batched_wxyzs = poses.quaternion.astype(np.float32)
+
+
+def below_table(count: int) -> Pose:
+    """A batch of poses out of sight, for copies that have no place yet."""
+    return Pose(np.tile([0.0, 0.0, -1.0], (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
 
 def box(side_m: float) -> Mesh:

@@ -10,7 +10,7 @@ import viser
 from jaxtyping import Float
 
 from app.viewer.nodes.atomic import atomic
-from app.viewer.nodes.ghosts import Mesh, between, mesh_of, moves, pose_at, top_m, way_of
+from app.viewer.nodes.ghosts import Mesh, add_ghosts, between, mesh_of, move_ghosts, moves, pose_at, top_m, way_of
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
@@ -121,19 +121,9 @@ class PushNodes:
         return self._way(name, poses)
 
     def _copies(self, path: str, mesh: Mesh, poses: Pose, opacity: float, scale: float) -> viser.BatchedMeshHandle:
-        vertices, faces = mesh
-        return self._scene.add_batched_meshes_simple(
-            path,
-            vertices,
-            faces,
-            poses.quaternion.astype(np.float32),
-            poses.position.astype(np.float32),
-            batched_scales=np.full(len(poses.position), scale),
-            batched_colors=PREDICTED,
-            opacity=opacity,
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
+        scales = np.full(len(poses.position), scale)
+        return add_ghosts(
+            self._scene, path, mesh, poses, batched_scales=scales, batched_colors=PREDICTED, opacity=opacity
         )
 
     def _at(self, step: float) -> None:
@@ -142,8 +132,7 @@ class PushNodes:
         self._step = step
         for name, node in self._ghosts.items():
             pose = pose_at(way_of(self._rollouts, self._rollouts.names.index(name)), step)
-            node.batched_positions = pose.position[None].astype(np.float32)
-            node.batched_wxyzs = pose.quaternion[None].astype(np.float32)
+            move_ghosts(node, Pose(pose.position[None], pose.quaternion[None]))
         self._pusher.position = between(self._rollouts.pusher[0], step)
 
     def _way(self, name: str, poses: Pose) -> np.ndarray:
