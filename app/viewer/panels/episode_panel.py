@@ -20,7 +20,7 @@ from app.services.episodes import KIND
 from app.services.goals import DraftChanged
 from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
 from app.viewer.nodes.scene_nodes import SceneNodes
-from app.viewer.panels.panel import RunCommand, ThreadedPanel
+from app.viewer.panels.panel import Panel, RunCommand
 from app.viewer.panels.status_line import status
 from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
 from osfcore.estimation.steps import EstimateStep
@@ -112,7 +112,7 @@ class _EpisodeState:
                 return self
 
 
-class EpisodePanel(ThreadedPanel):
+class EpisodePanel(Panel):
     """The folder and the nodes of episodes; the same in all browsers.
 
     Args:

@@ -24,7 +24,7 @@ from app.services.estimates import KIND, Asked, Estimates
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.loss_curves import LossCurves
-from app.viewer.panels.panel import RunCommand, ThreadedPanel
+from app.viewer.panels.panel import Panel, RunCommand
 from osfcore.errors import OsfError
 from osfcore.estimation.steps import EstimateStep
 
@@ -35,7 +35,7 @@ _NO_PICTURE = np.full((32, 64, 3), 235, np.uint8)
 _IDLE = "Not asked yet"
 
 
-class EstimatePanel(ThreadedPanel):
+class EstimatePanel(Panel):
     """The folder and the nodes of estimates; the same in all browsers.
 
     Args:

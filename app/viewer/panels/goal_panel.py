@@ -22,7 +22,7 @@ from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.scene_nodes import NO_TURN, Client
-from app.viewer.panels.panel import RunCommand, ThreadedPanel
+from app.viewer.panels.panel import Panel, RunCommand
 from app.viewer.panels.status_line import status
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose, quaternion_multiply
@@ -69,7 +69,7 @@ class Drafts(Protocol):
         ...
 
 
-class GoalPanel(ThreadedPanel):
+class GoalPanel(Panel):
     """The folder and the nodes of a goal that is being composed; the same in all browsers.
 
     Args:

@@ -14,7 +14,7 @@ import viser
 from app.processes.neural_client import Answer, NeuralLink
 from app.processes.neural_messages import DrawnView, DrawView
 from app.processes.render_cameras import view_camera
-from app.viewer.panels.panel import ThreadedPanel
+from app.viewer.panels.panel import Panel
 from app.viewer.panels.refinement import STEPS, Refinement, RenderTicket
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
@@ -137,7 +137,7 @@ class ClientView:
             self._hidden[path] = self.client.scene.add_frame(path, show_axes=False, visible=False)
 
 
-class NeuralPanel(ThreadedPanel):
+class NeuralPanel(Panel):
     """The views of all browsers, and the thread that requests and shows their pictures.
 
     Args:

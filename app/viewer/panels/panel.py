@@ -1,10 +1,9 @@
-"""What the viewer asks of each of its panels, and the base of those that draw in a thread of their own."""
+"""The base of the viewer's panels: what the viewer calls, and the thread in which they draw."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
 
 import viser
 
@@ -15,32 +14,8 @@ from app.viewer.nodes.scene_nodes import Client
 RunCommand = Callable[[Callable[[], object], Client], None]
 
 
-class Panel(Protocol):
-    """One part of the view: its controls, and the nodes that it draws."""
-
-    def start(self, record: SceneRecord | None) -> None:
-        """Begin to draw, with the scene on view."""
-        ...
-
-    def show(self, event: object) -> None:
-        """Draw what an event tells, soon; events of other kinds are ignored. Any thread may call."""
-        ...
-
-    def add_client(self, client: viser.ClientHandle) -> None:
-        """A browser has connected."""
-        ...
-
-    def remove_client(self, client: viser.ClientHandle) -> None:
-        """A browser has disconnected."""
-        ...
-
-    def close(self) -> None:
-        """Draw no more. Calling it again does nothing."""
-        ...
-
-
-class ThreadedPanel(ABC):
-    """A panel that stores events as they come and draws the newest state in a thread.
+class Panel(ABC):
+    """A folder of controls and the nodes it draws: stores events as they come, and draws the newest state in a thread.
 
     Args:
         name: of the thread, for logs.

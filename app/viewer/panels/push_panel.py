@@ -21,7 +21,7 @@ from app.services.predictions import Predictions
 from app.services.pushes import outcomes
 from app.viewer.nodes.push_nodes import PushNodes
 from app.viewer.nodes.scene_nodes import Client
-from app.viewer.panels.panel import RunCommand, ThreadedPanel
+from app.viewer.panels.panel import Panel, RunCommand
 from app.viewer.panels.push_controls import PushControls
 from app.viewer.panels.push_player import TICK_S, PushPlayer
 from app.viewer.panels.push_prediction import PushPrediction
@@ -53,7 +53,7 @@ class _Request:
     answer: Future[Answer]
 
 
-class PushPanel(ThreadedPanel):
+class PushPanel(Panel):
     """The folder and the nodes of predicted pushes; the same in all browsers.
 
     Args:
