@@ -1,4 +1,4 @@
-"""The README's commands work as they stand."""
+"""The commands and programs of README and docs work as they stand."""
 
 import json
 import os
@@ -15,18 +15,22 @@ import trimesh
 from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
 from tests.live import live_service
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+GUIDES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("command-line", "rest", "own-objects"))]
 OSF = Path(sys.executable).with_name("osf")
 
 
 def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+    """Blocks of code of all guides, in the order in which they build on each other."""
+    text = "".join(guide.read_text() for guide in GUIDES)
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
 def test_make_targets_exist():
     targets = [line.split()[1] for block in blocks("sh") for line in block.splitlines() if line.startswith("make ")]
     assert {"demo", "test"} <= set(targets)
-    for target in {*targets, *re.findall(r"`make (\w+)`", README)}:
+    for target in {*targets, *re.findall(r"`make ([\w-]+)`", README)}:
         done = subprocess.run(["make", "-n", target], cwd=Path(__file__).parents[1], capture_output=True, check=False)
         assert done.returncode == 0, target
 
@@ -111,6 +115,11 @@ def test_an_observation_is_sent_as_written(data_dir, tmp_path, seen):
     assert [estimate["id"] for estimate in listed["estimates"]] == [sent["id"]]
 
 
-@pytest.mark.parametrize("link", re.findall(r"\]\(([^)#:]+)\)", README))
-def test_links_lead_somewhere(link):
-    assert (Path(__file__).parents[1] / link).exists()
+@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")], ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+        assert (page.parent / link).exists(), link
+
+
+def test_the_readme_is_short():
+    assert len(README.split()) <= 900

@@ -1,0 +1,24 @@
+import subprocess
+import sys
+
+import pytest
+
+import osfcore
+
+
+def test_every_public_name_is_there():
+    assert len(osfcore.__all__) <= 25
+    for name in osfcore.__all__:
+        assert getattr(osfcore, name).__name__ == name
+    assert set(dir(osfcore)) == set(osfcore.__all__)
+
+
+def test_an_unknown_name_is_told_with_the_known_ones():
+    with pytest.raises(AttributeError, match=r"Teapot.*SceneRenderer"):
+        getattr(osfcore, "Teapot")  # noqa: B009
+
+
+def test_the_library_is_imported_at_once():
+    code = "import sys, osfcore; print(*(m for m in ('torch', 'numba', 'pybullet', 'cma') if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
