@@ -1,0 +1,41 @@
+"""Algorithm 1 in the simulator: look, estimate, plan, push, look again. Needs meshes: run `osf assets fetch` first."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from osfcore import AssetLibrary, Episode, FieldLibrary, GoalImage, Tabletop, goal_camera, knowledge_of
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.world.goal_layouts import random_goal
+from osfcore.world.tabletop import SceneRequest
+
+NAMES = ("005_tomato_soup_can", "009_gelatin_box")
+
+
+def main(objects: Path, steps: int = 20) -> None:
+    """One object of two is brought to where a goal image shows it.
+
+    Args:
+        objects: the folder where `osf assets fetch` has put the objects.
+        steps: most pushes.
+    """
+    assets, rng = AssetLibrary(objects), np.random.default_rng(0)
+    world = Tabletop(assets, request=SceneRequest(names=NAMES))
+    world.arrange(1)
+    start, camera = world.truth(), goal_camera()
+    random_goal(world, seed=1, moved=1)
+    goal = GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
+    world.restore(start)
+    knowledge = knowledge_of(NAMES, FieldLibrary(None), assets, None)
+    settings = EpisodeSettings(steps=steps, despite_doubts=True)
+    for event in Episode(world, knowledge, goal, settings, rng).run():
+        if type(event).__name__ not in ("Looking", "Planning"):
+            print(type(event).__name__, getattr(event, "text", ""))
+    world.close()
+
+
+if __name__ == "__main__":
+    from app.storage.paths import default_data_dir
+
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else default_data_dir() / "objects")

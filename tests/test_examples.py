@@ -1,0 +1,40 @@
+"""Each example runs as it stands, and tells something."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+WORDS = {
+    "render": "one table under four lights",
+    "estimate": "light: 0.",
+    "predict": "past everything: 005_tomato_soup_can 0 mm",
+    "plan": "after 12 actions",
+}
+
+
+def run(name, place, *arguments):
+    program = str(EXAMPLES / f"{name}.py")
+    done = subprocess.run([sys.executable, program, *arguments], cwd=place, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-500:]
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WORDS)
+def test_examples_that_need_no_meshes(name, tmp_path):
+    assert WORDS[name] in run(name, tmp_path)
+    if name == "render":
+        assert (tmp_path / "relit.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_an_episode(library, tmp_path):
+    assert "Finished" in run("episode", tmp_path, str(library.root))
+
+
+def test_examples_are_short():
+    for path in EXAMPLES.glob("*.py"):
+        assert len(path.read_text().splitlines()) <= 80, path.name
