@@ -44,8 +44,9 @@ from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
 from app.api.security import BodyLimitMiddleware, SecurityMiddleware
 from app.api.token_gate import TokenMiddleware
-from app.processes.neural_client import NeuralLink
-from app.processes.predict_process import WHO, predictor_main
+from app.processes.predict_process import predictor_main
+from app.processes.process_client import ProcessClient
+from app.processes.render_process import renderer_main
 from app.services.driver import Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
@@ -118,13 +119,13 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         runner = Runner(settings, store, AssetLibrary(settings.data_dir / "objects"))
         stack.push_async_callback(run_in_threadpool, runner.stop)
         await run_in_threadpool(runner.start)
-        neural = NeuralLink(settings.data_dir)
+        neural = ProcessClient(renderer_main, (settings.data_dir,), "neural renderer")
         stack.push_async_callback(run_in_threadpool, neural.stop)
         shelf = Shelf(runner.library)
         fields = FieldCatalogue(settings.data_dir, shelf.names)
         found = Estimates(runner, fields)
         stack.push_async_callback(run_in_threadpool, found.stop)
-        predictor = NeuralLink(settings.data_dir, predictor_main, WHO)
+        predictor = ProcessClient(predictor_main, (settings.data_dir,), "predictor of pushes")
         stack.push_async_callback(run_in_threadpool, predictor.stop)
         predicted = Predictions(runner, fields.names, predictor)
         wanted = Goals(runner, settings.data_dir, settings.max_goals)

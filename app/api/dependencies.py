@@ -11,8 +11,8 @@ from fastapi import Depends
 from starlette.requests import HTTPConnection
 
 from app.api.schemas.common import SceneOut
-from app.processes.messages import SceneRecord
-from app.processes.neural_client import NeuralLink
+from app.processes.process_client import ProcessClient
+from app.processes.scene_messages import SceneRecord
 from app.services.driver import Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
@@ -73,7 +73,7 @@ class Services:
     viewer: Viewer
     shelf: Shelf
     fields: FieldCatalogue
-    neural: NeuralLink
+    neural: ProcessClient
     estimates: Estimates
     predictions: Predictions
     goals: Goals

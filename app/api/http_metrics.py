@@ -55,7 +55,7 @@ class _State(Collector):
         for name, text, value in (
             ("osf_uptime_seconds", "Since the service was started.", runner.uptime_s),
             ("osf_scenes", "Scenes that are kept.", len(runner.scenes())),
-            ("osf_stage_ready", "1 while the simulation takes commands.", runner.stage_status == "ready"),
+            ("osf_stage_ready", "1 while the simulation takes commands.", runner.simulation_status == "ready"),
         ):
             yield GaugeMetricFamily(name, text, value=float(value))
         jobs = GaugeMetricFamily("osf_jobs", "Jobs by kind and state.", labels=("kind", "state"))

@@ -33,14 +33,14 @@ STATUS_OF_KIND = {
     "NoPrior": 409,
     "NoImages": 404,
     "QueueFull": 429,
-    "StageUnavailable": 503,
-    "StageBusy": 503,
-    "NeuralUnavailable": 503,
-    "NeuralBusy": 503,
+    "ProcessUnavailable": 503,
+    "ProcessHangs": 503,
+    "ProcessBusy": 503,
     "CannotStore": 507,
+    "UploadNotStored": 507,
     "CannotWrite": 507,
     "CorruptFile": 409,
-    "Internal": 500,
+    "InternalError": 500,
     "NotFound": 404,
 }
 _TITLES = {
@@ -86,7 +86,7 @@ def problem(
 
 def status_of(error: OsfError) -> int:
     """The HTTP status that says what an error says."""
-    return STATUS_OF_KIND.get(getattr(error, "kind", type(error).__name__), 422)
+    return STATUS_OF_KIND.get(type(error).__name__, 422)
 
 
 def install(app: FastAPI) -> None:

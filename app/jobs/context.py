@@ -7,23 +7,12 @@ import dataclasses
 import queue
 import threading
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from app.processes.messages import (
-    Act,
-    AskStage,
-    CancelJob,
-    ChangeJob,
-    Failure,
-    ObserveScene,
-    PauseJob,
-    Reply,
-    ResumeJob,
-    StepJob,
-    TakeView,
-)
+from app.processes.job_messages import CancelJob, ChangeJob, PauseJob, ResumeJob, SceneCommand, StepJob
+from app.processes.process_server import Answer
+from app.processes.scene_messages import Act, ObserveScene, TakeView
 from osfcore.objects.asset_library import AssetLibrary
 
 
@@ -48,18 +37,25 @@ class JobContext:
 
 
 class JobControl:
-    """Listens on the pipe in a thread of its own, so that an order counts even during a long step."""
+    """Orders that come while a job works, taken from the receiving thread so that they count even in a long step.
 
-    def __init__(self, connection: Connection, on_lost: Callable[[], None]) -> None:
-        self._connection = connection
-        self._on_lost = on_lost
+    Args:
+        send: takes messages to the service.
+    """
+
+    def __init__(self, send: Callable[[object], None]) -> None:
+        self._send = send
         self._may_run = threading.Event()
         self._may_run.set()
         self._is_cancelled = threading.Event()
         self._rests_after_round = threading.Event()
-        self._answers: queue.SimpleQueue[Reply | Failure] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._changes: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        threading.Thread(target=self._listen, name="orders", daemon=True).start()
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether the job rests after its current step."""
+        return not self._may_run.is_set()
 
     def must_stop(self) -> bool:
         """Whether the job was cancelled; waits here while it is paused."""
@@ -76,47 +72,39 @@ class JobControl:
 
     def changes(self) -> list[dict[str, Any]]:
         """Parameters that were sent since the last call, the latest last."""
-        found = []
+        changes = []
         with contextlib.suppress(queue.Empty):
             while True:
-                found.append(self._changes.get_nowait())
-        return found
+                changes.append(self._changes.get_nowait())
+        return changes
 
     def ask(self, command: Act | ObserveScene | TakeView) -> Any:  # noqa: ANN401  each command says what answers it
         """Have something done with the scene that this job drives, and wait for the answer.
 
         Raises:
-            StageError: if the stage refused it, or is not there.
+            OsfError: what the simulation raised, or ProcessUnavailable if it is not there now.
         """
-        from app.processes.sim_client import StageError
-
-        self._connection.send(AskStage(command))
+        self._send(SceneCommand(command))
         answer = self._answers.get()
-        if isinstance(answer, Failure):
-            raise StageError(answer.kind, answer.text)
+        if answer.error is not None:
+            raise answer.error
         return answer.value
 
-    def _listen(self) -> None:
-        while True:
-            try:
-                order = self._connection.recv()
-            except (EOFError, OSError):
-                # The service died: nobody wants the result, and what is half-written counts as never begun.
-                self._on_lost()
-                return
-            match order:
-                case PauseJob():
-                    self._may_run.clear()
-                case ResumeJob():
-                    self._rests_after_round.clear()
-                    self._may_run.set()
-                case StepJob():
-                    self._rests_after_round.set()
-                    self._may_run.set()
-                case ChangeJob(params):
-                    self._changes.put(params)
-                case Reply() | Failure():
-                    self._answers.put(order)
-                case CancelJob():
-                    self._is_cancelled.set()
-                    self._may_run.set()
+    def take(self, order: object) -> None:
+        """Take an order, or the answer to `ask`."""
+        match order:
+            case PauseJob():
+                self._may_run.clear()
+            case ResumeJob():
+                self._rests_after_round.clear()
+                self._may_run.set()
+            case StepJob():
+                self._rests_after_round.set()
+                self._may_run.set()
+            case ChangeJob(params):
+                self._changes.put(params)
+            case CancelJob():
+                self._is_cancelled.set()
+                self._may_run.set()
+            case Answer():
+                self._answers.put(order)

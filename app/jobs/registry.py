@@ -13,40 +13,31 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.clock import JobClock
-from app.jobs.context import JobContext
 from app.jobs.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended, job_fields, job_from_fields
-from app.jobs.outcomes import DIED, STOPPED, after
-from app.jobs.worker import job_main
-from app.processes.child_process import end, launch
-from app.processes.messages import (
-    AskStage,
-    CancelJob,
+from app.jobs.job_process import JobProcess
+from app.jobs.outcomes import JobStopped, Outcome, after
+from app.processes.job_messages import (
     ChangeJob,
-    Command,
-    Failure,
     JobCancelled,
-    JobDone,
     JobRests,
     JobStep,
     PauseJob,
-    Reply,
     ResumeJob,
+    SceneCommand,
     StepJob,
 )
+from app.processes.process_server import Answer
+from app.processes.scene_messages import Command
 from app.storage.database import CannotStore, Store, now_utc
 from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
 
 _TEMPORARY_PREFIX = ".new-"
 _ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
-_LOOK_INTERVAL_S = 0.2
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
 _log = logging.getLogger(__name__)
 
@@ -56,17 +47,6 @@ class QueueFull(OsfError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"{limit} jobs are waiting already, which is the most; wait for one or cancel one.")
-
-
-@dataclass
-class _Run:
-    """The one job that has a process."""
-
-    id: str
-    process: SpawnProcess
-    connection: Connection
-    clock: JobClock
-    cancel_at: float | None = None  # when patience with a cancelled job ends
 
 
 class Jobs:
@@ -79,6 +59,7 @@ class Jobs:
         max_queued: how many may wait.
         cancel_grace_s: how long a cancelled job may take to stop by itself.
         serve: carries out what a job asks for with the scene that it drives.
+        start_process: of a job, its data directory, its folder and what takes its events.
     """
 
     def __init__(
@@ -89,6 +70,7 @@ class Jobs:
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
+        start_process: Callable[[Job, Path, Path, Callable[[object], None]], JobProcess] = JobProcess,
     ) -> None:
         self._store = store
         self._data_dir = data_dir
@@ -97,10 +79,11 @@ class Jobs:
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
         self._serve = serve
+        self._start_process = start_process
         self._changed = threading.Condition(threading.RLock())
         self._jobs: dict[str, Job] = {}
         self._numbers: dict[str, int] = {}
-        self._run: _Run | None = None
+        self._run: JobProcess | None = None
         self._is_stopping = False
         self._last_event = 0.0
         self._untold: Job | None = None  # the latest progress, if it came too soon after the one before
@@ -115,7 +98,7 @@ class Jobs:
             self._jobs[job.id], self._numbers[job.id] = job, number
         for job in list(self._jobs.values()):
             if job.state in ("running", "paused"):
-                self._set(after(job, STOPPED, self.folder(job.id)))
+                self._set(after(job, JobStopped(), self.folder(job.id)))
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
@@ -213,10 +196,8 @@ class Jobs:
                 self._set(ended(self._jobs[job], "cancelled", note="Cancelled"))
                 self._tell_queue()
                 return self.get(job)
-            if self._run is not None and self._run.cancel_at is None:
-                grace_s = 0.0 if found.kind in _ENDED_AT_ONCE else self._cancel_grace_s
-                self._run.cancel_at = time.monotonic() + grace_s
-                self._order(CancelJob())
+            if self._run is not None:
+                self._run.cancel(0.0 if found.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
             self._changed.wait_for(lambda: self._jobs[job].is_finished, wait_s)
             return self.get(job)
 
@@ -256,18 +237,18 @@ class Jobs:
         """
         with self._changed:
             found = self.get(job)
-            if found.state not in ("running", "paused") or self._run is None or self._run.cancel_at is not None:
+            if found.state not in ("running", "paused") or self._run is None or self._run.is_cancelled:
                 raise WrongJobState(found, "changed")
-            self._order(ChangeJob(params))
+            self._run.order(ChangeJob(params))
             self._set(replace(self._jobs[job], params={**found.params, **params}))
             return self.get(job)
 
     def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
         with self._changed:
             found = self.get(job)
-            if found.state != before or self._run is None or self._run.cancel_at is not None:
+            if found.state != before or self._run is None or self._run.is_cancelled:
                 raise WrongJobState(found, "paused" if after == "paused" else "resumed")
-            self._order(order)
+            self._run.order(order)
             self._run.clock.switch(is_running=after == "running")
             self._set(replace(self._jobs[job], state=after, eta_s=None))
             return self.get(job)
@@ -292,10 +273,7 @@ class Jobs:
         folder = self.folder(job.id)
         if job.kind != "fetch_assets":
             folder.mkdir(parents=True, exist_ok=True)
-        process, connection = launch(
-            job_main, f"osf-job-{job.id}", job.kind, job.params, JobContext(self._data_dir, folder)
-        )
-        self._run = _Run(job.id, process, connection, JobClock())
+        self._run = self._start_process(job, self._data_dir, folder, self._on_event)
         self._set(replace(job, state="running", started_at=now_utc(), note="Starting"))
         self._tell_queue()
 
@@ -303,40 +281,20 @@ class Jobs:
         """Follow the running job until its process has ended."""
         run = self._run
         assert run is not None
-        outcome: object = None
+        outcome: Outcome | None = None
         while outcome is None:
-            if wait([run.connection], _LOOK_INTERVAL_S if run.cancel_at is None else 0.05):
-                try:
-                    message = run.connection.recv()
-                except (EOFError, OSError):
-                    outcome = DIED
-                    break
-                if isinstance(message, JobStep):
-                    self._progress(message)
-                    if message.seen is not None:
-                        self._publish(JobSeen(self._jobs[run.id], message.seen))
-                elif isinstance(message, AskStage):
-                    self._answer(run, message)
-                elif isinstance(message, JobRests):
-                    self._rest(run)
-                else:
-                    outcome = message
+            outcome = run.wait()
             with self._changed:
-                if outcome is not None:
-                    break
-                if self._untold is not None:
+                if outcome is None and self._untold is not None:
                     self._set(self._untold, is_progress=True)
-                if self._is_stopping:
-                    outcome = STOPPED
-                elif run.cancel_at is not None and time.monotonic() > run.cancel_at:
-                    outcome = JobCancelled()
-        end(run.process, 0.0 if isinstance(outcome, Failure | JobCancelled) else 1.0)
-        run.connection.close()
+                if outcome is None and self._is_stopping:
+                    outcome = JobStopped()
+        run.end()
         self._finish(run, outcome)
 
-    def _finish(self, run: _Run, outcome: object) -> None:
+    def _finish(self, run: JobProcess, outcome: Outcome) -> None:
         job = self._jobs[run.id]
-        if run.cancel_at is not None and not isinstance(outcome, JobDone):
+        if run.is_cancelled and not isinstance(outcome, dict):
             outcome = JobCancelled()  # whatever ended it first, it was asked to
         then = after(job, outcome, self.folder(job.id))
         if then.state == "cancelled":
@@ -346,39 +304,45 @@ class Jobs:
             self._set(then)
             self._changed.notify_all()
 
-    def _progress(self, step: JobStep) -> None:
-        with self._changed:
+    def _on_event(self, event: object) -> None:
+        """Take what the running job tells, in the thread that listens to it."""
+        with self._changed:  # until it has been noted which job that is
             run = self._run
-            assert run is not None
+        assert run is not None
+        match event:
+            case JobStep():
+                self._progress(run, event)
+            case SceneCommand():
+                self._answer(run, event)
+            case JobRests():
+                self._rest(run)
+
+    def _progress(self, run: JobProcess, step: JobStep) -> None:
+        with self._changed:
             eta_s = run.clock.left_s(step.done, step.total)
             job = self._jobs[run.id]
             result = step.result or None
             job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
             self._set(job, is_progress=True)
+        if step.seen is not None:
+            self._publish(JobSeen(job, step.seen))
 
-    def _answer(self, run: _Run, asked: AskStage) -> None:
+    def _answer(self, run: JobProcess, asked: SceneCommand) -> None:
         """Carry out what a job asks for, with the scene that it drives and no other."""
         scene = self._jobs[run.id].params.get("scene")
         try:
             if self._serve is None or asked.command.id != scene:
                 raise UnknownName("scene of this job", asked.command.id, [str(scene)])
-            answer: Reply | Failure = Reply(0, self._serve(asked.command))
+            answer = Answer(0, self._serve(asked.command))
         except OsfError as error:
-            answer = Failure.of(error)
-        self._order(answer)
+            answer = Answer(0, error=error)
+        run.order(answer)
 
-    def _rest(self, run: _Run) -> None:
+    def _rest(self, run: JobProcess) -> None:
         """The job has come to the end of a round, and waits."""
         with self._changed:
             run.clock.switch(is_running=False)
             self._set(replace(self._jobs[run.id], state="paused", eta_s=None))
-
-    def _order(self, order: PauseJob | ResumeJob | StepJob | ChangeJob | CancelJob | Reply | Failure) -> None:
-        assert self._run is not None
-        try:
-            self._run.connection.send(order)
-        except OSError:  # it has just ended; the working thread will see that
-            _log.info("job %s ended before it could be told %s", self._run.id, type(order).__name__)
 
     # State
 

@@ -4,28 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import logging
-import signal
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from app.jobs.context import JobContext, JobControl
-from app.processes.child_process import end_own_group, import_quietly, own_group, silence_stdout
-from app.processes.messages import (
-    Failure,
-    JobCancelled,
-    JobDone,
-    JobRests,
-    JobStep,
-)
-from osfcore.errors import OsfError
+from app.processes.child_process import end_own_group, import_quietly, own_group
+from app.processes.job_messages import JobCancelled, JobRests, JobStep, RunJob
+from app.processes.process_server import ProcessServer
 
-STEP_INTERVAL_S = 0.1  # steps that come faster are not told one by one
-_log = logging.getLogger(__name__)
+STEP_INTERVAL_S = 0.1
 
 
 def _collect_pushes(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
@@ -89,42 +79,48 @@ _WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
 _NOT_EXTRA = ("done", "total", "note", "seen")
 
 
-def job_main(connection: Connection, kind: str, params: dict[str, Any], place: JobContext) -> None:
-    """Run a job to its end and tell how it went."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
+def job_main(server: ProcessServer) -> None:
+    """Do the job that is asked for."""
     own_group()
-    silence_stdout()
-    orders = JobControl(connection, on_lost=end_own_group)
-    if kind not in _WITHOUT_PHYSICS:
+    control = JobControl(server.send)
+    # A service that died leaves nobody who wants the result, and what is half-written counts as never begun.
+    server.serve(lambda job, _: run_job(job, control, server.send), on_message=control.take, on_lost=end_own_group)
+
+
+def run_job(
+    job: RunJob, control: JobControl, send: Callable[[object], None], step_interval_s: float = STEP_INTERVAL_S
+) -> dict[str, Any] | JobCancelled:
+    """Do a job and tell of its steps.
+
+    Args:
+        job: what to do.
+        control: orders that come meanwhile.
+        send: takes JobStep and JobRests.
+        step_interval_s: steps that come faster are not told one by one [s].
+
+    Returns:
+        What the last step told, or that the job was cancelled.
+
+    Raises:
+        OsfError: if the job cannot be done.
+    """
+    if job.kind not in _WITHOUT_PHYSICS:
         import_quietly("osfcore.world.tabletop")
-    with contextlib.suppress(OSError):  # the web process has gone
-        connection.send(_run(connection, orders, kind, params, place))
-
-
-def _run(connection: Connection, orders: JobControl, kind: str, params: dict[str, Any], place: JobContext) -> object:
     result: dict[str, Any] = {}
     last = 0.0
-    try:
-        place = dataclasses.replace(place, orders=orders)
-        with contextlib.closing(KINDS[kind](params, place)) as steps:  # pyright: ignore[reportArgumentType]
-            for step in steps:
-                result = _extras(step)
-                now = time.monotonic()
-                if now - last >= STEP_INTERVAL_S or step.done == step.total or getattr(step, "must_be_told", False):
-                    connection.send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
-                    last = now
-                if getattr(step, "ends_round", False) and orders.rests_now():
-                    connection.send(JobRests())
-                if orders.must_stop():
-                    return JobCancelled()
-    except OsfError as error:
-        return Failure.of(error)
-    except MemoryError:
-        return Failure(0, "OutOfMemory", "The job ran out of memory; take fewer or smaller images.")
-    except Exception as error:
-        _log.exception("a %s job failed", kind)
-        return Failure(0, "Internal", f"The job failed ({type(error).__name__}); the service's log tells more.")
-    return JobDone(result)
+    context = JobContext(job.data_dir, job.folder, control)
+    with contextlib.closing(KINDS[job.kind](job.params, context)) as steps:  # pyright: ignore[reportArgumentType]
+        for step in steps:
+            result = _extras(step)
+            now = time.monotonic()
+            if now - last >= step_interval_s or step.done == step.total or getattr(step, "must_be_told", False):
+                send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
+                last = now
+            if getattr(step, "ends_round", False) and control.rests_now():
+                send(JobRests())
+            if control.must_stop():
+                return JobCancelled()
+    return result
 
 
 def _extras(step: object) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Messages between the web process and processes with neural models; answers are those of `processes.messages`."""
+"""Orders to the processes with neural models, and what answers them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -27,6 +28,11 @@ class DrawView:
     state: SceneState
     camera: Camera
     is_sharp: bool
+
+    @property
+    def patience(self) -> int:
+        """Views that move are drawn before comparisons, views that rest after them."""
+        return 2 if self.is_sharp else 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -57,6 +63,7 @@ class CompareView:
     state: SceneState
     camera: Camera
     observed: bytes
+    patience: ClassVar[int] = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +114,4 @@ class Predicted:
 
 
 Order = DrawView | CompareView | PredictPushes
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class NumberedOrder:
-    """An order with the number under which it is answered."""
-
-    number: int
-    order: Order
+NeuralAnswer = DrawnView | Comparison | Predicted | None

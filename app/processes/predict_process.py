@@ -8,31 +8,28 @@ from __future__ import annotations
 import os
 import time
 from collections import OrderedDict
-from collections.abc import Callable
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from app.processes.neural_messages import Order, Predicted, PredictPushes
-from app.processes.render_process import serve
+from app.processes.process_server import IsOvertaken, ProcessServer
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
 
 if TYPE_CHECKING:
     from osfcore.dynamics.rollout import PushModel
 
-WHO = "predictor of pushes"
 _MOST_MODELS = 8
 
 
-def predictor_main(connection: Connection, data_dir: Path) -> None:
-    """Serve orders until the other end is gone."""
-    serve(connection, Oracle(data_dir).answer, WHO)
+def predictor_main(server: ProcessServer, data_dir: Path) -> None:
+    """Carry out orders until the service has gone."""
+    server.serve(PushPredictor(data_dir).answer)
 
 
-class Oracle:
+class PushPredictor:
     """Predicts; keeps the models of the latest sets of objects, and loads one again when one of its files has changed.
 
     Args:
@@ -44,7 +41,7 @@ class Oracle:
         self._fields = FieldLibrary(data_dir)
         self._models: OrderedDict[object, PushModel] = OrderedDict()
 
-    def answer(self, order: Order, is_overtaken: Callable[[], bool] = lambda: False) -> Predicted | None:
+    def answer(self, order: Order, is_overtaken: IsOvertaken = lambda: False) -> Predicted | None:
         """What answers an order; None if nobody waits for it any more.
 
         Raises:

@@ -1,51 +1,71 @@
-"""Orders that wait to be carried out: of one visitor only the newest, quick ones first."""
+"""Requests that wait in a child process: the newest of each key only, the most urgent first."""
 
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
+from typing import Any
 
-from app.processes.neural_messages import CompareView, DrawView, NumberedOrder
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Request:
+    """A command and the number of its answer; 0 if nobody waits for one.
+
+    A command with an attribute `key` replaces a waiting one of the same key. Among commands with an attribute
+    `patience`, smaller values are carried out first; all others count as 0.
+    """
+
+    number: int
+    command: Any
+
+    @property
+    def key(self) -> object:
+        """Requests of equal keys replace each other."""
+        return getattr(self.command, "key", id(self))
 
 
-class Inbox:
-    """Filled by the thread that listens, emptied by the one that carries out."""
+class RequestQueue:
+    """Filled by the thread that receives, emptied by the one that works."""
 
     def __init__(self) -> None:
-        self._waiting: dict[str, NumberedOrder] = {}
+        self._waiting: dict[object, Request] = {}
         self._changed = threading.Condition()
         self._is_closed = False
 
-    def put(self, order: NumberedOrder) -> NumberedOrder | None:
-        """Let an order wait; returns the one that it overtakes, if there is one."""
+    def put(self, request: Request) -> Request | None:
+        """Append a request; returns the one that it replaces, if there is one."""
         with self._changed:
-            overtaken = self._waiting.get(order.order.key)
-            self._waiting[order.order.key] = order  # keeps its place in line
+            replaced = self._waiting.get(request.key)
+            self._waiting[request.key] = request  # keeps its place in line
             self._changed.notify()
-            return overtaken
+            return replaced
 
-    def take(self) -> NumberedOrder | None:
-        """The next order, waiting for one if need be; None once the inbox is closed."""
+    def take(self, timeout_s: float | None = None) -> Request | None:
+        """The next request, waited for if need be; None after `timeout_s`, or once the queue is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._is_closed)
-            if self._is_closed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed, timeout_s)
+            if self._is_closed or not self._waiting:
                 return None
-            order = min(self._waiting.values(), key=_patience)  # the first of the least patient
-            return self._waiting.pop(order.order.key)
+            request = min(self._waiting.values(), key=lambda r: getattr(r.command, "patience", 0))
+            return self._waiting.pop(request.key)
 
-    def is_overtaken(self, order: NumberedOrder) -> bool:
-        """Whether nobody waits for an order any more: a newer one of its key is there, or the inbox was closed."""
+    def is_empty(self) -> bool:
+        """Whether nothing waits."""
         with self._changed:
-            return self._is_closed or order.order.key in self._waiting
+            return not self._waiting
+
+    def is_closed(self) -> bool:
+        """Whether the sender has gone."""
+        with self._changed:
+            return self._is_closed
+
+    def is_overtaken(self, request: Request) -> bool:
+        """Whether nobody waits for an answer any more: a newer request of its key is there, or the sender has gone."""
+        with self._changed:
+            return self._is_closed or request.key in self._waiting
 
     def close(self) -> None:
-        """Let whoever waits go."""
+        """Wake whoever waits; there will be no more requests."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
-
-
-def _patience(order: NumberedOrder) -> int:
-    """How long an order can wait: views that move are the least patient, those that rest the most."""
-    if isinstance(order.order, CompareView):
-        return 1
-    return 2 if isinstance(order.order, DrawView) and order.order.is_sharp else 0

@@ -1,26 +1,25 @@
-"""The stage process: holds the simulated scenes, carries out commands, tells what moves and what the cameras see.
+"""The simulation's process: holds the scenes, carries out commands, tells what moves and what the cameras see.
 
-Nothing here is imported by the web process but `stage_main`, by name; physics and ray tracing load in the child only.
+The service imports only `simulation_main`; physics and ray tracing load in the child.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import signal
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.processes.child_process import import_quietly, silence_stdout
-from app.processes.messages import (
+from app.processes.child_process import import_quietly
+from app.processes.process_server import IsOvertaken, ProcessServer
+from app.processes.scene_messages import (
     Act,
     AdoptScene,
     Command,
@@ -29,17 +28,12 @@ from app.processes.messages import (
     CreateScene,
     DropScene,
     EditScene,
-    Failure,
     FramesTaken,
-    Leave,
     ObserveScene,
-    Reply,
-    Request,
     ResetScene,
     SceneChanged,
     SceneRecord,
     ShowScene,
-    StageReady,
     TakeImage,
     TakeMask,
     TakeView,
@@ -51,6 +45,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S, check_action
+from osfcore.io.image_file import encode_jpeg, encode_png, to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 
 if TYPE_CHECKING:
@@ -59,34 +54,34 @@ if TYPE_CHECKING:
 STATES_HZ = 60.0
 FRAME_INTERVAL_S = 0.2
 MAX_FRAME_SIDE = 192  # live images larger than this cost more than they show
-_PARENT_CHECK_S = 1.0
 _log = logging.getLogger(__name__)
 
 
-def stage_main(connection: Connection, objects_root: Path, max_live_worlds: int) -> None:
-    """Serve commands until told to leave or the other end is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the web process decides when to stop
-    silence_stdout()
-    import_quietly("osfcore.world.tabletop")  # slow, so before the stage calls itself ready
-
+def simulation_main(server: ProcessServer, objects_root: Path, max_live_worlds: int) -> None:
+    """Carry out commands until the service has gone."""
+    import_quietly("osfcore.world.tabletop")  # slow, so before the simulation calls itself ready
     with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
-        stage = Stage(connection, AssetLibrary(objects_root), executor, max_live_worlds)
+        simulation = Simulation(server.send, AssetLibrary(objects_root), executor, max_live_worlds)
         try:
-            connection.send(StageReady())
-            stage.serve()
-        except (EOFError, OSError):  # the web process has gone
-            pass
+            server.serve(simulation.carry_out, idle=simulation.idle)
         finally:
-            stage.close()
+            simulation.close()
 
 
-class Stage:
-    """Scenes by identifier; the latest few have a live simulation, the others are loaded when needed."""
+class Simulation:
+    """Scenes by identifier; the latest few have a live simulation, the others are loaded when needed.
+
+    Args:
+        send: takes events.
+        library: the objects.
+        executor: for ray tracing.
+        max_live_worlds: scenes whose simulation stays in memory.
+    """
 
     def __init__(
-        self, connection: Connection, library: AssetLibrary, executor: ThreadPoolExecutor, max_live_worlds: int
+        self, send: Callable[[object], None], library: AssetLibrary, executor: ThreadPoolExecutor, max_live_worlds: int
     ) -> None:
-        self._connection = connection
+        self._send = send
         self._library = library
         self._executor = executor
         self._max_live_worlds = max_live_worlds
@@ -99,19 +94,18 @@ class Stage:
         self._last_frames = 0.0
         self._last_lag_s = 0.0
 
-    def serve(self) -> None:
-        """Carry out commands in order; take live images in between."""
-        while True:
-            if not self._connection.poll(self._wait_s()):
-                self._take_frames()
-                continue
-            request = self._connection.recv()
-            if isinstance(request.command, Leave):
-                return
-            self._connection.send(self._answer(request))
-            # A page that keeps pushing would otherwise starve the live images.
-            if time.monotonic() - self._last_frames > 3 * FRAME_INTERVAL_S:
-                self._take_frames()
+    def idle(self, is_busy: bool) -> float | None:
+        """Take live images if they are due; returns the time until they are [s], None if no image is wanted.
+
+        While commands wait they are due three times as seldom, but a page that keeps pushing does not starve them.
+        """
+        if not (self._frames_due and self._frames_wanted):
+            return None
+        left_s = self._last_frames + FRAME_INTERVAL_S * (3 if is_busy else 1) - time.monotonic()
+        if left_s > 0:
+            return left_s
+        self._take_frames()
+        return None
 
     def close(self) -> None:
         """Free all simulations."""
@@ -119,25 +113,22 @@ class Stage:
             world.close()
         self._worlds.clear()
 
-    def _wait_s(self) -> float:
-        if not (self._frames_due and self._frames_wanted):
-            return _PARENT_CHECK_S
-        return max(self._last_frames + FRAME_INTERVAL_S - time.monotonic(), 0.0)
+    def carry_out(self, command: Command, is_overtaken: IsOvertaken = lambda: False) -> object:
+        """What answers a command.
 
-    def _answer(self, request: Request) -> Reply | Failure:
+        Raises:
+            OsfError: if it cannot be done; then nothing has changed.
+        """
+        del is_overtaken  # commands change scenes, so none is left out
         try:
-            return Reply(request.number, self._carry_out(request.command))
-        except OsfError as error:
-            return Failure.of(error, request.number)
-        except (EOFError, BrokenPipeError):
+            return self._dispatch(command)
+        except OsfError:
             raise
-        except Exception as error:
-            # A defect: the simulation may be in any state, so it is loaded afresh from the last record.
-            _log.exception("the stage could not carry out %s", type(request.command).__name__)
-            self._forget_world(getattr(request.command, "id", ""))
-            return Failure(request.number, "Internal", f"The simulation failed ({type(error).__name__}).")
+        except Exception:  # a defect: the simulation may be in any state, so it is loaded afresh from the last record
+            self._forget_world(getattr(command, "id", ""))
+            raise
 
-    def _carry_out(self, command: Command) -> object:
+    def _dispatch(self, command: Command) -> object:
         match command:
             case CreateScene():
                 return self._create(command)
@@ -158,7 +149,7 @@ class Stage:
                 return self._image(command)
             case TakeView(scene, camera, pusher):
                 image = self._world(scene).render((camera,), with_pusher=pusher).images[0]
-                return _encoded(_eight_bit(image), ".png")
+                return encode_png(to_uint8(image))
             case TakeMask():
                 return self._mask(command)
             case ObserveScene():
@@ -286,7 +277,7 @@ class Stage:
 
     def _tell(self, record: SceneRecord, states: tuple[SceneState, ...] = (), interval_s: float = 0.0) -> None:
         self._records[record.id] = record
-        self._connection.send(SceneChanged(record, states, interval_s))
+        self._send(SceneChanged(record, states, interval_s))
         self._frames_due = self._frames_due or record.id == self._shown
 
     def _time_s(self, scene: str) -> float:
@@ -303,10 +294,10 @@ class Stage:
     def _image(self, command: TakeImage) -> bytes:
         world, camera = self._world(command.id), self._camera(command.camera, command.size)
         seen = world.render((camera,), masks=command.masks, with_pusher=command.pusher)
-        pixels = _eight_bit(seen.images[0])
+        pixels = to_uint8(seen.images[0])
         if command.masks and seen.masks is not None:
             pixels = draw_masks(pixels, seen.masks[0])
-        return _encoded(pixels, ".png")
+        return encode_png(pixels)
 
     def _mask(self, command: TakeMask) -> bytes:
         world, camera = self._world(command.id), self._camera(command.camera, command.size)
@@ -315,7 +306,7 @@ class Stage:
         masks = world.render((camera,), masks=True).masks
         if masks is None:
             raise InvalidInput("renderer", "without masks", "one that makes masks")
-        return _encoded(masks[0][world.names.index(command.object)].astype(np.uint8) * 255, ".png")
+        return encode_png(masks[0][world.names.index(command.object)].astype(np.uint8) * 255)
 
     def _observe(self, command: ObserveScene) -> SceneRecord:
         from osfcore.io.observation_file import write_observation
@@ -342,7 +333,7 @@ class Stage:
             world.restore(self._record(command.id).state)
             self._time_offsets[command.id] = time_s
         poses = tuple((name, goal.pose(name)) for name in goal.names)
-        return ComposedGoal(_encoded(_eight_bit(image), ".png"), poses)
+        return ComposedGoal(encode_png(to_uint8(image)), poses)
 
     def _take_frames(self) -> None:
         """Send the shown scene's live images if they are wanted and stale."""
@@ -357,10 +348,10 @@ class Stage:
         except OsfError as error:
             _log.warning("no live images of scene %s: %s", record.id, error)
             return
-        images = _eight_bit(seen.images)
-        jpegs = tuple(_encoded(image, ".jpg") for image in images)
+        images = to_uint8(seen.images)
+        jpegs = tuple(encode_jpeg(image) for image in images)
         names = tuple(camera.name for camera in seen.cameras)
-        self._connection.send(FramesTaken(record.id, record.revision, names, images, jpegs))
+        self._send(FramesTaken(record.id, record.revision, names, images, jpegs))
         self._last_frames = time.monotonic()
         self._last_lag_s = self._last_frames - start
 
@@ -387,15 +378,3 @@ def draw_masks(pixels: np.ndarray, masks: np.ndarray) -> np.ndarray:
         colour = MASK_COLOURS[number % len(MASK_COLOURS)]
         drawn[mask] = (pixels[mask].astype(np.uint16) + colour) // 2
     return drawn
-
-
-def _eight_bit(images: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(images, 0, 1) * 255).astype(np.uint8)
-
-
-def _encoded(pixels: np.ndarray, suffix: str) -> bytes:
-    import cv2
-
-    quality = [cv2.IMWRITE_JPEG_QUALITY, 85] if suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
-    _, data = cv2.imencode(suffix, pixels[..., ::-1] if pixels.ndim == 3 else pixels, quality)
-    return data.tobytes()

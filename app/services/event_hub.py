@@ -5,9 +5,27 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+
+from app.processes.scene_messages import SceneRecord
 
 _log = logging.getLogger(__name__)
 Listener = Callable[[object], None]
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentScene:
+    """Another scene is shown now, or none."""
+
+    record: SceneRecord | None
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A sentence for whoever watches; `level` is "info", "warning" or "error"."""
+
+    level: str
+    text: str
 
 
 class Hub:

@@ -10,18 +10,17 @@ from pathlib import Path
 
 from PIL import Image
 
-from app.processes.messages import ComposedGoal, ComposeGoal
-from app.processes.sim_client import StageError
+from app.processes.scene_messages import ComposedGoal, ComposeGoal
 from app.services.runner import Runner
 from app.storage.database import now_utc
 from app.storage.goal_store import GoalRecord, GoalStore, Poses, Source
 from app.storage.photos import read_photo
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
 
 GOAL_SIDE = 256  # of images that are made here [px]
-_MISPLACED = ("OverlappingObjects", "InvalidInput")  # what a hand can do wrong while it composes
+_MISPLACED = (OverlappingObjects, InvalidInput)  # what a hand can do wrong while it composes
 
 
 class NoDraft(OsfError):
@@ -222,9 +221,7 @@ class Goals:
             number = self._next_revision()
             try:
                 made = self._runner.compose(ComposeGoal(draft.scene, laid, size=GOAL_SIDE))
-            except StageError as error:
-                if error.kind not in _MISPLACED:
-                    raise
+            except _MISPLACED as error:
                 return self._set_draft(Draft(draft.scene, laid, str(error), number), None)
             return self._set_draft(Draft(draft.scene, made.poses, "", number), made)
 

@@ -9,9 +9,9 @@ from concurrent.futures import Future
 import numpy as np
 from jaxtyping import Float
 
-from app.processes.messages import SceneRecord
-from app.processes.neural_client import Answer, NeuralLink
-from app.processes.neural_messages import PredictPushes
+from app.processes.neural_messages import NeuralAnswer, PredictPushes
+from app.processes.process_client import ProcessClient
+from app.processes.scene_messages import SceneRecord
 from app.services.fields import MissingFields
 from app.services.runner import Runner
 from osfcore.errors import InvalidInput, OsfError
@@ -35,7 +35,7 @@ class Predictions:
         link: to the process that predicts.
     """
 
-    def __init__(self, runner: Runner, fields: Callable[[], Collection[str]], link: NeuralLink) -> None:
+    def __init__(self, runner: Runner, fields: Callable[[], Collection[str]], link: ProcessClient) -> None:
         self._runner = runner
         self._fields = fields
         self._link = link
@@ -62,7 +62,7 @@ class Predictions:
         actions: Float[np.ndarray, "K T 3"],
         key: str | None = None,
         before: SceneState | None = None,
-    ) -> Future[Answer]:
+    ) -> Future[NeuralAnswer]:
         """Ask where actions would lead; the future tells a Predicted, or None where a newer order of the key overtook.
 
         Args:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from app.processes.messages import SceneRecord
+from app.processes.scene_messages import SceneRecord
 from app.services.goals import Goals
 from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord

@@ -1,4 +1,4 @@
-"""The one command path: REST and viewer ask here for every change; scenes go to the stage, jobs to `Jobs`."""
+"""The one command path: REST and viewer ask here for every change; scenes go to the simulation, jobs to `Jobs`."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ import numpy as np
 
 from app.jobs.job import Job, JobChanged, JobSeen, SetInUse, TrainingAlready, check_params
 from app.jobs.registry import Jobs
-from app.processes.messages import (
+from app.processes.process_client import ProcessClient, Status
+from app.processes.scene_messages import (
     Act,
     AdoptScene,
     Command,
     ComposedGoal,
     ComposeGoal,
     CreateScene,
-    CurrentScene,
     DropScene,
     EditScene,
-    Notice,
+    FramesTaken,
     ObserveScene,
     ResetScene,
     SceneChanged,
     SceneRecord,
     ShowScene,
-    StageEvent,
     TakeImage,
     TakeMask,
     WatchFrames,
 )
-from app.processes.sim_client import StageLink, Status
-from app.services.event_hub import Hub
+from app.processes.sim_process import simulation_main
+from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.image_sets import ImageSets
 from app.services.scene_images import SceneImages
 from app.services.service_settings import Settings
@@ -74,7 +73,7 @@ class TooManyScenes(OsfError):
 class Runner:
     """Scenes, jobs and their events.
 
-    Methods that wait for the stage block; those that only read answer from memory. Any thread may call them.
+    Methods that wait for the simulation block; those that only read answer from memory. Any thread may call them.
     """
 
     def __init__(self, settings: Settings, store: Store, library: AssetLibrary) -> None:
@@ -86,13 +85,15 @@ class Runner:
             store, settings.data_dir, self._on_job, settings.max_queued_jobs, settings.cancel_grace_s, self._serve
         )
         self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets)
-        self._stage = StageLink(
-            library.root,
-            settings.max_live_worlds,
-            settings.stage_timeout_s,
+        self._simulation = ProcessClient(
+            simulation_main,
+            (library.root, settings.max_live_worlds),
+            "simulation",
+            answer_s=settings.stage_timeout_s,
+            keeps_running=True,
             greeting=self._greeting,
-            on_event=self._on_stage_event,
-            on_lost=self._on_stage_lost,
+            on_event=self._on_simulation_event,
+            on_lost=self._on_simulation_lost,
         )
         self._lock = threading.RLock()
         self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
@@ -100,21 +101,21 @@ class Runner:
         self._current: str | None = None
         self._watchers = 0
         self._images = SceneImages(
-            settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._stage.call_async
+            settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._simulation.call_async
         )
         self._scenes_in_the_making = 0
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
 
     def start(self) -> None:
-        """Take over what the store holds, start the stage and the jobs, and make a first scene if there is none."""
+        """Take over what the store holds, start simulation and jobs, make a first scene if there is none."""
         records, self._current = self._store.scenes()
         self._records = {record.id: record for record in records}
         if self._current is None and records:
             self._current = records[-1].id
         self.sets.start()
         sweep(self._settings.data_dir / "fields")
-        self._stage.start()
+        self._simulation.start()
         self.jobs.start()
         self.ensure_demo_scene()
 
@@ -122,12 +123,12 @@ class Runner:
         """End all processes. Calling it again does nothing."""
         self.sets.stop()
         self.jobs.stop()
-        self._stage.stop()
+        self._simulation.stop()
 
     @property
-    def stage_status(self) -> Status:
+    def simulation_status(self) -> Status:
         """Whether scenes can be worked with."""
-        return self._stage.status
+        return self._simulation.status
 
     @property
     def uptime_s(self) -> float:
@@ -196,7 +197,7 @@ class Runner:
             poses=None if poses is None else _stacked([pose for _, pose in poses]),
         )
         try:
-            record: SceneRecord = self._stage.call(command)
+            record: SceneRecord = self._simulation.call(command)
             with self._lock:
                 self._store.save_scene(record)
                 self._records[record.id] = record
@@ -218,7 +219,7 @@ class Runner:
             self.scene(scene)
             self._store.delete_scene(scene)
             del self._records[scene]
-            self._stage.submit(DropScene(scene))
+            self._simulation.submit(DropScene(scene))
             was_current = self._current == scene
             if was_current:
                 self._show(next(reversed(self._records), None))
@@ -292,7 +293,7 @@ class Runner:
             OsfError: if the simulation is not there now.
         """
         self.scene(scene)
-        return self._stage.call(ObserveScene(scene, folder, goal, masks))
+        return self._simulation.call(ObserveScene(scene, folder, goal, masks))
 
     def compose(self, command: ComposeGoal) -> ComposedGoal:
         """How a scene could become, seen by the goal camera; the scene stays as it is.
@@ -306,14 +307,14 @@ class Runner:
         self._check_free(command.id)
         _check_poses(command.poses)
         image_side(command.size)
-        return self._stage.call(command)
+        return self._simulation.call(command)
 
     def watch_frames(self, change: int) -> None:
         """Tell that `change` more (or less, if negative) listeners look at live images."""
         with self._lock:
             before, self._watchers = self._watchers, max(self._watchers + change, 0)
             if (before > 0) != (self._watchers > 0):
-                self._stage.submit(WatchFrames(self._watchers > 0))
+                self._simulation.submit(WatchFrames(self._watchers > 0))
 
     # Jobs
 
@@ -363,11 +364,11 @@ class Runner:
 
     def _serve(self, command: Command) -> Any:  # noqa: ANN401  each command says what answers it
         """Carry out what a job asks for with its own scene."""
-        return self._change(command) if isinstance(command, Act) else self._stage.call(command)
+        return self._change(command) if isinstance(command, Act) else self._simulation.call(command)
 
     def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
         self.scene(command.id)
-        record: SceneRecord = self._stage.call(command)
+        record: SceneRecord = self._simulation.call(command)
         with self._lock:
             latest = self._records.get(command.id)
             if latest is not None:
@@ -377,7 +378,7 @@ class Runner:
     def _show(self, scene: str | None) -> None:
         self._current = scene
         self._store.set_current(scene)
-        self._stage.submit(ShowScene(scene))
+        self._simulation.submit(ShowScene(scene))
         self.hub.publish(CurrentScene(None if scene is None else self._records[scene]))
 
     def _check_names(self, names: tuple[str, ...] | None) -> None:
@@ -417,14 +418,14 @@ class Runner:
             adopt: list[Command] = [AdoptScene(record) for record in self._records.values()]
             return [*adopt, ShowScene(self._current), WatchFrames(self._watchers > 0)]
 
-    def _on_stage_event(self, event: StageEvent) -> None:
+    def _on_simulation_event(self, event: SceneChanged | FramesTaken) -> None:
         if isinstance(event, SceneChanged):
             with self._lock:
                 if event.record.id in self._records:
                     self._records[event.record.id] = event.record
         self.hub.publish(event)
 
-    def _on_stage_lost(self) -> None:
+    def _on_simulation_lost(self) -> None:
         self.hub.publish(Notice("error", "The simulation stopped unexpectedly and is being restarted."))
 
     def _on_job(self, event: JobChanged | JobSeen) -> None:

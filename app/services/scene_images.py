@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from app.processes.messages import TakeImage, TakeMask
+from app.processes.scene_messages import TakeImage, TakeMask
 from app.services.image_cache import ImageCache
 
 ImageKey = tuple[int, TakeImage | TakeMask]  # revision of the scene, and what is asked for

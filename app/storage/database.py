@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from app.processes.messages import SceneRecord
+from app.processes.scene_messages import SceneRecord
 from osfcore.errors import CorruptFile, OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose

@@ -7,35 +7,30 @@ Decoding takes much memory and may crash; neither must hurt the service. What is
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import logging
-import signal
 import threading
 from collections.abc import AsyncIterator, Callable
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Generic, TypeVar
 
 from starlette.concurrency import run_in_threadpool
 
-from app.processes.child_process import end, launch, own_group, silence_stdout
-from app.processes.messages import Failure
+from app.processes.child_process import own_group
+from app.processes.process_client import ProcessClient, ProcessHangs, ProcessUnavailable
+from app.processes.process_server import ProcessServer
 from app.storage.database import CannotStore
-from osfcore.errors import OsfError
+from osfcore.errors import CannotWrite, OsfError
 
 _WRITE_BYTES = 1 << 20
 _PATIENCE_S = 600.0
-_log = logging.getLogger(__name__)
 Found = TypeVar("Found")
 
 
 class UploadRefused(OsfError):
-    """An upload that cannot be used, told by the process that looked at it; `kind` is the class of its error."""
+    """An upload that cannot be used."""
 
-    def __init__(self, kind: str, text: str) -> None:
-        super().__init__(text)
-        self.kind = "CannotStore" if kind == "CannotWrite" else "UploadRefused"
+
+class UploadNotStored(UploadRefused):
+    """An upload for which there is no room on the disk."""
 
 
 async def save(chunks: AsyncIterator[bytes], file: Path) -> None:
@@ -72,47 +67,49 @@ class Examiner(Generic[Found]):
         self._what = what
         self._names = names
         self._one_at_a_time = asyncio.Lock()  # decoding takes much memory
-        self._worker: SpawnProcess | None = None
-        self._worker_lock = threading.Lock()
+        self._lock = threading.Lock()
+        self._process: ProcessClient | None = None
         self._is_stopped = False
 
     def stop(self) -> None:
         """End the process that looks at an upload, if there is one. Calling it again does nothing."""
-        with self._worker_lock:
+        with self._lock:
             self._is_stopped = True
-            if self._worker is not None:
-                end(self._worker)
+            process = self._process
+        if process is not None:
+            process.stop()
 
     async def examine(self, folder: Path) -> Found:
         """What was found in the upload in a folder.
 
         Raises:
             UploadRefused: if it cannot be used.
+            UploadNotStored: if the disk is full.
         """
         async with self._one_at_a_time:
             return await run_in_threadpool(self._examine, folder)
 
     def _examine(self, folder: Path) -> Found:
-        with self._worker_lock:
+        with self._lock:
             if self._is_stopped:
-                raise UploadRefused("Stopped", f"The service is stopping; upload the {self._what} again later.")
-            process, connection = launch(examine_main, "osf-upload", self._look, self._what, folder)
-            self._worker = process
+                raise UploadRefused(f"The service is stopping; upload the {self._what} again later.")
+            self._process = ProcessClient(
+                examiner_main, (self._look,), f"process that looked at the {self._what}", answer_s=_PATIENCE_S
+            )
         try:
-            if not connection.poll(_PATIENCE_S):
-                late = f"Looking at the {self._what} took more than {_PATIENCE_S / 60:.0f} minutes."
-                raise UploadRefused("TooSlow", late)
-            outcome = connection.recv()
-        except (EOFError, OSError):
+            return self._process.call(folder)
+        except CannotWrite as error:
+            raise UploadNotStored(self._plain(str(error), folder)) from error
+        except ProcessHangs:
+            late = f"Looking at the {self._what} took more than {_PATIENCE_S / 60:.0f} minutes."
+            raise UploadRefused(late) from None
+        except ProcessUnavailable:
             died = f"The process that looked at the {self._what} ended unexpectedly; it may have run out of memory."
-            raise UploadRefused("Died", died) from None
+            raise UploadRefused(died) from None
+        except OsfError as error:
+            raise UploadRefused(self._plain(str(error), folder)) from error
         finally:
-            end(process)
-            connection.close()
-            self._worker = None
-        if isinstance(outcome, Failure):
-            raise UploadRefused(outcome.kind, self._plain(outcome.text, folder))
-        return outcome
+            self._process.stop()
 
     def _plain(self, text: str, folder: Path) -> str:
         """An error's sentence without the names of places that the uploader does not know."""
@@ -121,22 +118,7 @@ class Examiner(Generic[Found]):
         return text
 
 
-def examine_main(connection: Connection, look: Callable[[Path], object], what: str, folder: Path) -> None:
-    """Look at what was uploaded to a folder and tell what was found, or a Failure."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def examiner_main(server: ProcessServer, look: Callable[[Path], object]) -> None:
+    """Look at the folder that is asked for."""
     own_group()
-    silence_stdout()
-    outcome: object
-    try:
-        outcome = look(folder)
-    except OsfError as error:
-        outcome = Failure.of(error)
-    except MemoryError:
-        text = f"The {what} needs more memory than there is; take fewer or smaller images."
-        outcome = Failure(0, "OutOfMemory", text)
-    except Exception as error:
-        _log.exception("looking at an upload failed")
-        text = f"The {what} could not be looked at ({type(error).__name__}); the service's log tells more."
-        outcome = Failure(0, "Internal", text)
-    with contextlib.suppress(OSError):  # the web process has gone
-        connection.send(outcome)
+    server.serve(lambda folder, _: look(folder))

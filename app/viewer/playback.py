@@ -1,4 +1,4 @@
-"""Plays scene changes at their own pace: the stage computes faster than time, people want to see it move."""
+"""Plays scene changes at their own pace: the simulation computes faster than time, people want to see it move."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from app.processes.messages import CurrentScene, FramesTaken, SceneChanged, SceneRecord
+from app.processes.scene_messages import FramesTaken, SceneChanged, SceneRecord
+from app.services.event_hub import CurrentScene
 from osfcore.geometry.states import SceneState
 
 _CATCH_UP_S = 0.5  # further behind than this, playing goes faster than time

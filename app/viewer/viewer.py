@@ -15,9 +15,10 @@ from pathlib import Path
 import viser
 
 from app.jobs.job import JobChanged
-from app.processes.messages import CurrentScene, SceneRecord
-from app.processes.neural_client import NeuralLink
+from app.processes.process_client import ProcessClient
+from app.processes.scene_messages import SceneRecord
 from app.services.estimates import Estimates
+from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals
 from app.services.predictions import Predictions
 from app.services.runner import Runner
@@ -55,7 +56,7 @@ class Viewer:
     def __init__(
         self,
         runner: Runner,
-        neural: NeuralLink,
+        neural: ProcessClient,
         fields: Callable[[], Collection[str]],
         estimates: Estimates,
         predictions: Predictions,

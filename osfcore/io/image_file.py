@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from osfcore.errors import CannotWrite
 from osfcore.io.files import write_atomically
 
 
@@ -17,13 +16,25 @@ def to_uint8(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
-def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write an RGB image; the file appears only when it is whole.
+def encode_png(image: UInt8[np.ndarray, "h w *channels"]) -> bytes:
+    """An RGB or grey image as PNG."""
+    return _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 3])
+
+
+def encode_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """An RGB image as JPEG of quality 85."""
+    return _encoded(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:
+    """Write an RGB or grey image; the file appears only when it is whole.
 
     Raises:
         CannotWrite: if the disk refuses.
     """
-    done, data = cv2.imencode(".png", image[..., ::-1])
-    if not done:
-        raise CannotWrite(path, "the image could not be encoded")
-    write_atomically(path, data.tobytes())
+    write_atomically(path, encode_png(image))
+
+
+def _encoded(image: UInt8[np.ndarray, "h w *channels"], suffix: str, options: list[int]) -> bytes:
+    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image), options)
+    return data.tobytes()

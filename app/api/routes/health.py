@@ -20,5 +20,5 @@ async def get(services: ServicesDep) -> Health:
         version=VERSION,
         uptime_s=round(services.runner.uptime_s, 3),
         objects_available=len(services.shelf.names()),
-        stage=services.runner.stage_status,
+        stage=services.runner.simulation_status,
     )

@@ -11,8 +11,8 @@ from fastapi import APIRouter, Response
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.predictions import PredictionIn, PredictionOut
-from app.processes.messages import SceneRecord
 from app.processes.neural_messages import Predicted
+from app.processes.scene_messages import SceneRecord
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.rollouts import check_actions
 from osfcore.geometry.states import SceneState

@@ -8,7 +8,7 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.problems import NotFound
 from app.api.routes import PNG, problems
 from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
-from app.processes.messages import SceneRecord, TakeImage, TakeMask
+from app.processes.scene_messages import SceneRecord, TakeImage, TakeMask
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS
 
@@ -120,7 +120,7 @@ async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
     try:
         png = await services.runner.image(command)
     except OsfError:
-        found(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the stage says of it
+        found(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the simulation says
         raise
     return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
 

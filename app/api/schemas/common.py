@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.processes.messages import SceneRecord
+from app.processes.scene_messages import SceneRecord
 from app.services.runner import MAX_SEED
 from osfcore.geometry.cameras import (
     DEFAULT_IMAGE_SIDE,
@@ -220,7 +220,7 @@ class SceneOut(BaseModel):
 
     @staticmethod
     def of(record: SceneRecord, labels: dict[str, str], *, is_current: bool) -> SceneOut:
-        """From the stage's record."""
+        """From the simulation's record."""
         state = record.state
         poses = [(name, state.pose(name)) for name in state.names]
         return SceneOut(

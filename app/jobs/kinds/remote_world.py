@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from app.processes.messages import Act, ObserveScene, SceneRecord, TakeView
+from app.processes.scene_messages import Act, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import Observation, SceneState
@@ -51,7 +51,7 @@ class RemoteWorld:
         """Images of all cameras.
 
         Raises:
-            StageError: if the simulation is not there now.
+            ProcessUnavailable: if the simulation is not there now.
         """
         place = self._folder / _SEEN
         shutil.rmtree(place, ignore_errors=True)
@@ -65,7 +65,7 @@ class RemoteWorld:
 
         Raises:
             InvalidInput: if the action is outside its limits; the world is unchanged.
-            StageError: if the simulation is not there now.
+            ProcessUnavailable: if the simulation is not there now.
         """
         self.record = self._ask(Act(self._scene, (check_action(action),)))
 

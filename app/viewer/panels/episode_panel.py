@@ -14,9 +14,10 @@ import numpy as np
 import viser
 
 from app.jobs.job import Job, JobChanged, JobSeen
-from app.processes.messages import CurrentScene, SceneChanged
 from app.processes.plan_summary import PlanSketch
+from app.processes.scene_messages import SceneChanged
 from app.services.episodes import KIND
+from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged
 from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
 from app.viewer.nodes.scene_nodes import SceneNodes

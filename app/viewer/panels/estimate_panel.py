@@ -17,10 +17,10 @@ from PIL import Image
 from viser import uplot
 
 from app.jobs.job import Job, JobChanged, JobSeen
-from app.processes.messages import CurrentScene
-from app.processes.neural_client import Answer, NeuralLink
-from app.processes.neural_messages import Comparison
+from app.processes.neural_messages import Comparison, NeuralAnswer
+from app.processes.process_client import ProcessClient
 from app.services.estimates import KIND, Asked, Estimates
+from app.services.event_hub import CurrentScene
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.loss_curves import LossCurves
@@ -52,7 +52,7 @@ class EstimatePanel(Panel):
         server: viser.ViserServer,
         nodes: tuple[SceneNodes, EstimateNodes],
         estimates: Estimates,
-        neural: NeuralLink,
+        neural: ProcessClient,
         run_command: RunCommand,
         cancel: Callable[[str], object],
     ) -> None:
@@ -71,7 +71,7 @@ class EstimatePanel(Panel):
         self._plot: viser.GuiUplotHandle | None = None
         self._plot_names: list[str] = []
         self._picture_at = 0.0
-        self._picture: Future[Answer] | None = None
+        self._picture: Future[NeuralAnswer] | None = None
         self._picture_of: object = None
         self._add_panel(server.gui)
 
@@ -230,7 +230,7 @@ class EstimatePanel(Panel):
         self._picture = self._neural.submit(order)
         self._picture.add_done_callback(partial(self._receive, job.id))
 
-    def _receive(self, job: str, answer: Future[Answer]) -> None:
+    def _receive(self, job: str, answer: Future[NeuralAnswer]) -> None:
         self._picture = None
         if answer.exception() is None and isinstance(result := answer.result(), Comparison) and job == self._drawn_job:
             with Image.open(io.BytesIO(result.comparison)) as picture:

@@ -16,7 +16,7 @@ import viser
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from app.processes.messages import CurrentScene
+from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
 from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.episode_nodes import GOAL

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from app.processes.neural_client import Answer, NeuralLink
-from app.processes.neural_messages import DrawnView, DrawView
+from app.processes.neural_messages import DrawnView, DrawView, NeuralAnswer
+from app.processes.process_client import ProcessClient
 from app.processes.render_cameras import view_camera
 from app.viewer.panels.panel import Panel
 from app.viewer.panels.refinement import STEPS, Refinement, RenderTicket
@@ -40,7 +40,7 @@ class _Answer:
 
     ticket: RenderTicket
     names: tuple[str, ...]
-    future: Future[Answer]
+    future: Future[NeuralAnswer]
 
 
 class ClientView:
@@ -147,7 +147,7 @@ class NeuralPanel(Panel):
     """
 
     def __init__(
-        self, link: NeuralLink, state: Callable[[], SceneState], fields: Callable[[], Collection[str]]
+        self, link: ProcessClient, state: Callable[[], SceneState], fields: Callable[[], Collection[str]]
     ) -> None:
         super().__init__("neural-panel")
         self._link = link

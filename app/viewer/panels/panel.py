@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import viser
 
-from app.processes.messages import CurrentScene, SceneRecord
+from app.processes.scene_messages import SceneRecord
+from app.services.event_hub import CurrentScene
 from app.viewer.drawing_thread import DrawingThread
 from app.viewer.nodes.scene_nodes import Client
 

@@ -14,9 +14,9 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.processes.messages import CurrentScene, SceneChanged, SceneRecord
-from app.processes.neural_client import Answer
-from app.processes.neural_messages import Predicted
+from app.processes.neural_messages import NeuralAnswer, Predicted
+from app.processes.scene_messages import SceneChanged, SceneRecord
+from app.services.event_hub import CurrentScene
 from app.services.predictions import Predictions
 from app.services.pushes import outcomes
 from app.viewer.nodes.push_nodes import PushNodes
@@ -50,7 +50,7 @@ class _Request:
     record: SceneRecord
     actions: Float[np.ndarray, "T 3"]
     client: Client
-    answer: Future[Answer]
+    answer: Future[NeuralAnswer]
 
 
 class PushPanel(Panel):

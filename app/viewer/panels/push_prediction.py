@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from app.processes.messages import SceneRecord
+from app.processes.scene_messages import SceneRecord
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 

@@ -2,7 +2,8 @@ import pytest
 
 from app.api.problems import NotFound, problem, status_of
 from app.jobs.registry import QueueFull
-from app.processes.sim_client import StageError, StageUnavailable
+from app.processes.process_client import ProcessUnavailable
+from app.processes.process_server import InternalError
 from osfcore.errors import InvalidInput, OverlappingObjects
 
 
@@ -11,9 +12,8 @@ from osfcore.errors import InvalidInput, OverlappingObjects
     [
         (InvalidInput("x", 1, "2"), 422),
         (OverlappingObjects("a", "b", 0.01), 422),
-        (StageError("OverlappingObjects", "a and b overlap."), 422),
-        (StageError("Internal", "The simulation failed."), 500),
-        (StageUnavailable("died"), 503),
+        (InternalError("simulation", ValueError()), 500),
+        (ProcessUnavailable("simulation", "died"), 503),
         (QueueFull(20), 429),
         (NotFound("no"), 404),
     ],

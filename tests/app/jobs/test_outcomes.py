@@ -1,10 +1,12 @@
 import pytest
 
 from app.jobs.job import Job
-from app.jobs.outcomes import DIED, DIED_NOTE, INTERRUPTED_NOTE, RESUMES_NOTE, STOPPED, STOPPED_NOTE, after
-from app.processes.messages import Failure, JobCancelled, JobDone
+from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped, after
+from app.processes.job_messages import JobCancelled
+from osfcore.errors import OsfError
 
-REFUSED = Failure(0, "InvalidInput", "It is too large.")
+REFUSED = OsfError("It is too large.")
+STOPPED, DIED = JobStopped(), JobDied()
 
 
 def running(kind):
@@ -25,7 +27,7 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("kind", ["episode", "collect_table", "estimate", "train_field"])
 def test_what_was_done_to_its_end_is_kept(folder, kind):
-    over = after(running(kind), JobDone({"n": 1}), folder)
+    over = after(running(kind), {"n": 1}, folder)
     assert (over.state, over.note, over.result, over.error) == ("done", "Done", {"n": 1}, None)
     assert over.files == ("report.json", "steps.csv")
     assert over.finished_at is not None
@@ -36,10 +38,9 @@ def test_what_was_done_to_its_end_is_kept(folder, kind):
     ("outcome", "state", "error"),
     [
         (STOPPED, "interrupted", INTERRUPTED_NOTE),
-        (DIED, "failed", DIED_NOTE),
-        (REFUSED, "failed", REFUSED.text),
+        (DIED, "failed", str(DIED)),
+        (REFUSED, "failed", str(REFUSED)),
         (JobCancelled(), "cancelled", None),
-        ("nonsense", "failed", "The job's process told nonsense."),
     ],
 )
 def test_an_episode_keeps_its_steps_however_it_ends(folder, outcome, state, error):
@@ -54,11 +55,10 @@ def test_an_episode_keeps_its_steps_however_it_ends(folder, outcome, state, erro
 @pytest.mark.parametrize(
     ("outcome", "state", "error"),
     [
-        (STOPPED, "failed", STOPPED_NOTE),
-        (DIED, "failed", DIED_NOTE),
-        (REFUSED, "failed", REFUSED.text),
+        (STOPPED, "failed", str(STOPPED)),
+        (DIED, "failed", str(DIED)),
+        (REFUSED, "failed", str(REFUSED)),
         (JobCancelled(), "cancelled", None),
-        (None, "failed", "The job's process told nonsense."),
     ],
 )
 @pytest.mark.parametrize("kind", ["collect_pushes", "estimate"])

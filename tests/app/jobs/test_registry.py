@@ -1,26 +1,17 @@
+import multiprocessing
 import os
+import queue
 import signal
 import time
-from multiprocessing import Pipe
 
 import pytest
 
-import app.jobs.outcomes as job_ends
-import app.jobs.registry as jobs_module
+from app.jobs.clock import JobClock
 from app.jobs.job import JobSeen
-from app.jobs.outcomes import DIED_NOTE, INTERRUPTED_NOTE, RESUMES_NOTE, STOPPED_NOTE
+from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped
 from app.jobs.registry import Jobs, QueueFull, WrongJobState
-from app.processes.messages import (
-    AskStage,
-    CancelJob,
-    JobCancelled,
-    JobDone,
-    JobRests,
-    JobStep,
-    PauseJob,
-    StepJob,
-    TakeImage,
-)
+from app.processes.job_messages import CancelJob, JobCancelled, JobRests, JobStep, PauseJob, SceneCommand, StepJob
+from app.processes.scene_messages import TakeImage
 from app.storage.database import CannotStore, Store
 from app.storage.field_files import workshop
 from osfcore.errors import UnknownName
@@ -52,6 +43,11 @@ def open_jobs(store, data_dir):
     yield open_jobs
     for jobs in opened:
         jobs.stop()
+
+
+def pid_of_job():
+    """Of the job process that was started last."""
+    return max(child.pid for child in multiprocessing.active_children() if child.name == "osf-job")
 
 
 def until_state(jobs, job, *states):
@@ -107,7 +103,7 @@ def test_a_job_that_does_not_listen_is_ended(open_jobs):
     jobs, _ = open_jobs(cancel_grace_s=0.2)
     job = jobs.submit(*LONG)
     until(lambda: jobs.get(job.id).done > 0)
-    os.kill(jobs._run.process.pid, signal.SIGSTOP)
+    os.kill(pid_of_job(), signal.SIGSTOP)
     assert jobs.cancel(job.id).state == "cancelled"
     assert not jobs.folder(job.id).exists()
 
@@ -116,7 +112,7 @@ def test_a_job_that_dies_fails_and_the_next_one_runs(open_jobs):
     jobs, _ = open_jobs()
     job, following = jobs.submit(*LONG), jobs.submit(*TABLE)
     until(lambda: jobs.get(job.id).done > 0)
-    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    os.kill(pid_of_job(), signal.SIGKILL)
     failed = until_state(jobs, job, "failed")
     assert "ended unexpectedly" in failed.error
     assert until_state(jobs, following, "done").state == "done"
@@ -144,7 +140,7 @@ def test_after_a_stop_running_jobs_failed_and_waiting_ones_go_on(open_jobs):
     jobs.stop()
     again, _ = open_jobs()
     failed = again.get(job.id)
-    assert (failed.state, failed.error) == ("failed", STOPPED_NOTE)
+    assert (failed.state, failed.error) == ("failed", str(JobStopped()))
     assert until_state(again, waiting, "done", "failed").state == "done"
 
 
@@ -157,7 +153,7 @@ def test_after_a_crash_running_jobs_failed_too(open_jobs, store):
     for number, fields in kept.items():
         store.save_job(fields["id"], number, {**fields, "state": "paused"})  # as a killed service leaves it
     again, events = open_jobs()
-    assert again.get(job.id).error == STOPPED_NOTE
+    assert again.get(job.id).error == str(JobStopped())
     assert events[0].job.state == "failed"
     with pytest.raises(UnknownName):
         again.get("none")
@@ -182,7 +178,7 @@ def test_a_training_that_was_killed_says_that_it_can_go_on_and_a_cancelled_one_l
     shop = workshop(data_dir, "box")
     job = jobs.submit("train_field", params)
     until(lambda: "Image" in jobs.get(job.id).note)
-    os.kill(jobs._run.process.pid, signal.SIGKILL)
+    os.kill(pid_of_job(), signal.SIGKILL)
     assert RESUMES_NOTE in until_state(jobs, job, "failed").error
     assert shop.is_dir()
     again = jobs.submit("train_field", params)
@@ -216,7 +212,7 @@ def test_progress_that_comes_too_soon_is_told_when_nothing_follows(open_jobs):
     events.clear()
     jobs.resume(job.id)
     until(lambda: jobs.get(job.id).done > 200)
-    os.kill(jobs._run.process.pid, signal.SIGSTOP)  # nothing follows, as in a long step
+    os.kill(pid_of_job(), signal.SIGSTOP)  # nothing follows, as in a long step
     until(lambda: events and events[-1].job.done == jobs.get(job.id).done)
     jobs.cancel(job.id)
 
@@ -248,48 +244,68 @@ def test_inputs_that_no_job_takes_go_at_once_and_those_of_a_killed_service_at_th
     assert list(left.parent.iterdir()) == []
 
 
-def test_what_a_job_lets_the_live_view_draw_is_told_but_not_kept(open_jobs, monkeypatch):
-    jobs, events = open_jobs()
-    job = jobs.submit(*LONG)
-    until(lambda: jobs.get(job.id).done > 0)
-    connection = jobs._run.connection
+class PlayedJob:
+    """A job process whose part is played by the test."""
 
-    class Showing:
-        def recv(self):
-            monkeypatch.setattr(jobs._run, "connection", connection)
-            return JobStep(7, 10, "Look", {}, seen="a view")
+    def __init__(self, grace_s=0.0):
+        self._orders = queue.Queue()
+        self._outcome = None
+        self._is_over = False
+        self.is_cancelled = False
 
-        def fileno(self):
-            return connection.fileno()
+    def start(self, job, data_dir, folder, on_event):
+        self.id, self.clock, self.send = job.id, JobClock(), on_event
+        return self
 
-    monkeypatch.setattr(jobs._run, "connection", Showing())
-    (seen,) = until(lambda: [event for event in events if isinstance(event, JobSeen)])
-    assert (seen.job.id, seen.seen) == (job.id, "a view")
-    assert "a view" not in str(jobs.get(job.id))
-    jobs.cancel(job.id)
+    def end_with(self, outcome):
+        """Let the process end."""
+        self._outcome = outcome
 
+    def recv(self):
+        """The next order that it got."""
+        return self._orders.get(timeout=10)
 
-def test_an_estimate_is_ended_without_grace(open_jobs, monkeypatch):
-    jobs, _ = open_jobs(cancel_grace_s=600)
-    job = jobs.submit(*LONG)
-    until(lambda: jobs.get(job.id).done > 0)
-    os.kill(jobs._run.process.pid, signal.SIGSTOP)  # as in a step that takes long
-    monkeypatch.setattr(jobs_module, "_ENDED_AT_ONCE", (LONG[0],))
-    assert jobs.cancel(job.id).state == "cancelled"
+    def order(self, message):
+        self._orders.put(message)
+
+    def cancel(self, grace_s):
+        self.is_cancelled = True
+        self.order(CancelJob())
+        if grace_s < 1:
+            self._outcome = JobCancelled()
+
+    def wait(self):
+        time.sleep(0.02)
+        return self._outcome
+
+    def end(self):
+        pass
 
 
 @pytest.fixture
-def played(monkeypatch):
-    """The job's end of the pipe, so that a test can play the job."""
-    ours, theirs = Pipe()
-    monkeypatch.setattr(jobs_module, "launch", lambda *_: (None, ours))
-    monkeypatch.setattr(jobs_module, "end", lambda *_: None)
-    yield theirs
-    theirs.close()
+def played():
+    return PlayedJob()
+
+
+def test_what_a_job_lets_the_live_view_draw_is_told_but_not_kept(open_jobs, played):
+    jobs, events = open_jobs(start_process=played.start)
+    job = jobs.submit("estimate", {})
+    until_state(jobs, job, "running")
+    played.send(JobStep(7, 10, "Look", {}, seen="a view"))
+    (seen,) = until(lambda: [event for event in events if isinstance(event, JobSeen)])
+    assert (seen.job.id, seen.seen) == (job.id, "a view")
+    assert "a view" not in str(jobs.get(job.id))
+
+
+def test_an_estimate_is_ended_without_grace(open_jobs, played):
+    jobs, _ = open_jobs(cancel_grace_s=600, start_process=played.start)
+    job = jobs.submit("estimate", {})
+    until_state(jobs, job, "running")
+    assert jobs.cancel(job.id).state == "cancelled"
 
 
 def test_a_job_may_rest_after_a_round_and_go_on_by_single_steps(played, open_jobs):
-    jobs, _ = open_jobs()
+    jobs, _ = open_jobs(start_process=played.start)
     job = jobs.submit("episode", {"scene": "s1"})
     until_state(jobs, job, "running")
     jobs.pause(job.id)
@@ -304,12 +320,12 @@ def test_a_job_may_rest_after_a_round_and_go_on_by_single_steps(played, open_job
 
 
 def test_parameters_of_a_live_job_can_be_changed(played, open_jobs):
-    jobs, _ = open_jobs()
+    jobs, _ = open_jobs(start_process=played.start)
     job = jobs.submit("episode", {"scene": "s1", "settings": {"steps": 30}})
     until_state(jobs, job, "running")
     assert jobs.change(job.id, {"settings": {"steps": 5}}).params == {"scene": "s1", "settings": {"steps": 5}}
     assert played.recv().params == {"settings": {"steps": 5}}
-    played.send(JobDone({}))
+    played.end_with({})
     until_state(jobs, job, "done")
     with pytest.raises(WrongJobState):
         jobs.change(job.id, {"settings": {}})
@@ -324,15 +340,15 @@ def test_what_a_job_asks_for_is_done_with_its_own_scene_only(played, open_jobs):
             raise UnknownName("camera", "7", ["0", "goal"])
         return b"picture"
 
-    jobs, _ = open_jobs(serve=serve)
+    jobs, _ = open_jobs(serve=serve, start_process=played.start)
     job = jobs.submit("episode", {"scene": "s1"})
     until_state(jobs, job, "running")
-    played.send(AskStage(TakeImage("s1", "goal", 32)))
+    played.send(SceneCommand(TakeImage("s1", "goal", 32)))
     assert played.recv().value == b"picture"
-    played.send(AskStage(TakeImage("s1", "7", 32)))
-    assert "camera" in played.recv().text
-    played.send(AskStage(TakeImage("s2", "goal", 32)))
-    assert "s2" in played.recv().text
+    played.send(SceneCommand(TakeImage("s1", "7", 32)))
+    assert "camera" in str(played.recv().error)
+    played.send(SceneCommand(TakeImage("s2", "goal", 32)))
+    assert "s2" in str(played.recv().error)
     assert [command.id for command in asked] == ["s1", "s1"]
 
 
@@ -345,12 +361,12 @@ def begun(jobs, kind="episode"):
 
 
 def test_an_episode_that_a_stop_interrupts_keeps_its_steps(played, open_jobs):
-    jobs, _ = open_jobs()
+    jobs, _ = open_jobs(start_process=played.start)
     job = begun(jobs)
     played.send(JobStep(1, 3, "Pushing", {"stage": "act", "steps": 1}))
     until(lambda: jobs.get(job.id).done == 1)
     jobs.stop()
-    again, _ = open_jobs()
+    again, _ = open_jobs(start_process=played.start)
     kept = again.get(job.id)
     assert (kept.state, kept.error, kept.files) == ("interrupted", INTERRUPTED_NOTE, ("report.json",))
     assert (kept.done, kept.result) == (1, {"stage": "act", "steps": 1})
@@ -364,7 +380,7 @@ def test_an_episode_that_a_stop_interrupts_keeps_its_steps(played, open_jobs):
 def test_after_a_crash_an_episode_is_interrupted_and_half_of_anything_else_is_removed(
     played, open_jobs, store, kind, over, state
 ):
-    jobs, _ = open_jobs()
+    jobs, _ = open_jobs(start_process=played.start)
     job = begun(jobs, kind)
     ((number, fields),) = store.jobs()
     folder = jobs.folder(job.id)
@@ -372,38 +388,27 @@ def test_after_a_crash_an_episode_is_interrupted_and_half_of_anything_else_is_re
     folder.mkdir(exist_ok=True)
     (folder / "report.json").write_text("{}")
     store.save_job(job.id, number, {**fields, "state": state})  # as a killed service leaves it
-    again, events = open_jobs()
+    again, events = open_jobs(start_process=played.start)
     assert again.get(job.id).state == events[0].job.state == over
     assert folder.exists() == (kind == "episode")
     assert again.get(job.id).files == (("report.json",) if kind == "episode" else ())
 
 
 def test_an_episode_whose_process_dies_fails_and_keeps_its_steps(played, open_jobs):
-    jobs, _ = open_jobs()
+    jobs, _ = open_jobs(start_process=played.start)
     job = begun(jobs)
-    played.close()
+    played.end_with(JobDied())
     failed = until_state(jobs, job, "failed", "done")
-    assert (failed.state, failed.error, failed.files) == ("failed", DIED_NOTE, ("report.json",))
+    assert (failed.state, failed.error, failed.files) == ("failed", str(JobDied()), ("report.json",))
     assert (jobs.folder(job.id) / "report.json").is_file()
-
-
-def test_what_keeps_its_steps_keeps_them_when_its_process_is_killed(open_jobs, monkeypatch):
-    monkeypatch.setattr(job_ends, "_KEEPING", (LONG[0],))
-    jobs, _ = open_jobs()
-    job = jobs.submit(*LONG)
-    until(lambda: jobs.get(job.id).done > 0)
-    (jobs.folder(job.id) / "report.json").write_text("{}")
-    os.kill(jobs._run.process.pid, signal.SIGKILL)
-    failed = until_state(jobs, job, "failed")
-    assert (failed.error, failed.files) == (DIED_NOTE, ("report.json",))
 
 
 @pytest.mark.parametrize("answers", [True, False])
 def test_a_cancelled_episode_keeps_its_steps_whether_it_listens_or_not(played, open_jobs, answers):
-    jobs, _ = open_jobs(cancel_grace_s=600 if answers else 0.1)
+    jobs, _ = open_jobs(cancel_grace_s=600 if answers else 0.1, start_process=played.start)
     job = begun(jobs)
     if answers:
-        played.send(JobCancelled())
+        played.end_with(JobCancelled())
     over = jobs.cancel(job.id) if not answers else until_state(jobs, job, "cancelled", "done")
     assert (over.state, over.error, over.files) == ("cancelled", None, ("report.json",))
     if not answers:
@@ -411,7 +416,7 @@ def test_a_cancelled_episode_keeps_its_steps_whether_it_listens_or_not(played, o
 
 
 def test_an_episode_that_was_cancelled_before_it_began_leaves_nothing(played, open_jobs, data_dir):
-    jobs, _ = open_jobs()
+    jobs, _ = open_jobs(start_process=played.start)
     begun(jobs)
     (data_dir / "given").mkdir()
     waiting = jobs.submit("episode", {"scene": "s1"}, data_dir / "given")

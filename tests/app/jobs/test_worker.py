@@ -1,30 +1,29 @@
 import dataclasses
-from multiprocessing import Pipe
 from pathlib import Path
-from threading import Event
+from threading import Thread
 
 import pytest
 
-import app.jobs.worker as job_process
 from app.jobs.context import JobContext, JobControl
-from app.jobs.worker import KINDS, job_main
-from app.processes.child_process import end, launch
-from app.processes.messages import (
-    AskStage,
+from app.jobs.worker import KINDS, job_main, run_job
+from app.processes.child_process import launch
+from app.processes.job_messages import (
     CancelJob,
     ChangeJob,
-    Failure,
     JobCancelled,
-    JobDone,
     JobRests,
     JobStep,
     PauseJob,
-    Reply,
     ResumeJob,
+    RunJob,
+    SceneCommand,
     StepJob,
-    TakeImage,
 )
-from app.processes.sim_client import StageError
+from app.processes.process_client import ProcessClient
+from app.processes.process_server import Answer, InternalError, child_main
+from app.processes.request_queue import Request
+from app.processes.scene_messages import TakeImage
+from osfcore.errors import UnknownName
 from tests.app.conftest import until
 
 TABLE = {"images": 60, "size": 16, "seed": 0}
@@ -32,138 +31,105 @@ TABLE = {"images": 60, "size": 16, "seed": 0}
 
 @pytest.fixture
 def start(data_dir, tmp_path):
-    """Starts a job process; gives its pipe. All of them end with the test."""
+    """Starts a job process; gives its client, the future of its outcome, its events and its folder."""
     started = []
 
     def start(kind, params):
-        folder = tmp_path / f"job{len(started)}"
+        folder, events = tmp_path / f"job{len(started)}", []
         folder.mkdir()
-        started.append((*launch(job_main, "job", kind, params, JobContext(data_dir, folder)), folder))
-        return started[-1]
+        client = ProcessClient(job_main, (), "job", on_event=events.append)
+        started.append(client)
+        return client, client.submit(RunJob(kind, params, data_dir, folder)), events, folder
 
     yield start
-    for process, connection, _ in started:
-        end(process)
-        connection.close()
-
-
-def told(connection):
-    """All messages to the end."""
-    messages = []
-    try:
-        while True:
-            messages.append(connection.recv())
-    except EOFError:
-        return messages
+    for client in started:
+        client.stop()
 
 
 def test_steps_rise_to_the_end_and_files_are_there(start):
-    process, connection, folder = start("collect_table", TABLE)
-    *steps, last = told(connection)
-    assert isinstance(last, JobDone)
+    _, outcome, steps, folder = start("collect_table", TABLE)
+    assert isinstance(outcome.result(60), dict)
     assert all(isinstance(step, JobStep) for step in steps)
     counts = [step.done for step in steps]
     assert counts == sorted(counts)
     assert counts[-1] == steps[-1].total == 60
     assert {path.name for path in folder.iterdir()} == {"table", "table.zip"}
-    end(process, 5)
-    assert process.exitcode == 0
 
 
 def test_a_refusal_is_told_in_its_words(start):
-    _, connection, _ = start("collect_object", {**TABLE, "name": "teapot"})
-    (failure,) = told(connection)
-    assert isinstance(failure, Failure)
-    assert failure.kind == "UnknownName"
-    assert "teapot" in failure.text
+    _, outcome, events, _ = start("collect_object", {**TABLE, "name": "teapot"})
+    with pytest.raises(UnknownName, match="teapot"):
+        outcome.result(60)
+    assert events == []
 
 
 def test_a_defect_is_told_without_a_traceback(start):
-    _, connection, _ = start("collect_table", {"sizes": 3})
-    (failure,) = told(connection)
-    assert failure.kind == "Internal"
-    assert "TypeError" in failure.text
-    assert "\n" not in failure.text
+    _, outcome, _, _ = start("collect_table", {"sizes": 3})
+    with pytest.raises(InternalError, match=r"The job failed \(TypeError\)") as failure:
+        outcome.result(60)
+    assert "\n" not in str(failure.value)
 
 
 def test_cancelling_ends_between_steps(start):
-    _, connection, folder = start("collect_table", {**TABLE, "images": 5000})
-    connection.recv()
-    connection.send(CancelJob())
-    assert isinstance(told(connection)[-1], JobCancelled)
+    client, outcome, events, folder = start("collect_table", {**TABLE, "images": 5000})
+    until(lambda: events)
+    client.notify(CancelJob())
+    assert isinstance(outcome.result(60), JobCancelled)
     assert not (folder / "table").exists()
 
 
-def test_a_job_whose_service_died_ends(start):
-    process, connection, _ = start("collect_table", {**TABLE, "images": 5000})
-    connection.recv()
+def test_a_job_whose_service_died_ends(data_dir, tmp_path):
+    process, connection = launch(child_main, "job", job_main, "job")
+    connection.send(Request(1, RunJob("collect_table", {**TABLE, "images": 5000}, data_dir, tmp_path)))
+    while not isinstance(connection.recv(), JobStep):
+        pass
     connection.close()
     until(lambda: not process.is_alive())
 
 
 def test_pausing_holds_and_cancelling_frees():
-    ours, theirs = Pipe()
-    lost = Event()
-    orders = JobControl(theirs, on_lost=lost.set)
-    ours.send(PauseJob())
-    until(lambda: not orders._may_run.is_set())
-    ours.send(ResumeJob())
-    until(orders._may_run.is_set)
-    assert not orders.must_stop()
-    ours.send(PauseJob())
-    ours.send(CancelJob())
-    until(orders._is_cancelled.is_set)
-    assert orders.must_stop()
-    ours.close()
-    assert lost.wait(10)
-    theirs.close()
+    control, held = JobControl(lambda _: None), []
+    control.take(PauseJob())
+    assert control.is_paused
+    waiting = Thread(target=lambda: held.append(control.must_stop()))
+    waiting.start()
+    control.take(ResumeJob())
+    waiting.join(10)
+    assert held == [False]
+    control.take(PauseJob())
+    control.take(CancelJob())
+    assert control.must_stop()
 
 
-@pytest.fixture
-def wired():
-    """Orders of a job, and the service's end of the pipe."""
-    ours, theirs = Pipe()
-    lost = Event()
-    yield JobControl(theirs, on_lost=lost.set), ours
-    ours.close()
-    assert lost.wait(10)
-    theirs.close()
+def test_a_single_step_rests_after_its_round():
+    control = JobControl(lambda _: None)
+    control.take(PauseJob())
+    control.take(StepJob())
+    assert not control.must_stop()  # it goes on in the middle of the round
+    assert control.rests_now()
+    assert control.is_paused
+    control.take(ResumeJob())
+    assert not control.rests_now()
 
 
-def test_a_single_step_rests_after_its_round(wired):
-    orders, ours = wired
-    ours.send(PauseJob())
-    until(lambda: not orders._may_run.is_set())
-    ours.send(StepJob())
-    until(orders._may_run.is_set)
-    assert not orders.must_stop()  # it goes on in the middle of the round
-    assert orders.rests_now()
-    assert not orders._may_run.is_set()
-    ours.send(ResumeJob())
-    until(orders._may_run.is_set)
-    assert not orders.rests_now()
+def test_changes_come_in_order_and_once():
+    control = JobControl(lambda _: None)
+    control.take(ChangeJob({"a": 1}))
+    control.take(ChangeJob({"a": 2}))
+    assert control.changes() == [{"a": 1}, {"a": 2}]
+    assert control.changes() == []
 
 
-def test_changes_come_in_order_and_once(wired):
-    orders, ours = wired
-    ours.send(ChangeJob({"a": 1}))
-    ours.send(ChangeJob({"a": 2}))
-    until(lambda: orders._changes.qsize() == 2)
-    assert orders.changes() == [{"a": 1}, {"a": 2}]
-    assert orders.changes() == []
-
-
-def test_a_job_asks_for_what_it_wants_done_with_its_scene(wired):
-    orders, ours = wired
-    asked = TakeImage("s1", "goal", 32)
-    ours.send(Reply(0, b"picture"))
-    assert orders.ask(asked) == b"picture"
-    message = ours.recv()
-    assert isinstance(message, AskStage)
-    assert message.command == asked
-    ours.send(Failure(0, "UnknownName", "There is no such scene."))
-    with pytest.raises(StageError, match="no such scene"):
-        orders.ask(asked)
+def test_a_job_asks_for_what_it_wants_done_with_its_scene():
+    sent = []
+    control, command = JobControl(sent.append), TakeImage("s1", "goal", 32)
+    control.take(Answer(0, b"picture"))
+    assert control.ask(command) == b"picture"
+    assert [type(message) for message in sent] == [SceneCommand]
+    assert sent[0].command == command
+    control.take(Answer(0, error=UnknownName("scene", "s1", [])))
+    with pytest.raises(UnknownName, match="no scene"):
+        control.ask(command)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,23 +144,20 @@ class Told:
     ends_round: bool = False
 
 
-def run(monkeypatch, steps, orders=None):
+def run(monkeypatch, steps, orders=()):
     """What a job tells that makes these steps faster than they are worth telling."""
     told = []
+    control = JobControl(told.append)
+    for order in orders:
+        control.take(order)
 
-    class Connection:
-        send = staticmethod(told.append)
-
-    class Deaf:
-        def rests_now(self):
-            return False
-
-        def must_stop(self):
-            return False
+    def send(message):
+        told.append(message)
+        if isinstance(message, JobRests):
+            control.take(ResumeJob())
 
     monkeypatch.setitem(KINDS, "played", lambda *_: (step for step in steps))
-    monkeypatch.setattr(job_process, "STEP_INTERVAL_S", float("inf"))
-    outcome = job_process._run(Connection(), orders or Deaf(), "played", {}, JobContext(Path("d"), Path("f")))
+    outcome = run_job(RunJob("played", {}, Path("d"), Path("f")), control, send, float("inf"))
     return told, outcome
 
 
@@ -203,8 +166,7 @@ def test_steps_that_must_be_told_are_never_thinned_out(monkeypatch):
     told, outcome = run(monkeypatch, steps)
     assert [step.done for step in told] == list(range(0, 30, 3))
     assert [step.seen for step in told] == [f"view {number}" for number in range(0, 30, 3)]
-    assert isinstance(outcome, JobDone)
-    assert outcome.result == {"must_be_told": False, "ends_round": False}
+    assert outcome == {"must_be_told": False, "ends_round": False}
 
 
 def test_steps_that_come_too_fast_are_not_told_but_the_last_one_is(monkeypatch):
@@ -213,18 +175,8 @@ def test_steps_that_come_too_fast_are_not_told_but_the_last_one_is(monkeypatch):
 
 
 def test_a_job_tells_that_it_rests_where_a_round_ends_and_only_then(monkeypatch):
-    class Stepping:
-        left = 1
-
-        def rests_now(self):
-            self.left -= 1
-            return self.left >= 0
-
-        def must_stop(self):
-            return False
-
     steps = [Told(1, True), Told(2, True, ends_round=True), Told(3, True), Told(4, True, ends_round=True)]
-    told, _ = run(monkeypatch, steps, Stepping())
+    told, _ = run(monkeypatch, steps, [PauseJob(), StepJob()])
     assert [type(message) for message in told] == [JobStep, JobStep, JobRests, JobStep, JobStep]
 
 

@@ -2,7 +2,7 @@ import pickle
 
 import numpy as np
 
-from app.processes.neural_messages import CompareView, Comparison, DrawnView, DrawView, NumberedOrder
+from app.processes.neural_messages import CompareView, Comparison, DrawnView, DrawView
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -18,7 +18,6 @@ def test_all_survive_the_way_to_the_other_process():
         DrawnView(np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32)),
         Comparison(b"a", b"b", b"c", 30.0),
     ):
-        back = pickle.loads(pickle.dumps(NumberedOrder(7, message)))
-        assert back.number == 7
-        assert type(back.order) is type(message)
-    assert back.order == Comparison(b"a", b"b", b"c", 30.0)
+        back = pickle.loads(pickle.dumps(message))
+        assert type(back) is type(message)
+    assert back == Comparison(b"a", b"b", b"c", 30.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.processes.neural_messages import DrawView, Predicted, PredictPushes
-from app.processes.predict_process import Oracle
+from app.processes.predict_process import PushPredictor
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
@@ -17,7 +17,7 @@ TOWARD = np.tile([0.3, 0.0, 0.0], (1, 6, 1))  # the pusher of `state` passes the
 
 @pytest.fixture(scope="module")
 def oracle(fields_dir):
-    return Oracle(fields_dir)
+    return PushPredictor(fields_dir)
 
 
 def beside(state):
@@ -64,7 +64,7 @@ def test_models_are_kept_until_a_field_changes_and_order_does_not_matter(fields_
     shutil.copytree(fields_dir, tmp_path / "own")
     other = "006_mustard_bottle"
     write_box(tmp_path / "own", other, SIZE_M, (0.1, 0.1, 0.1))
-    oracle = Oracle(tmp_path / "own")
+    oracle = PushPredictor(tmp_path / "own")
     first = oracle._model((BOX, other))
     assert oracle._model((other, BOX)) is first
     poses = Pose(np.array([[0.05, -0.02, 0.04], [0.05, 0.2, 0.04]]), np.tile([1.0, 0, 0, 0], (2, 1)))

@@ -5,8 +5,10 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from app.processes.messages import Act, AdoptScene, CreateScene, ResetScene, SceneChanged, TakeImage
-from app.processes.sim_client import MAX_PENDING, StageBusy, StageError, StageLink, StageUnavailable
+from app.processes.process_client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessUnavailable
+from app.processes.scene_messages import Act, AdoptScene, CreateScene, ResetScene, SceneChanged, TakeImage
+from app.processes.sim_process import simulation_main
+from osfcore.errors import OverlappingObjects, UnknownName
 from osfcore.geometry.poses import Pose
 from tests.app.conftest import until
 
@@ -33,9 +35,22 @@ def desk():
     return Desk()
 
 
+def simulation(library, desk, answer_s=30.0):
+    return ProcessClient(
+        simulation_main,
+        (library.root, 2),
+        "simulation",
+        answer_s=answer_s,
+        keeps_running=True,
+        greeting=desk.greeting,
+        on_event=desk.take,
+        on_lost=desk.lose,
+    )
+
+
 @pytest.fixture
 def link(library, desk):
-    link = StageLink(library.root, 2, 30.0, desk.greeting, desk.take, desk.lose)
+    link = simulation(library, desk)
     link.start()
     yield link
     link.stop()
@@ -49,15 +64,14 @@ def create(link, scene="a", names=("003_cracker_box",), poses=None):
 def test_commands_are_answered_and_refusals_told(link):
     made = create(link)
     assert made.state.names == ("003_cracker_box",)
-    with pytest.raises(StageError, match="teapot") as refused:
+    with pytest.raises(UnknownName, match="teapot"):
         create(link, "b", ("teapot",))
-    assert refused.value.kind == "UnknownName"
-    with pytest.raises(StageError, match="no scene"):
+    with pytest.raises(UnknownName, match="no scene"):
         link.call(ResetScene("b"))
     assert link.status == "ready"
 
 
-def test_a_killed_stage_comes_back_with_its_scenes(link, desk):
+def test_a_killed_simulation_comes_back_with_its_scenes(link, desk):
     create(link)
     moved = link.call(Act("a", (np.array([0.1, 0.1, 0.0]),)))
     process = link.process
@@ -75,17 +89,17 @@ def test_waiting_commands_fail_clearly_when_it_dies(link):
     pending = [link.submit(TakeImage("a", "0", 1024)) for _ in range(5)]
     os.kill(link.process.pid, signal.SIGKILL)
     for future in pending[1:]:
-        with pytest.raises(StageUnavailable, match="restarted"):
+        with pytest.raises(ProcessUnavailable, match="restarted"):
             future.result(20)
 
 
-def test_a_stage_that_hangs_is_replaced(library, desk):
-    link = StageLink(library.root, 2, 1.0, desk.greeting, desk.take, desk.lose)
+def test_a_simulation_that_hangs_is_replaced(library, desk):
+    link = simulation(library, desk, 1.0)
     link.start()
     until(lambda: link.status == "ready")
     hung = link.process
     os.kill(hung.pid, signal.SIGSTOP)
-    with pytest.raises(StageUnavailable, match="did not answer"):
+    with pytest.raises(ProcessUnavailable, match="did not answer"):
         create(link)
     until(lambda: link.process is not hung and link.status == "ready")
     link.stop()
@@ -95,14 +109,14 @@ def test_too_much_at_once_is_refused(link):
     create(link)
     futures: list[Future] = [link.submit(TakeImage("a", "0", 48)) for _ in range(3 * MAX_PENDING)]
     outcomes = [future.exception(60) for future in futures]
-    assert {type(outcome) for outcome in outcomes} == {type(None), StageBusy}
+    assert {type(outcome) for outcome in outcomes} == {type(None), ProcessBusy}
 
 
 def test_after_stopping_nothing_is_taken(library, desk):
-    link = StageLink(library.root, 2, 5.0, desk.greeting, desk.take, desk.lose)
+    link = simulation(library, desk, 5.0)
     link.start()
     link.stop()
-    with pytest.raises(StageUnavailable):
+    with pytest.raises(ProcessUnavailable):
         create(link)
     assert not link.process.is_alive()
     assert desk.lost == 0
@@ -110,6 +124,6 @@ def test_after_stopping_nothing_is_taken(library, desk):
 
 def test_poses_overlapping_leave_no_scene(link, desk):
     poses = Pose(np.array([[0, 0, 0.2], [0, 0, 0.2]]), np.array([[1.0, 0, 0, 0]] * 2))
-    with pytest.raises(StageError, match="overlap"):
+    with pytest.raises(OverlappingObjects):
         create(link, "c", ("003_cracker_box", "006_mustard_bottle"), poses)
     assert desk.records == {}

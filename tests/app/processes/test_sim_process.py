@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.processes.messages import (
+from app.processes.process_server import Answer, ProcessServer, Ready
+from app.processes.request_queue import Request
+from app.processes.scene_messages import (
     Act,
     ComposedGoal,
     ComposeGoal,
     CreateScene,
     DropScene,
     EditScene,
-    Failure,
     FramesTaken,
-    Leave,
     ObserveScene,
-    Reply,
-    Request,
     ResetScene,
     SceneChanged,
     ShowScene,
@@ -30,7 +28,8 @@ from app.processes.messages import (
     TakeView,
     WatchFrames,
 )
-from app.processes.sim_process import MASK_COLOURS, Stage, draw_masks
+from app.processes.sim_process import MASK_COLOURS, Simulation, draw_masks
+from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -41,14 +40,17 @@ BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 
 
 class Director:
-    """The other end of a stage that runs in a thread."""
+    """The other end of a simulation that runs in a thread."""
 
     def __init__(self, library, max_live_worlds):
-        self._ours, theirs = Pipe()
+        self._ours, self._theirs = Pipe()
         self._executor = ThreadPoolExecutor(2)
-        self.stage = Stage(theirs, library, self._executor, max_live_worlds)
-        self._thread = Thread(target=self.stage.serve)
+        server = ProcessServer(self._theirs, "simulation")
+        self._simulation = Simulation(server.send, library, self._executor, max_live_worlds)
+        serve = {"idle": self._simulation.idle}
+        self._thread = Thread(target=server.serve, args=(self._simulation.carry_out,), kwargs=serve)
         self._thread.start()
+        assert isinstance(self.next(), Ready)
         self._number = 0
         self.events = []
 
@@ -57,9 +59,9 @@ class Director:
         self._ours.send(Request(self._number, command))
         while True:
             message = self.next()
-            if isinstance(message, Reply | Failure):
+            if isinstance(message, Answer):
                 assert message.number == self._number
-                return message.value if isinstance(message, Reply) else message
+                return message.error or message.value
             self.events.append(message)
 
     def next(self):
@@ -67,12 +69,11 @@ class Director:
         return self._ours.recv()
 
     def close(self):
-        self._ours.send(Request(0, Leave()))
-        self._thread.join()
-        self.stage.close()
-        self._executor.shutdown()
         self._ours.close()
-        self.stage._connection.close()
+        self._thread.join()
+        self._simulation.close()
+        self._executor.shutdown()
+        self._theirs.close()
 
 
 @pytest.fixture
@@ -149,9 +150,9 @@ def test_refusals_change_nothing(director):
         TakeMask("a", "0", "teapot", 64),
         ResetScene("z"),
     ):
-        assert isinstance(director.call(command), Failure)
+        assert isinstance(director.call(command), OsfError)
     assert director.call(DropScene("a")) is None
-    assert isinstance(director.call(ResetScene("a")), Failure)
+    assert isinstance(director.call(ResetScene("a")), OsfError)
 
 
 def test_live_images_come_when_watched_and_only_after_changes(director):
@@ -208,7 +209,7 @@ def test_a_scene_is_observed_as_the_robot_sees_it_and_nothing_tells_the_truth(di
     assert [camera.name for camera in goal.cameras] == ["goal"]
     assert goal.masks is None
     assert goal.pusher is None
-    assert director.call(ObserveScene("b", tmp_path / "none", goal=False, masks=True)).kind == "UnknownName"
+    assert isinstance(director.call(ObserveScene("b", tmp_path / "none", goal=False, masks=True)), UnknownName)
 
 
 def pixels(png):
@@ -261,19 +262,17 @@ def test_a_goal_is_composed_and_the_scene_and_its_time_stay(director, used, aske
 @pytest.mark.parametrize(
     ("asked", "kind"),
     [
-        ({"poses": (("teapot", Pose.identity()),)}, "UnknownName"),
-        ({"poses": ((BOX, Pose(np.array([9.0, 0, 0.1]), np.array([1.0, 0, 0, 0]))),)}, "InvalidInput"),
-        ({"seed": 0, "moved": 3}, "InvalidInput"),
-        ({"size": 4}, "InvalidInput"),
-        ({"poses": BOTTLE}, "OverlappingObjects"),
+        ({"poses": (("teapot", Pose.identity()),)}, UnknownName),
+        ({"poses": ((BOX, Pose(np.array([9.0, 0, 0.1]), np.array([1.0, 0, 0, 0]))),)}, InvalidInput),
+        ({"seed": 0, "moved": 3}, InvalidInput),
+        ({"size": 4}, InvalidInput),
+        ({"poses": BOTTLE}, OverlappingObjects),
     ],
 )
 def test_a_goal_that_cannot_be_leaves_the_scene_and_its_time_too(director, used, asked, kind):
     if asked.get("poses") == BOTTLE:
         asked = {"poses": ((BOX, used.state.pose(BOTTLE)),)}
-    failure = director.call(ComposeGoal("a", **asked))
-    assert isinstance(failure, Failure)
-    assert failure.kind == kind
+    assert type(director.call(ComposeGoal("a", **asked))) is kind
     assert is_as_it_was(director, used)
 
 
@@ -283,7 +282,7 @@ def test_a_goal_of_a_scene_that_left_memory_or_never_was(director, used):
     made = director.call(ComposeGoal("a", size=64))
     np.testing.assert_allclose(dict(made.poses)[BOX].position, used.state.pose(BOX).position, atol=2e-3)
     assert is_as_it_was(director, used)
-    assert director.call(ComposeGoal("z")).kind == "UnknownName"
+    assert isinstance(director.call(ComposeGoal("z")), UnknownName)
 
 
 def test_a_goal_shows_what_the_goal_camera_would_see_without_the_pusher(director, used):
@@ -303,5 +302,5 @@ def test_any_camera_may_look(director, used):
     without = pixels(director.call(TakeView("a", goal_camera(64), pusher=False)))
     assert (square != without).any()
     np.testing.assert_array_equal(square, pixels(director.call(TakeImage("a", "goal", 64))))
-    assert director.call(TakeView("z", camera)).kind == "UnknownName"
+    assert isinstance(director.call(TakeView("z", camera)), UnknownName)
     assert is_as_it_was(director, used)

@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.processes.messages import ComposedGoal
-from app.processes.sim_client import StageError, StageUnavailable
+from app.processes.process_client import ProcessUnavailable
+from app.processes.process_server import InternalError
+from app.processes.scene_messages import ComposedGoal
 from app.services.event_hub import Hub
 from app.services.goals import GOAL_SIDE, Draft, DraftChanged, DraftUnsound, Goals, GoalsChanged, NoDraft, NoTable
 from app.services.runner import SceneHeld
 from app.storage.database import CannotStore
 from app.storage.goal_store import TooManyGoals
 from app.storage.photos import PhotoRefused
-from osfcore.errors import InvalidInput, UnknownName
+from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from tests.app.storage.test_database import record
 
-OVERLAP = StageError("OverlappingObjects", "x and y overlap by 3 mm.")
+OVERLAP = OverlappingObjects("x", "y", 0.003)
 
 
 def at(x, y=0.0):
@@ -136,7 +137,7 @@ def test_a_random_layout_is_asked_for_by_seed(goals, runner):
     assert (command.seed, command.moved, command.poses, made.source) == (7, 2, (), "drawn")
 
 
-@pytest.mark.parametrize("error", [OVERLAP, SceneHeld("s", "j"), StageUnavailable("restarting")])
+@pytest.mark.parametrize("error", [OVERLAP, SceneHeld("s", "j"), ProcessUnavailable("simulation", "died")])
 def test_a_goal_that_cannot_be_made_is_told_and_not_kept(goals, runner, error):
     runner.error = error
     for call in (
@@ -193,7 +194,7 @@ def test_a_draft_begins_where_things_are_and_follows_the_hand(goals, runner):
 
 def test_a_problem_is_told_and_goes_with_its_cause(goals, runner):
     goals.begin_draft()
-    for error in (OVERLAP, StageError("InvalidInput", "x is not over the table.")):
+    for error in (OVERLAP, InvalidInput("x", "away", "over the table")):
         runner.error = error
         bad = goals.move_draft((("x", at(0.2)),))
         assert (bad.problem, goals.draft) == (str(error), bad)
@@ -209,7 +210,9 @@ def test_a_problem_is_told_and_goes_with_its_cause(goals, runner):
     assert goals.draft_image() == b"picture 2"
 
 
-@pytest.mark.parametrize("error", [SceneHeld("s", "j"), StageUnavailable("x"), StageError("Internal", "It failed.")])
+@pytest.mark.parametrize(
+    "error", [SceneHeld("s", "j"), ProcessUnavailable("simulation", "x"), InternalError("simulation", ValueError())]
+)
 def test_what_is_not_the_hands_fault_is_raised_and_changes_nothing(goals, runner, error):
     begun = goals.begin_draft()
     runner.error = error

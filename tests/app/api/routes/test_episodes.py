@@ -8,7 +8,7 @@ import pytest
 
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
-from app.jobs.outcomes import STOPPED, after
+from app.jobs.outcomes import JobStopped, after
 from osfcore.io.image_file import write_png
 from osfcore.io.scene_file import Scene, scene_to_json
 from tests.app.api.routes.test_jobs import LONG
@@ -59,7 +59,7 @@ def interrupted(services, scene, waiting):
     }
     notice = {"step": 0, "matter": "lamp", "text": "The lamp was moved."}
     (folder / REPORT_FILE).write_text(json.dumps({"steps": [step], "noticed": [notice]}))
-    jobs._set(after(jobs.get(name), STOPPED, folder))
+    jobs._set(after(jobs.get(name), JobStopped(), folder))
     return name
 
 

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from app.api.routes.events import Mailbox
-from app.processes.messages import CurrentScene, FramesTaken, Notice, SceneChanged
+from app.processes.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
+from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import Draft, DraftChanged, GoalsChanged
 from tests.app.api.routes.test_jobs import TABLE
 from tests.app.conftest import until

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.processes.sim_client import StageError
+from osfcore.errors import UnknownName
 from osfcore.geometry.workspace import STEP_S
 from tests.app.api.test_problems import is_problem
 
@@ -188,7 +188,7 @@ def test_missing_scenes_are_not_found(service, method, tail):
 def test_an_image_of_a_scene_deleted_meanwhile_is_not_found(service, services, scene, monkeypatch):
     async def gone(command):
         services.runner.delete_scene(command.id)
-        raise StageError("UnknownName", "There is no scene.")
+        raise UnknownName("scene", "a", [])
 
     monkeypatch.setattr(services.runner, "image", gone)
     is_problem(service.get(f"/api/scenes/{scene['id']}/images/0.png"), 404)

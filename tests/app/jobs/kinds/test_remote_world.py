@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from app.jobs.kinds.remote_world import RemoteWorld
-from app.processes.messages import Act, ObserveScene, SceneRecord, TakeView
-from app.processes.sim_client import StageError
-from osfcore.errors import InvalidInput, OsfError
+from app.processes.scene_messages import Act, ObserveScene, SceneRecord, TakeView
+from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.io.observation_file import write_observation
 from osfcore.world.tabletop import SceneRequest, Tabletop
@@ -95,7 +94,7 @@ def test_a_photo_shows_what_any_camera_sees_with_the_pusher(remote, stage, size)
 
 def test_what_the_stage_refuses_is_told(tmp_path):
     def refuse(_):
-        raise StageError("UnknownName", "There is no scene named 's1'.")
+        raise UnknownName("scene", "s1", [])
 
     remote = RemoteWorld(refuse, "s1", tmp_path)
     for call in (

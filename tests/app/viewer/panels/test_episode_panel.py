@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app.jobs.job import Job, JobChanged, JobSeen, State
-from app.processes.messages import CurrentScene, SceneChanged
+from app.processes.scene_messages import SceneChanged
+from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
 from app.viewer.nodes.episode_nodes import PARTS, EpisodeNodes
 from app.viewer.nodes.scene_nodes import SceneNodes

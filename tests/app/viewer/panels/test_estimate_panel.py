@@ -10,8 +10,8 @@ import viser
 from PIL import Image
 
 from app.jobs.job import Job, JobChanged, JobSeen
-from app.processes.messages import CurrentScene
 from app.processes.neural_messages import Comparison
+from app.services.event_hub import CurrentScene
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.estimate_panel import EstimatePanel

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.processes.messages import CurrentScene
+from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged, NoDraft
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.panels.goal_panel import NAME, WRONG, GoalPanel

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.processes.neural_client import NeuralUnavailable
 from app.processes.neural_messages import DrawnView
+from app.processes.process_client import ProcessUnavailable
 from app.viewer.panels.neural_panel import NeuralPanel
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
@@ -190,7 +190,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
 
 def test_where_the_renderer_fails_the_switch_goes_back_and_says_why(room, browser):
     browser.turn(True)
-    room.renderer.answer(0, NeuralUnavailable("neural renderer", "stopped unexpectedly"))
+    room.renderer.answer(0, ProcessUnavailable("neural renderer", "stopped unexpectedly"))
     until(lambda: browser.notifications)
     assert "stopped unexpectedly" in browser.notifications[0].body
     assert browser.switch.value is False

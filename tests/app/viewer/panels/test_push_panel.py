@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.processes.messages import CurrentScene, Notice, SceneChanged, SceneRecord
-from app.processes.neural_client import NeuralUnavailable
 from app.processes.neural_messages import Predicted
+from app.processes.process_client import ProcessUnavailable
+from app.processes.scene_messages import SceneChanged, SceneRecord
+from app.services.event_hub import CurrentScene, Notice
 from app.services.fields import MissingFields
 from app.services.pushes import MAX_ACTIONS
 from app.services.runner import SceneHeld
@@ -224,7 +225,7 @@ def test_an_answer_may_be_a_refusal_or_overtaken(room):
     room.gui.press("Predict")
     assert {asked.key for asked in room.asked} == {"viewer"}
     room.asked[0].answer.set_result(None)
-    room.asked[1].answer.set_exception(NeuralUnavailable("predictor", "stopped unexpectedly"))
+    room.asked[1].answer.set_exception(ProcessUnavailable("predictor", "stopped unexpectedly"))
     room.gui.says("stopped unexpectedly")
     assert room.refused[0][1] is SOMEBODY
 

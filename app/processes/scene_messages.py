@@ -1,18 +1,13 @@
-"""What crosses the lines between the web process, the stage process and job processes: frozen dataclasses only.
-
-Errors cross as `Failure` (class name and sentence), because exceptions with constructors of their own do not pickle.
-"""
+"""Commands to the process that simulates the scenes, and its events: frozen dataclasses only."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from osfcore.errors import OsfError
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -21,7 +16,7 @@ from osfcore.geometry.states import SceneState
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneRecord:
-    """A scene as the stage last reported it.
+    """A scene as the simulation last reported it.
 
     Attributes:
         id: identifier.
@@ -44,7 +39,7 @@ class SceneRecord:
     revision: int
 
 
-# Commands to the stage; each is answered by one Reply or Failure.
+# Commands to the simulation.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,7 +58,7 @@ class CreateScene:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AdoptScene:
-    """Take over a scene that was known before this stage started. Answered by its SceneRecord."""
+    """Take over a scene that was known before this simulation started. Answered by its SceneRecord."""
 
     record: SceneRecord
 
@@ -200,11 +195,6 @@ class WatchFrames:
     wanted: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Leave:
-    """End the process."""
-
-
 Command = (
     CreateScene
     | AdoptScene
@@ -219,52 +209,10 @@ Command = (
     | ComposeGoal
     | ShowScene
     | WatchFrames
-    | Leave
 )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Request:
-    """A command with the number under which it is answered."""
-
-    number: int
-    command: Command
-
-
-# From the stage.
-
-
-@dataclass(frozen=True, slots=True)
-class StageReady:
-    """The process has loaded its libraries and takes commands."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Reply:
-    """A command's result."""
-
-    number: int
-    value: Any
-
-
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """A command that could not be done, or a job that ended in an error.
-
-    Attributes:
-        number: of the request; 0 for a job.
-        kind: class name of the error.
-        text: one sentence for a person.
-    """
-
-    number: int
-    kind: str
-    text: str
-
-    @staticmethod
-    def of(error: OsfError, number: int = 0) -> Failure:
-        """The failure that an error amounts to."""
-        return Failure(number, type(error).__name__, str(error))
+# Events of the simulation.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -299,97 +247,3 @@ class FramesTaken:
     names: tuple[str, ...]
     images: UInt8[np.ndarray, "V h w 3"]
     jpegs: tuple[bytes, ...]
-
-
-# From and to job processes.
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class JobStep:
-    """How far a job is.
-
-    Attributes:
-        done: units finished.
-        total: units in all.
-        note: what is being done, for a person.
-        result: what its kind tells besides.
-        seen: what the live view draws of it, and nobody keeps; None for most kinds.
-    """
-
-    done: int
-    total: int
-    note: str
-    result: dict[str, Any]
-    seen: object = None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class AskStage:
-    """A job wants something done with the scene that it drives. Answered by a Reply or Failure, numbered 0."""
-
-    command: Act | ObserveScene | TakeView
-
-
-@dataclass(frozen=True, slots=True)
-class JobRests:
-    """A job has come to the end of the round after which it was to rest."""
-
-
-@dataclass(frozen=True, slots=True)
-class JobDone:
-    """A job has finished."""
-
-    result: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class JobCancelled:
-    """A job has stopped because it was asked to."""
-
-
-@dataclass(frozen=True, slots=True)
-class PauseJob:
-    """Stop after the current step, until resumed."""
-
-
-@dataclass(frozen=True, slots=True)
-class ResumeJob:
-    """Go on."""
-
-
-@dataclass(frozen=True, slots=True)
-class StepJob:
-    """Go on to the end of the current round, then rest; for kinds of jobs that have rounds."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ChangeJob:
-    """From now on, work with these parameters; for kinds of jobs that look at changes."""
-
-    params: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class CancelJob:
-    """Stop after the current step."""
-
-
-# Only within the web process.
-
-
-@dataclass(frozen=True, slots=True)
-class CurrentScene:
-    """Another scene is shown now, or none."""
-
-    record: SceneRecord | None
-
-
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """A sentence for whoever watches; `level` is "info", "warning" or "error"."""
-
-    level: str
-    text: str
-
-
-StageEvent = SceneChanged | FramesTaken

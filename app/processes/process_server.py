@@ -1,0 +1,132 @@
+"""The child's end of a pipe: receives requests in a thread, carries them out in order, sends answers and events.
+
+Exceptions cross as themselves: every `OsfError` pickles. Anything else that is raised is logged here and crosses as an
+`InternalError` without details.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from app.processes.child_process import silence_stdout
+from app.processes.request_queue import Request, RequestQueue
+from osfcore.errors import OsfError
+
+IsOvertaken = Callable[[], bool]
+_log = logging.getLogger(__name__)
+
+
+class InternalError(OsfError):
+    """A defect of this program in a child process; its log has the traceback."""
+
+    def __init__(self, who: str, error: Exception) -> None:
+        super().__init__(f"The {who} failed ({type(error).__name__}); the service's log tells more.")
+
+
+class OutOfMemory(OsfError):
+    """A child process that could not get the memory it needs."""
+
+    def __init__(self, who: str) -> None:
+        super().__init__(f"The {who} ran out of memory; take fewer or smaller images.")
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The process has loaded its libraries and takes requests."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Answer:
+    """The outcome of a request: a value or an error."""
+
+    number: int
+    value: Any = None
+    error: OsfError | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Overtaken:
+    """A request that is left undone because a newer one of its key has come."""
+
+    number: int
+
+
+class ProcessServer:
+    """Serves the requests that come through a pipe.
+
+    Args:
+        connection: to the service.
+        who: what people call this process.
+    """
+
+    def __init__(self, connection: Connection, who: str) -> None:
+        self._connection = connection
+        self._who = who
+        self._lock = threading.Lock()
+        self._queue = RequestQueue()
+
+    def send(self, message: object) -> None:
+        """Send an event; does nothing once the service has gone. Any thread may call it."""
+        with self._lock, contextlib.suppress(OSError):
+            self._connection.send(message)
+
+    def serve(
+        self,
+        carry_out: Callable[[Any, IsOvertaken], object],
+        *,
+        idle: Callable[[bool], float | None] = lambda _: None,
+        on_message: Callable[[object], None] = lambda _: None,
+        on_lost: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Carry out requests until the service has gone.
+
+        Args:
+            carry_out: returns the answer to a command; raises OsfError to refuse it.
+            idle: called between requests with whether one waits; returns after which time without requests it is to be
+                called again [s], None for not before the next request.
+            on_message: called from the receiving thread with everything that is no request.
+            on_lost: called from the receiving thread when the service has gone.
+        """
+        # Requests are received at once, however long one takes, so that the sender never blocks.
+        threading.Thread(target=self._receive, args=(on_message, on_lost), name="receive", daemon=True).start()
+        self.send(Ready())
+        while not self._queue.is_closed():
+            request = self._queue.take(idle(not self._queue.is_empty()))
+            if request is not None:
+                self.send(self._answer(carry_out, request))
+
+    def _receive(self, on_message: Callable[[object], None], on_lost: Callable[[], None]) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                message = self._connection.recv()
+                if not isinstance(message, Request):
+                    on_message(message)
+                elif (replaced := self._queue.put(message)) is not None:
+                    self.send(Overtaken(replaced.number))
+        self._queue.close()
+        on_lost()
+
+    def _answer(self, carry_out: Callable[[Any, IsOvertaken], object], request: Request) -> Answer:
+        try:
+            return Answer(request.number, carry_out(request.command, lambda: self._queue.is_overtaken(request)))
+        except OsfError as error:
+            return Answer(request.number, error=error)
+        except MemoryError:
+            return Answer(request.number, error=OutOfMemory(self._who))
+        except Exception as error:  # a defect must not end the requests of others
+            _log.exception("the %s could not carry out %s", self._who, type(request.command).__name__)
+            return Answer(request.number, error=InternalError(self._who, error))
+
+
+def child_main(connection: Connection, target: Callable[..., None], who: str, *arguments: object) -> None:
+    """Run `target(server, *arguments)`: what every child process starts with."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service decides when to stop
+    silence_stdout()
+    target(ProcessServer(connection, who), *arguments)
