@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from app.jobs.outcomes import DIED_NOTE, INTERRUPTED_NOTE
+from app.jobs.outcomes import INTERRUPTED_NOTE
 from tests.app.conftest import until
 from tests.live import free_port, start_service, stop_service
 
@@ -85,7 +85,7 @@ def test_what_was_done_is_there_after_the_worker_and_after_the_service_was_kille
         os.kill(children(service.pid)[-1], signal.SIGKILL)
         until(lambda: call(port, "GET", f"episodes/{first}")["status"] == "failed")
         broken = call(port, "GET", f"episodes/{first}")
-        assert broken["error"] == DIED_NOTE
+        assert broken["error"] == str(JobDied())
         assert len(broken["steps"]) >= 2
         second = far_away(port, scene)
         before = call(port, "GET", f"episodes/{second}")

@@ -19,7 +19,7 @@ from schemathesis.specs.openapi.checks import (
 from app.api.app_factory import create_app
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
-from app.jobs.outcomes import STOPPED, after
+from app.jobs.outcomes import after
 from app.services.episodes import FILES
 from app.services.service_settings import Settings
 from osfcore.io.files import write_json
@@ -96,7 +96,7 @@ def interrupt(jobs, name):
     folder = jobs.folder(name)
     write_png(folder / FRAMES_FOLDER / "000.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_json(folder / REPORT_FILE, {"steps": [], "noticed": []})
-    jobs._set(after(jobs.get(name), STOPPED, folder))
+    jobs._set(after(jobs.get(name), JobStopped(), folder))
 
 
 def reach(case, made):

@@ -2,40 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from app.cli.progress_bar import follow
 from app.storage.paths import default_data_dir
 
-_FIGURES, _PICTURE = "render.json", "render.png"
-_ESTIMATE_FIGURES, _DYNAMICS_FIGURES = "estimate.json", "dynamics.json"
-_SCENES = {"render": 60, "estimate": 5}
+_PICTURE = "render.png"
 
 
 @dataclass(frozen=True)
-class Bench:
-    """Measure what things cost. Run alone on the machine.
+class _Benchmark(ABC):
+    """What all benchmarks share. Run alone on the machine."""
 
-    render: new scenes against TinyRenderer, planning, growth. estimate: first frames, later frames and goals.
-    dynamics: 1,000 sequences of ten pushes among three objects.
-    """
-
-    what: tyro.conf.Positional[Literal["render", "estimate", "dynamics"]]
-    """What to measure."""
+    FIGURES: ClassVar[str]  # the file that holds the result
     out: Path | None = None
-    """Folder for the figures as JSON and, with render, a picture of scenes by TinyRenderer and by us."""
-    seed: int = 0
-    """Of all scenes."""
-    scenes: int | None = None
-    """New scenes; by default 60 to render and 5 to estimate."""
-    repeats: int = 5
-    """With render: of everything else."""
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
-    """With dynamics: what computes."""
+    """Folder for the figures as JSON and, of rendering, a picture of scenes by TinyRenderer and by us."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Where fetched objects and trained fields are."""
     json: bool = False
@@ -43,88 +29,117 @@ class Bench:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds figures and tables."""
-        if self.what == "dynamics":
-            return self._dynamics()
-        scenes = _SCENES[self.what] if self.scenes is None else self.scenes
-        return self._estimate(scenes) if self.what == "estimate" else self._render(scenes)
+        from osfcore.io.files import write_json
+        from osfcore.io.output_paths import check_place
 
-    def _render(self, scenes: int) -> dict[str, Any]:
+        if self.out is not None:  # before the work begins
+            for name in (self.FIGURES, _PICTURE):
+                check_place(self.out / name)
+        result = self._measure()
+        if self.out is not None:
+            write_json(self.out / self.FIGURES, result)
+        if not self.json:
+            self._show(result)
+        return result
+
+    @abstractmethod
+    def _measure(self) -> dict[str, Any]:
+        """The figures."""
+
+    @abstractmethod
+    def _show(self, result: dict[str, Any]) -> None:
+        """Print the figures for people."""
+
+
+@dataclass(frozen=True)
+class BenchRenderCommand(_Benchmark):
+    """New scenes against TinyRenderer, planning, growth."""
+
+    FIGURES: ClassVar[str] = "render.json"
+    scenes: int = 60
+    """New scenes."""
+    repeats: int = 5
+    """Of everything else."""
+    seed: int = 0
+    """Of all scenes."""
+
+    def _measure(self) -> dict[str, Any]:
         from osfcore.experiments.benchmarks.rendering import BenchRender, bench_render
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.inspection.contact_sheet import contact_sheet
-        from osfcore.io.files import write_json
         from osfcore.io.image_file import write_png
         from osfcore.objects.asset_library import AssetLibrary
 
-        config = BenchRender(scenes=scenes, repeats=self.repeats, seed=self.seed)
-        self._check_places(_FIGURES, _PICTURE)
-        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
-        last = follow(bench_render(config, fields, assets))
+        config = BenchRender(scenes=self.scenes, repeats=self.repeats, seed=self.seed)
+        last = follow(bench_render(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
-        result = last.report.to_json()
         if self.out is not None:
-            write_json(self.out / _FIGURES, result)
             write_png(self.out / _PICTURE, contact_sheet(last.report.shown, truth="Tiny"))
-        if not self.json:
-            _show(result)
-        return result
+        return last.report.to_json()
 
-    def _estimate(self, scenes: int) -> dict[str, Any]:
+    def _show(self, result: dict[str, Any]) -> None:
+        _show_render(result)
+
+
+@dataclass(frozen=True)
+class BenchEstimateCommand(_Benchmark):
+    """First frames, later frames and goals."""
+
+    FIGURES: ClassVar[str] = "estimate.json"
+    scenes: int = 5
+    """New scenes."""
+    seed: int = 0
+    """Of all scenes."""
+
+    def _measure(self) -> dict[str, Any]:
         from osfcore.experiments.benchmarks.estimation import BenchEstimate, bench_estimate
         from osfcore.fields.field_library import FieldLibrary
-        from osfcore.io.files import write_json
         from osfcore.objects.asset_library import AssetLibrary
 
-        self._check_places(_ESTIMATE_FIGURES)
-        config = BenchEstimate(scenes=scenes, seed=self.seed)
+        config = BenchEstimate(scenes=self.scenes, seed=self.seed)
         last = follow(bench_estimate(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
-        result = last.report.to_json()
-        if self.out is not None:
-            write_json(self.out / _ESTIMATE_FIGURES, result)
-        if not self.json:
-            print(
-                f"{result['scenes']} scenes of {result['objects']} objects, {result['threads']} threads, medians: "
-                f"first frame {result['first_s']:.1f} s, later frame {result['next_s']:.2f} s "
-                f"({result['refine_hz']:.1f} Hz), goal {result['goal_s']:.1f} s."
-            )
-        return result
+        return last.report.to_json()
 
-    def _dynamics(self) -> dict[str, Any]:
-        from dataclasses import asdict
+    def _show(self, result: dict[str, Any]) -> None:
+        print(
+            f"{result['scenes']} scenes of {result['objects']} objects, {result['threads']} threads, medians: "
+            f"first frame {result['first_s']:.1f} s, later frame {result['next_s']:.2f} s "
+            f"({result['refine_hz']:.1f} Hz), goal {result['goal_s']:.1f} s."
+        )
 
+
+@dataclass(frozen=True)
+class BenchDynamicsCommand(_Benchmark):
+    """1,000 sequences of ten pushes among three objects."""
+
+    FIGURES: ClassVar[str] = "dynamics.json"
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """What computes."""
+
+    def _measure(self) -> dict[str, Any]:
         from osfcore.dynamics.network_weights import read_network
         from osfcore.dynamics.push_models import load_shapes, network_path
-        from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, HORIZON, SEQUENCES, bench_rollouts
+        from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, bench_rollouts
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
-        from osfcore.io.files import write_json
 
-        self._check_places(_DYNAMICS_FIGURES)
         shapes = load_shapes(self.data_dir, FieldLibrary(self.data_dir), BENCH_NAMES)
-        result = asdict(bench_rollouts(read_network(network_path(self.data_dir)), shapes, pick_device(self.device)))
-        if self.out is not None:
-            write_json(self.out / _DYNAMICS_FIGURES, result)
-        if not self.json:
-            print(
-                f"{SEQUENCES} sequences of {HORIZON} pushes among {len(BENCH_NAMES)} objects, {result['threads']} "
-                f"threads: {result['rollout_s']:.2f} s; {result['rollout_steps_per_s']:.0f} steps of scenes a second; "
-                f"something moves in {100 * result['touched_share']:.0f} % of the sequences."
-            )
-        return result
+        return asdict(bench_rollouts(read_network(network_path(self.data_dir)), shapes, pick_device(self.device)))
 
-    def _check_places(self, *names: str) -> None:
-        """Refuse what cannot be written before the work begins."""
-        from osfcore.io.output_paths import check_place
+    def _show(self, result: dict[str, Any]) -> None:
+        from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, HORIZON, SEQUENCES
 
-        if self.out is not None:
-            for name in names:
-                check_place(self.out / name)
+        print(
+            f"{SEQUENCES} sequences of {HORIZON} pushes among {len(BENCH_NAMES)} objects, {result['threads']} "
+            f"threads: {result['rollout_s']:.2f} s; {result['rollout_steps_per_s']:.0f} steps of scenes a second; "
+            f"something moves in {100 * result['touched_share']:.0f} % of the sequences."
+        )
 
 
-def _show(result: dict[str, Any]) -> None:
+def _show_render(result: dict[str, Any]) -> None:
     print(
         f"New scene: TinyRenderer {result['tinyrenderer_ms']:.1f} ms, ours {result['scene_ms']:.1f} ms "
         f"({result['ratio']:.1f} times faster, {result['threads']} threads; "
@@ -138,3 +153,11 @@ def _show(result: dict[str, Any]) -> None:
         print(f"Milliseconds by {what}: {rows}.")
     exponents = ", ".join(f"{key} {power:.2f}" for key, power in result["growth"].items() if power is not None)
     print(f"Growth (1 is in proportion): {exponents}.")
+
+
+Bench = Annotated[
+    Annotated[BenchRenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[BenchEstimateCommand, tyro.conf.subcommand("estimate")]
+    | Annotated[BenchDynamicsCommand, tyro.conf.subcommand("dynamics")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -16,134 +18,168 @@ from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from osfcore.experiments.estimation.evaluation import EstimateEvaluationStep
-    from osfcore.experiments.fields.evaluation import EvaluationStep
-
-_FOLDER = "evaluation"  # of the data directory
+    from osfcore.fields.field_library import FieldLibrary
+    from osfcore.objects.asset_library import AssetLibrary
 
 
 @dataclass(frozen=True)
-class Evaluate:
-    """Measure fields, the estimators that use them, predicted pushes, or whole episodes, on what was never trained on.
+class _Evaluation(ABC):
+    """What all evaluations share. A killed one goes on when started again, and may be run in pieces."""
 
-    fields: each object alone on unseen views under unseen lights, and scenes of several. estimate: poses and light
-    from first frames, along pushes without masks and of goals, what each ingredient is worth, and spoiled inputs.
-    dynamics: predicted pushes of two to six objects against the simulator, against a quasi-static model, and against
-    the constant pose; objects and pairs of objects that training never saw.
-    mpc: tables that shall become what a goal image shows, in 30 pushes; the same planner told the truth; no action.
-    Results are kept in the output folder: a killed evaluation goes on when started again, and may be run in pieces.
-    """
-
-    what: tyro.conf.Positional[Literal["fields", "estimate", "dynamics", "mpc"]]
-    """What to evaluate."""
     out: Path | None = None
     """Folder for results and pictures; DATA_DIR/evaluation by default."""
     names: tuple[str, ...] | None = None
-    """Objects; by default all that have a field and a mesh, with estimate the ten default ones."""
+    """Objects; by default all that have a field and a mesh."""
     tasks: int = 20
-    """Scenes against the simulator, each with its own objects and light; with fields, 0 for objects alone."""
-    objects: int = 3
-    """Objects in a scene."""
+    """Scenes against the simulator, each with its own objects and light."""
     seed: int = 0
-    """Of views, lights, scenes and searches."""
-    parts: tuple[Literal["first", "track", "goal", "ablations"], ...] = ("first", "track", "goal", "ablations")
-    """With estimate: what to measure; first frames are in any case."""
-    bad: int = 0
-    """With estimate: number of spoiled inputs (100 gives ten of each kind)."""
-    cost: Literal["pose", "image"] = "pose"
-    """With mpc: futures are compared with the goal's poses, or rendered and compared with the goal image."""
-    oracle: bool = True
-    """With mpc: also measure the planner that is told the truth."""
-    workers: int = 2
-    """With dynamics and mpc: processes that simulate side by side."""
-    data: Path | None = None
-    """With --weights: measure on the test images of this set in the OSF format instead of the simulator's."""
-    weights: Path | None = None
-    """With --data: the field to measure."""
+    """Of everything random."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Where fetched objects and trained fields are."""
     json: bool = False
     """Print the result as one JSON object in the last line."""
 
+    @property
+    def folder(self) -> Path:
+        """Where results are kept."""
+        return self.data_dir / "evaluation" if self.out is None else self.out
+
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
-        if self.what != "fields" and (self.data is not None or self.weights is not None):
-            raise InvalidInput("--data or --weights", "given", "left out: they belong to 'osf eval fields'")
-        if self.what == "dynamics":
-            return self._dynamics()
-        if self.what == "mpc":
-            return self._mpc()
-        last, show = self._estimates() if self.what == "estimate" else (follow(self._steps()), _show)
-        assert last is not None
-        assert last.report is not None, "the last step brings the report"
-        result = last.report.to_json()
-        if not self.json:
-            show(result)
-        return result
-
-    @property
-    def _folder(self) -> Path:
-        return self.data_dir / _FOLDER if self.out is None else self.out
-
-    def _steps(self) -> Iterator[EvaluationStep]:
-        from osfcore.experiments.fields.evaluation import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
+
+        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
+        with self._pool() as executor:
+            last = follow(self._steps(fields, assets, executor))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        report = last.report if isinstance(last.report, dict) else last.report.to_json()
+        if not self.json:
+            self._show(report)
+        return report
+
+    def _pool(self) -> Any:  # noqa: ANN401  a context that gives an executor, or none
+        return nullcontext()
+
+    @abstractmethod
+    def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
+        """The evaluation's steps, of which the last brings the report."""
+
+    @abstractmethod
+    def _show(self, report: dict[str, Any]) -> None:
+        """Print the report for people."""
+
+
+@dataclass(frozen=True)
+class EvaluateFieldsCommand(_Evaluation):
+    """Fields: each object alone on unseen views under unseen lights, and scenes of several."""
+
+    objects: int = 3
+    """Objects in a scene."""
+    data: Path | None = None
+    """With --weights: measure on the test images of this set in the OSF format instead of the simulator's."""
+    weights: Path | None = None
+    """With --data: the field to measure."""
+
+    def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
+        from osfcore.experiments.fields.evaluation import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
 
         if self.data is not None and self.weights is not None:
-            return evaluate_set(EvaluateSet(self.data, self.weights, self._folder))
+            return evaluate_set(EvaluateSet(self.data, self.weights, self.folder))
         if self.data is not None or self.weights is not None:
             raise InvalidInput("choice of --data and --weights", "one alone", "both or none")
-        config = EvaluateFields(self._folder, self.names, self.tasks, self.objects, self.seed)
-        return evaluate_fields(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects"))
+        config = EvaluateFields(self.folder, self.names, self.tasks, self.objects, self.seed)
+        return evaluate_fields(config, fields, assets)
 
-    def _estimates(self) -> tuple[EstimateEvaluationStep | None, Callable[[dict[str, Any]], None]]:
-        """Measure estimators; the last step, and how to show its report."""
+    def _show(self, report: dict[str, Any]) -> None:
+        _show_fields(report)
+
+
+@dataclass(frozen=True)
+class EvaluateEstimateCommand(_Evaluation):
+    """Estimates: poses and light from first frames, along pushes without masks and of goals, ablations, spoiled inputs.
+
+    Without --names, of the ten default objects.
+    """
+
+    objects: int = 3
+    """Objects in a scene."""
+    parts: tuple[Literal["first", "track", "goal", "ablations"], ...] = ("first", "track", "goal", "ablations")
+    """What to measure; first frames are in any case."""
+    bad: int = 0
+    """Number of spoiled inputs (100 gives ten of each kind)."""
+
+    def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.estimation.evaluation import evaluate_estimate
         from osfcore.experiments.estimation.parts import EvaluateEstimate
-        from osfcore.fields.field_library import FieldLibrary
-        from osfcore.objects.asset_library import AssetLibrary
 
-        config = EvaluateEstimate(self._folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
-        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
-        return follow(evaluate_estimate(config, fields, assets)), partial(_show_estimate, config.folder)
+        config = EvaluateEstimate(self.folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
+        return evaluate_estimate(config, fields, assets)
 
-    def _dynamics(self) -> dict[str, Any]:
-        """Measure predicted pushes."""
+    def _show(self, report: dict[str, Any]) -> None:
+        _show_estimate(self.folder, report)
+
+
+@dataclass(frozen=True)
+class _ParallelEvaluation(_Evaluation):
+    workers: int = 2
+    """Processes that simulate side by side."""
+
+    def _pool(self) -> Any:  # noqa: ANN401
+        return worker_pool(self.workers)
+
+
+@dataclass(frozen=True)
+class EvaluateDynamicsCommand(_ParallelEvaluation):
+    """Predicted pushes of two to six objects against the simulator, a quasi-static model and the constant pose.
+
+    Objects and pairs of objects that training never saw are among them.
+    """
+
+    def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.dynamics.evaluation import EvaluateDynamics, evaluate_dynamics
-        from osfcore.fields.field_library import FieldLibrary
-        from osfcore.objects.asset_library import AssetLibrary
 
-        config = EvaluateDynamics(self._folder, self.tasks, self.seed, self.names, self.data_dir)
-        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
-        with worker_pool(self.workers) as executor:
-            last = follow(evaluate_dynamics(config, fields, assets, executor))
-        assert last is not None
-        assert last.report is not None, "the last step brings the report"
-        if not self.json:
-            _show_dynamics(config.folder, last.report)
-        return last.report
+        config = EvaluateDynamics(self.folder, self.tasks, self.seed, self.names, self.data_dir)
+        return evaluate_dynamics(config, fields, assets, executor)
 
-    def _mpc(self) -> dict[str, Any]:
-        """Measure whole episodes."""
+    def _show(self, report: dict[str, Any]) -> None:
+        _show_dynamics(self.folder, report)
+
+
+@dataclass(frozen=True)
+class EvaluateMpcCommand(_ParallelEvaluation):
+    """Episodes: tables that shall become what a goal image shows; the same planner told the truth; no action."""
+
+    objects: int = 3
+    """Objects in a scene."""
+    cost: Literal["pose", "image"] = "pose"
+    """Futures are compared with the goal's poses, or rendered and compared with the goal image."""
+    oracle: bool = True
+    """Also measure the planner that is told the truth."""
+
+    def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.rearrangement.evaluation import EvaluateMpc, evaluate_mpc
-        from osfcore.fields.field_library import FieldLibrary
-        from osfcore.objects.asset_library import AssetLibrary
 
         config = EvaluateMpc(
-            self._folder, self.data_dir, self.tasks, self.objects, self.seed, self.cost, self.names, self.oracle
+            self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.cost, self.names, self.oracle
         )
-        fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
-        with worker_pool(self.workers) as executor:
-            last = follow(evaluate_mpc(config, fields, assets, executor))
-        assert last is not None
-        assert last.report is not None, "the last step brings the report"
-        if not self.json:
-            _show_mpc(config.folder, last.report)
-        return last.report
+        return evaluate_mpc(config, fields, assets, executor)
+
+    def _show(self, report: dict[str, Any]) -> None:
+        _show_mpc(self.folder, report)
 
 
-def _show(result: dict[str, Any]) -> None:
+Evaluate = Annotated[
+    Annotated[EvaluateFieldsCommand, tyro.conf.subcommand("fields")]
+    | Annotated[EvaluateEstimateCommand, tyro.conf.subcommand("estimate")]
+    | Annotated[EvaluateDynamicsCommand, tyro.conf.subcommand("dynamics")]
+    | Annotated[EvaluateMpcCommand, tyro.conf.subcommand("mpc")],
+    tyro.conf.OmitSubcommandPrefixes,
+]
+
+
+def _show_fields(result: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 

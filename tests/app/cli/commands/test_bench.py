@@ -108,3 +108,13 @@ def test_rollouts_are_timed(tmp_path, monkeypatch, capsys):
     assert json.loads((tmp_path / "dynamics.json").read_text()) == result
     assert main(arguments) == 0
     assert "steps of scenes a second" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "option"), [("dynamics", "--scenes"), ("estimate", "--repeats"), ("render", "--device")]
+)
+def test_an_option_that_does_not_apply_is_refused(command, option, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", command, option, "1"])
+    assert stop.value.code == 2
+    assert option in capsys.readouterr().err
