@@ -18,7 +18,6 @@ from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.render_cameras import bands
 from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME, FieldLibrary
 from osfcore.io.image_file import encode_png, to_uint8
-from osfcore.metrics.image_errors import psnr
 
 if TYPE_CHECKING:
     from osfcore.geometry.cameras import Camera
@@ -75,6 +74,7 @@ class NeuralRenderer:
     def _compare(self, order: CompareView) -> Comparison:
         import cv2
 
+        from osfcore.metrics.image_errors import psnr
         from osfcore.render.types import EXACT
 
         decoded = cv2.imdecode(np.frombuffer(order.observed, np.uint8), cv2.IMREAD_COLOR)

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, RECORDING_FILE, REPORT_FILE, VIDEO_FILE
 from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
 from app.jobs.job import Job
@@ -25,6 +23,7 @@ from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.poses import unit_quaternion
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import as_mapping, entry_of, list_of, read_json
+from osfcore.io.image_file import encode_png
 from osfcore.io.scene_file import camera_to_json, scene_from_json
 
 KIND = "episode"
@@ -178,8 +177,7 @@ class Episodes:
             raise UnknownName("frame", str(step), [f"0 to {count - 1}"] if count else ["none yet"])
         if part == "all":
             return path.read_bytes()
-        _, data = cv2.imencode(".png", part_of(read_frame(path), part)[..., ::-1])
-        return data.tobytes()
+        return encode_png(part_of(read_frame(path), part))
 
     def files(self, job: Job) -> tuple[str, ...]:
         """Names that can be downloaded now; those of an episode that was broken off are made when they are."""

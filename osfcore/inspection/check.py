@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -21,7 +20,8 @@ from osfcore.fields.training.visual_hull import carve, silhouette_box
 from osfcore.inspection.image_set_overlay import overlay_sheet
 from osfcore.inspection.observation_overlay import observation_sheet
 from osfcore.io.archives import unpack_set
-from osfcore.io.files import read_json, write_atomically
+from osfcore.io.files import read_json
+from osfcore.io.image_file import write_png
 from osfcore.io.image_set import read_image_set, read_splits
 from osfcore.io.observation_file import OBSERVATION_FILE, is_observation, read_observation
 from osfcore.io.output_paths import check_place
@@ -172,8 +172,7 @@ def draw_overlay(path: Path, out: Path) -> None:
     """
     check_overlay_place(out)
     sheet = observation_sheet(read_observation(path)) if is_observation(path) else _set_sheet(path)
-    _, data = cv2.imencode(".png", sheet)
-    write_atomically(out, data.tobytes())
+    write_png(out, sheet[..., ::-1])
 
 
 def _set_sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:

@@ -13,6 +13,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.inspection.image_set_overlay import draw_line, draw_text
+from osfcore.io.image_file import to_uint8
 
 _MOST_COLUMNS = 4
 _SIDE = 384  # longer side of a tile: outlines and names need more pixels than most images have
@@ -44,7 +45,7 @@ def _tile(observation: Observation, view: int) -> UInt8[np.ndarray, "h w 3"]:
     height, width = observation.images.shape[1:3]
     scale = _SIDE / max(height, width)
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
-    pixels = np.round(np.clip(observation.images[view, ..., ::-1], 0, 1) * 255).astype(np.uint8)
+    pixels = to_uint8(observation.images[view, ..., ::-1])
     bgr = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
     camera = observation.cameras[view].resized(*size)
     _draw_workspace(bgr, camera)

@@ -11,7 +11,6 @@ Images are RGB, linear radiance as value / 255. Masks have a single channel, in 
 
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,9 +30,9 @@ from osfcore.io.files import (
     list_of,
     read_json,
     reading_png,
-    write_atomically,
     write_json,
 )
+from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.scene_file import camera_from_json, camera_to_json
 
 OBSERVATION_FILE = "observation.json"
@@ -83,8 +82,8 @@ def write_observation(folder: Path, observation: Observation) -> None:
     }
     for view, camera in enumerate(observation.cameras):
         content["images"][camera.name] = f"image_{view}.png"
-        pixels = np.round(np.clip(observation.images[view], 0, 1) * 255).astype(np.uint8)
-        _write_png(folder / f"image_{view}.png", pixels)
+        pixels = to_uint8(observation.images[view])
+        write_png(folder / f"image_{view}.png", pixels)
     if observation.masks is not None:
         content["masks"] = _write_masks(folder, observation, observation.masks)
     write_json(path, content)
@@ -99,14 +98,8 @@ def _write_masks(
         seen = [number for number in range(len(observation.names)) if masks[view, number].any()]
         files[camera.name] = {observation.names[number]: f"mask_{view}_{number}.png" for number in seen}
         for number in seen:
-            _write_png(folder / f"mask_{view}_{number}.png", masks[view, number].astype(np.uint8) * 255)
+            write_png(folder / f"mask_{view}_{number}.png", masks[view, number].astype(np.uint8) * 255)
     return files
-
-
-def _write_png(path: Path, pixels: UInt8[np.ndarray, "h w *c"]) -> None:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
-    write_atomically(path, buffer.getvalue())
 
 
 def _check(observation: Observation) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from osfcore.errors import InvalidInput
 
 MASK_MARGIN_PX = 2
 MOST_DB = 100.0
-_SSIM_SIDE, _SSIM_SIGMA = 11, 1.5
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+_SSIM_SIDE = 11
 
 
 def psnr(
@@ -29,14 +29,15 @@ def psnr(
         InvalidInput: if shapes differ, or the mask has no pixel.
     """
     _same_shape(truth, image)
-    error = (truth.astype(np.float64) - image) ** 2
+    x, y = truth.astype(np.float64), image.astype(np.float64)
     if mask is not None:
         if mask.shape != truth.shape[:2] or not mask.any():
             raise InvalidInput(
                 "mask", f"of shape {mask.shape} with {int(mask.sum())} pixels", "as the image, not empty"
             )
-        error = error[mask]
-    return float(-10 * np.log10(max(float(error.mean()), 10 ** (-MOST_DB / 10))))
+        x, y = x[mask], y[mask]
+    with np.errstate(divide="ignore"):
+        return float(min(peak_signal_noise_ratio(x, y, data_range=1), MOST_DB))
 
 
 def ssim(truth: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"]) -> float:
@@ -51,14 +52,9 @@ def ssim(truth: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"]) -
     _same_shape(truth, image)
     if min(truth.shape[:2]) < _SSIM_SIDE:
         raise InvalidInput("sides of the images [px]", truth.shape[:2], f"at least {_SSIM_SIDE}")
+    wang = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     x, y = truth.astype(np.float64), image.astype(np.float64)
-    mean_x, mean_y = _window_mean(x), _window_mean(y)
-    var_x = _window_mean(x * x) - mean_x**2
-    var_y = _window_mean(y * y) - mean_y**2
-    covariance = _window_mean(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + _SSIM_C1) / (mean_x**2 + mean_y**2 + _SSIM_C1)
-    structure = (2 * covariance + _SSIM_C2) / (var_x + var_y + _SSIM_C2)
-    return float((luminance * structure).mean())
+    return float(np.mean(structural_similarity(x, y, data_range=1, channel_axis=2, **wang)))
 
 
 def dilated(mask: Bool[np.ndarray, "h w"], margin_px: int = MASK_MARGIN_PX) -> Bool[np.ndarray, "h w"]:
@@ -70,10 +66,3 @@ def dilated(mask: Bool[np.ndarray, "h w"], margin_px: int = MASK_MARGIN_PX) -> B
 def _same_shape(truth: np.ndarray, image: np.ndarray) -> None:
     if truth.shape != image.shape or truth.ndim != 3:
         raise InvalidInput("shape of the image", image.shape, f"that of the truth, {truth.shape}")
-
-
-def _window_mean(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "y x 3"]:
-    """Weighted means over the windows that lie inside the image."""
-    blurred = cv2.GaussianBlur(image, (_SSIM_SIDE, _SSIM_SIDE), _SSIM_SIGMA)
-    edge = _SSIM_SIDE // 2
-    return blurred[edge:-edge, edge:-edge]

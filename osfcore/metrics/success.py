@@ -80,11 +80,3 @@ def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, 
         max(others, default=0.0),
         float(np.mean(pose6d)),
     )
-
-
-def interval(successes: int, tasks: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    z, share = 1.96, successes / tasks
-    middle = (share + z**2 / (2 * tasks)) / (1 + z**2 / tasks)
-    half = z * np.sqrt(share * (1 - share) / tasks + z**2 / (4 * tasks**2)) / (1 + z**2 / tasks)
-    return max(0.0, middle - float(half)), min(1.0, middle + float(half))

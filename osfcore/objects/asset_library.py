@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
+from osfcore.io.image_file import encode_png
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.download import remove_old, told_as_fetch_failed
@@ -155,7 +156,7 @@ class AssetLibrary:
             remove_old(self.root, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
             with self._temporary(asset.info.name) as folder:
                 _write_arrays(folder / _ARRAYS, asset)
-                _write_png(folder / _TEXTURE, asset.mesh.texture)
+                (folder / _TEXTURE).write_bytes(encode_png(asset.mesh.texture))
                 (folder / _VIEWER).write_bytes(glb)
                 checks = {f: zlib.crc32((folder / f).read_bytes()) for f in (_ARRAYS, _TEXTURE, _VIEWER)}
                 facts = {
@@ -276,13 +277,6 @@ def _write_arrays(path: Path, asset: ObjectAsset) -> None:
             resting_quaternions=asset.resting.quaternions.astype(float),
             resting_probabilities=asset.resting.probabilities.astype(float),
         )
-
-
-def _write_png(path: Path, texture: np.ndarray) -> None:
-    import cv2
-
-    _, data = cv2.imencode(".png", texture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    path.write_bytes(data.tobytes())
 
 
 def _sync(path: Path) -> None:

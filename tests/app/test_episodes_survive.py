@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from app.jobs.outcomes import INTERRUPTED_NOTE
+from app.jobs.outcomes import INTERRUPTED_NOTE, JobDied
 from tests.app.conftest import until
 from tests.live import free_port, start_service, stop_service
 

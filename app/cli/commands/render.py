@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
+from osfcore.io.image_file import to_uint8
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,6 @@ class Render:
 
     def run(self) -> dict[str, Any]:
         """Render with two by two rays a pixel; the result tells the file and its size."""
-        import numpy as np
-
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.image_file import write_png
@@ -51,7 +50,7 @@ class Render:
         renderer = SceneRenderer(fields, library.load_table(), device=str(pick_device(self.device)))
         quality = Quality(samples_per_side=2)
         image = renderer.render(SceneBatch.of(scene.state), (cameras[self.camera],), quality=quality).rgb[0, 0]
-        pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+        pixels = to_uint8(image)
         write_png(self.out, pixels)
         height, width = pixels.shape[:2]
         if not self.json:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 from app.storage.field_files import clear_workshop, install, open_workshop
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from osfcore.io.image_file import write_png
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from app.jobs.context import JobContext
 
 PREVIEW = "preview.png"
@@ -108,7 +106,7 @@ def _train(params: dict[str, Any], data: Path, out: Path, preview: Path, begin: 
     previews = 0
     for told in train_field(config):
         if told.preview is not None:
-            _write_png(preview, told.preview)
+            write_png(preview, told.preview)
             previews += 1
         share = told.progress.done / max(told.progress.total, 1)
         yield replace(
@@ -128,14 +126,3 @@ def _offer(shop: Path, folder: Path, name: str) -> None:
             shutil.copyfile(shop / file, folder / f"{name}{Path(file).suffix}")
     except OSError as error:
         raise CannotWrite(folder, error.strerror or str(error)) from error
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    from PIL import Image
-
-    partial = path.with_name(f".{path.name}")
-    try:
-        Image.fromarray(pixels).save(partial, format="PNG")
-        os.replace(partial, path)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error

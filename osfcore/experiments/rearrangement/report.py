@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from osfcore.experiments.charts import Axis, chart, cumulative, side_by_side
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.inspection.contact_sheet import contact_sheet
 from osfcore.io.image_file import write_png
-from osfcore.metrics.success import OTHERS_M, SUCCESS_DEG, SUCCESS_M, RearrangementScore, interval
+from osfcore.metrics.success import OTHERS_M, SUCCESS_DEG, SUCCESS_M, RearrangementScore
 
 CURVE_MM = (5, 10, 15, 20, 30, 40, 60, 80, 100)
 _NEVER_MM = 1e6  # the error of a task in which something else was pushed away
@@ -112,3 +113,9 @@ def _mean(values: Sequence[bool]) -> float:
 
 def _rounded(value: np.floating[Any] | float, digits: int) -> float:
     return round(float(value), digits)
+
+
+def interval(successes: int, tasks: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    limits = binomtest(successes, tasks).proportion_ci(method="wilson")
+    return float(limits.low), float(limits.high)

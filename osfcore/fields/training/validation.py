@@ -14,6 +14,7 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.ray_sampling import RaySource
 from osfcore.fields.training.optimization import composite
+from osfcore.io.image_file import to_uint8
 from osfcore.io.image_set import ImageSet
 
 MASK_MARGIN_PX = 2
@@ -67,7 +68,7 @@ class Holdout:
             inside.append(_decibels(error[dilated_mask(self._images.rgba[number, ..., 3])]))
             if preview is None:
                 strip = np.hstack([truth, ours, _DIFFERENCE_GAIN * np.abs(truth - ours)])
-                preview = np.round(np.clip(strip, 0, 1) * 255).astype(np.uint8)
+                preview = to_uint8(strip)
         assert preview is not None, "a set has at least one test image"
         return Look(float(np.mean(full)), float(np.mean(inside)), len(full), preview)
 

@@ -32,6 +32,7 @@ from osfcore.geometry.cameras import (
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
+from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer
@@ -168,7 +169,7 @@ def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -
 
 def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray, "h w 4"]) -> dict[str, object]:
     """Write one image; return its entry in anno.json."""
-    pixels = np.round(np.clip(rgba, 0, 1) * 255).astype(np.uint8)
+    pixels = to_uint8(rgba)
     if not cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA)):
         raise OSError(f"{path.name} could not be written")
     return {

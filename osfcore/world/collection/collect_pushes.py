@@ -16,6 +16,7 @@ from osfcore.errors import CannotWrite, InvalidInput, WorkerDied
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras
 from osfcore.geometry.poses import rotation_angle
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.io.image_file import to_uint8
 from osfcore.io.push_file import EpisodeFolder, PushEpisode, load_episode, save_episode
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.collection.disturbed_states import disturbed
@@ -260,4 +261,4 @@ def _frame(world: Tabletop, config: CollectPushes) -> np.ndarray:
     """The view of camera "0" as one 8-bit frame, or no frame."""
     if not config.images:
         return np.zeros((0, DEFAULT_IMAGE_SIDE, DEFAULT_IMAGE_SIDE, 3), np.uint8)
-    return np.round(world.observe().images * 255).clip(0, 255).astype(np.uint8)
+    return to_uint8(world.observe().images)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import SceneState
-from osfcore.metrics.success import RearrangementScore, RearrangementTask, interval, score_of
+from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.catalogue import CATALOGUE
 
@@ -92,19 +92,3 @@ def test_a_quaternion_and_its_opposite_are_the_same(signs, turn):
     flipped = score_of(TASK, state(GOAL.poses.position, turned * np.array(signs)[:, None]), SYMMETRIES)
     assert flipped.pose6d == pytest.approx(plain.pose6d, abs=1e-9)
     assert flipped.moved_deg == pytest.approx(plain.moved_deg, abs=1e-4)
-
-
-@given(st.integers(1, 500).flatmap(lambda tasks: st.tuples(st.integers(0, tasks), st.just(tasks))))
-def test_an_interval_holds_the_share_and_shrinks_with_more_tasks(counts):
-    successes, tasks = counts
-    low, high = interval(successes, tasks)
-    assert 0 <= low < high <= 1
-    assert low - 1e-9 <= successes / tasks <= high + 1e-9
-    more = interval(4 * successes, 4 * tasks)
-    assert more[1] - more[0] < high - low
-    assert interval(tasks - successes, tasks) == (pytest.approx(1 - high), pytest.approx(1 - low))
-
-
-def test_an_interval_is_the_one_of_the_books():
-    assert interval(5, 10) == (pytest.approx(0.2366, abs=1e-4), pytest.approx(0.7634, abs=1e-4))
-    assert interval(0, 10) == (pytest.approx(0, abs=1e-12), pytest.approx(0.2775, abs=1e-4))

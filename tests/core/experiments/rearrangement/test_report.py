@@ -4,8 +4,10 @@ from dataclasses import asdict
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from osfcore.experiments.rearrangement.report import CURVE_MM, MpcReport, scores_of, write_pictures
+from osfcore.experiments.rearrangement.report import CURVE_MM, MpcReport, interval, scores_of, write_pictures
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.metrics.success import RearrangementScore
@@ -109,3 +111,19 @@ def test_the_oracle_has_its_own_curve(tmp_path):
         write_pictures(tmp_path / name, MpcReport(OURS, oracle))
         pictures.append((tmp_path / name / "mpc.png").read_bytes())
     assert pictures[0] != pictures[1]
+
+
+@given(st.integers(1, 500).flatmap(lambda tasks: st.tuples(st.integers(0, tasks), st.just(tasks))))
+def test_an_interval_holds_the_share_and_shrinks_with_more_tasks(counts):
+    successes, tasks = counts
+    low, high = interval(successes, tasks)
+    assert 0 <= low < high <= 1
+    assert low - 1e-9 <= successes / tasks <= high + 1e-9
+    more = interval(4 * successes, 4 * tasks)
+    assert more[1] - more[0] < high - low
+    assert interval(tasks - successes, tasks) == (pytest.approx(1 - high), pytest.approx(1 - low))
+
+
+def test_an_interval_is_the_one_of_the_books():
+    assert interval(5, 10) == (pytest.approx(0.2366, abs=1e-4), pytest.approx(0.7634, abs=1e-4))
+    assert interval(0, 10) == (pytest.approx(0, abs=1e-12), pytest.approx(0.2775, abs=1e-4))
