@@ -46,9 +46,11 @@ class _Evaluation(ABC):
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
+        from osfcore.experiments.charts import check_matplotlib
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
 
+        check_matplotlib()  # before hours of work
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         with self._pool() as executor:
             last = follow(self._steps(fields, assets, executor))

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from osfcore.dynamics.contact_geometry import part_outlines
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
-from osfcore.experiments.charts import Axis, Curve, chart, round_limit, side_by_side
+from osfcore.experiments.charts import Axis, Chart, Curve, write_charts
 from osfcore.experiments.dynamics.report import DynamicsReport, Scored
 from osfcore.experiments.dynamics.scores import HORIZONS
 from osfcore.geometry.poses import Pose
@@ -23,7 +23,6 @@ GALLERY_HORIZON = 10  # actions
 _EACH = 6  # windows of a kind
 _CELL_PX, _SHOWN_M = 260, 0.5
 _PAPER, _START, _TRUE, _PREDICTED, _PUSHER = 255, (190, 190, 190), (44, 160, 44), (214, 39, 40), (31, 119, 180)
-_LEAST_LIMIT = 10.0
 
 
 def write_plots(folder: Path, report: DynamicsReport) -> None:
@@ -41,7 +40,7 @@ def write_plots(folder: Path, report: DynamicsReport) -> None:
     counts = sorted({int(key.split()[1]) for key in report.by_set})
     curves = [_curve(f"{count} objects", report.of_count(count), "network", deg=False) for count in counts]
     panels.append(_panel("Graph network", "median position error [mm]", curves))
-    write_png(folder / "dynamics.png", side_by_side(panels))
+    write_charts(folder / "dynamics.png", panels)
 
 
 def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool) -> Curve:
@@ -52,10 +51,8 @@ def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool) -> Curve
     return Curve(name, np.array(HORIZONS, float), np.array(values), dots=True)
 
 
-def _panel(title: str, label: str, curves: Sequence[Curve]) -> UInt8[np.ndarray, "h w 3"]:
-    highest = max((float(np.nanmax(c.y)) for c in curves if np.isfinite(c.y).any()), default=_LEAST_LIMIT)
-    y = Axis(label, 0, round_limit(max(highest, _LEAST_LIMIT)))
-    return chart(title, Axis("actions of 0.2 s", 0, HORIZONS[-1]), y, curves, legend="top")
+def _panel(title: str, label: str, curves: Sequence[Curve]) -> Chart:
+    return Chart(title, Axis("actions of 0.2 s", 0, HORIZONS[-1]), Axis(label, 0), curves)
 
 
 def write_gallery(folder: Path, report: DynamicsReport, shapes: Mapping[str, ObjectShape]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from scipy.special import erf
 
-from osfcore.experiments.charts import Axis, Curve, chart, cumulative, round_limit, side_by_side
+from osfcore.experiments.charts import Axis, Chart, Curve, cumulative, write_charts
 from osfcore.experiments.estimation.report import EstimateReport, errors_at
 from osfcore.experiments.estimation.scores import (
     FrameScore,
@@ -54,15 +54,15 @@ def write_plots(folder: Path, report: EstimateReport) -> None:
     Raises:
         CannotWrite: if the disk refuses.
     """
-    write_png(folder / "errors.png", errors_plot(report))
-    write_png(folder / "calibration.png", calibration_plot(report.first))
+    write_charts(folder / "errors.png", errors_charts(report))
+    write_charts(folder / "calibration.png", calibration_charts(report.first))
     if report.tracks:
-        write_png(folder / "track.png", track_plot(report.tracks))
+        write_charts(folder / "track.png", track_charts(report.tracks))
     if report.views is not None:
-        write_png(folder / "views.png", views_plot(report))
+        write_charts(folder / "views.png", views_charts(report))
 
 
-def errors_plot(report: EstimateReport) -> UInt8[np.ndarray, "h w 3"]:
+def errors_charts(report: EstimateReport) -> list[Chart]:
     """Cumulative errors of position and rotation; refused objects keep a curve below 1."""
     kinds = {"first frame, 4 views": report.first, "goal, 1 view": report.all_goals}
     kinds["light held overhead"] = report.fixed_light or ()
@@ -73,22 +73,22 @@ def errors_plot(report: EstimateReport) -> UInt8[np.ndarray, "h w 3"]:
             if frames:
                 values = [getattr(score, key) for score in objects_of(frames)]
                 curves.append(cumulative(name, values, axis, sum(len(frame.names) for frame in frames)))
-        panels.append(chart("Objects with at most this error", axis, _SHARE, curves))
-    return side_by_side(panels)
+        panels.append(Chart("Objects with at most this error", axis, _SHARE, curves))
+    return panels
 
 
-def calibration_plot(frames: Sequence[FrameScore]) -> UInt8[np.ndarray, "h w 3"]:
+def calibration_charts(frames: Sequence[FrameScore]) -> list[Chart]:
     """How often errors lie within so many claimed deviations, against Gaussian errors."""
     axis, ratios = Axis("|error| / claimed deviation", 0, 5), ratios_of(frames)
-    x = np.linspace(axis.low, axis.high, 200)
+    x = np.linspace(0, 5, 200)
     curves = [
         Curve("if it were Gaussian", x, erf(x / np.sqrt(2))),
         *(cumulative(key, getattr(ratios, key), axis) for key in ("position", "rotation", "light")),
     ]
-    return chart("Right estimates: are deviations honest?", axis, Axis("share of components", 0, 1), curves)
+    return [Chart("Right estimates: are deviations honest?", axis, Axis("share of components", 0, 1), curves)]
 
 
-def track_plot(tracks: Sequence[TrackScore]) -> UInt8[np.ndarray, "h w 3"]:
+def track_charts(tracks: Sequence[TrackScore]) -> list[Chart]:
     """Errors along episodes: median, and what nine of ten stay below."""
     count = max((len(track.seconds) for track in tracks), default=0)
     steps = np.arange(1, count + 1)
@@ -99,20 +99,12 @@ def track_plot(tracks: Sequence[TrackScore]) -> UInt8[np.ndarray, "h w 3"]:
             Curve("median", steps.astype(float), np.array([median(v) for v in values], float), dots=True),
             Curve("90 % below", steps.astype(float), np.array([quantile(v, 0.9) for v in values], float), dots=True),
         ]
-        high = _limit(curves, 5.0)
-        panels.append(
-            chart(
-                "Without masks, step by step",
-                Axis("step", 0, max(count, 1)),
-                Axis(axis.label, 0, high),
-                curves,
-                legend="top",
-            )
-        )
-    return side_by_side(panels)
+        errors = Axis(axis.label, 0)
+        panels.append(Chart("Without masks, step by step", Axis("step", 0, max(count, 1)), errors, curves))
+    return panels
 
 
-def views_plot(report: EstimateReport) -> UInt8[np.ndarray, "h w 3"]:
+def views_charts(report: EstimateReport) -> list[Chart]:
     """Accuracy by number of cameras."""
     views = report.by_views()
     x = np.array(sorted(views), float)
@@ -125,17 +117,10 @@ def views_plot(report: EstimateReport) -> UInt8[np.ndarray, "h w 3"]:
     ]
     light = np.array([median(frame.light_deg for frame in f) for f in frames], float)
     errors.append(Curve("light, median [deg]", x, light, dots=True))
-    return side_by_side(
-        [
-            chart("Under 1 cm and 5 deg", axis, _SHARE, [Curve("share", x, right, dots=True)]),
-            chart("Errors", axis, Axis("error", 0, _limit(errors, 1.0)), errors, legend="top"),
-        ]
-    )
-
-
-def _limit(curves: Sequence[Curve], least: float) -> float:
-    """Where an axis ends that holds all of the curves."""
-    return round_limit(max(least, *(float(np.nanmax([*curve.y, 0.0])) for curve in curves)))
+    return [
+        Chart("Under 1 cm and 5 deg", axis, _SHARE, [Curve("share", x, right, dots=True)]),
+        Chart("Errors", axis, Axis("error", 0), errors),
+    ]
 
 
 # Galleries

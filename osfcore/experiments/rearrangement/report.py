@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from osfcore.experiments.charts import Axis, chart, cumulative, side_by_side
+from osfcore.experiments.charts import Axis, Chart, cumulative, write_charts
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.inspection.contact_sheet import contact_sheet
 from osfcore.io.image_file import write_png
@@ -97,8 +97,8 @@ def write_pictures(folder: Path, report: MpcReport) -> None:
     share, mm, sixd = Axis("share of tasks", 0, 1), Axis("threshold [mm]", 0, _CHART_MM), Axis("distance", 0, _CHART_6D)
     reached = [cumulative(name, [_reached_mm(score) for score in scores], mm) for name, scores in kinds.items()]
     poses = [cumulative(name, [score.pose6d for score in scores], sixd) for name, scores in kinds.items()]
-    charts = (chart("Objects that had to move", mm, share, reached), chart("6D poses, all objects", sixd, share, poses))
-    write_png(folder / "mpc.png", side_by_side(charts))
+    charts = (Chart("Objects that had to move", mm, share, reached), Chart("6D poses, all objects", sixd, share, poses))
+    write_charts(folder / "mpc.png", charts)
     shown = [comparison for result in report.ours for comparison in result.shown]
     write_png(folder / "mpc_tasks.png", contact_sheet(shown, per_row=_PER_ROW, truth="goal"))
 
