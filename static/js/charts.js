@@ -1,120 +1,95 @@
-// Small charts over the steps of an episode: lines, and stacked bars. Axes carry units; the label says the latest values.
-import { svg } from "./curves.js";
+// Small charts over the steps of an episode, drawn by uPlot: lines, and stacked bars. The label says the latest values.
+import uPlot from "../vendor/uPlot-1.6.32.js";
 import { el } from "./dom.js";
 
-const [WIDTH, HEIGHT] = [364, 124];
-const [LEFT, RIGHT, TOP, BOTTOM] = [34, 8, 17, 20];
-const TICKS = 4;
+const HEIGHT = 132;
 const FEW = 5; // steps for which the axis has room at least
+const BARS = uPlot.paths.bars({ size: [0.7, 18] });
+const charts = new WeakMap();
 
-/** Round steps for an axis from 0 to `most`. */
-function ticks(most, count = TICKS) {
-  const raw = most / count;
-  const power = 10 ** Math.floor(Math.log10(raw));
-  const step = [1, 2, 5, 10].map((f) => f * power).find((s) => s >= raw * (1 - 1e-9));
-  const all = [];
-  for (let i = 0; i * step < most * (1 + 1e-9) || i < 2; i += 1) all.push(Number((i * step).toPrecision(6)));
-  return all;
+const colour = (name) => () => getComputedStyle(document.documentElement).getPropertyValue(name);
+const axis = (options) => ({ stroke: colour("--muted"), grid: { stroke: colour("--line"), width: 1 }, ticks: { show: false }, font: "10px sans-serif", ...options });
+
+/** A dashed line at the step one looks at. */
+function drawMark(plot) {
+  const { at } = charts.get(plot.root.parentElement) ?? {};
+  if (!(at >= 0)) return;
+  const x = plot.valToPos(at, "x", true);
+  const { ctx, bbox } = plot;
+  ctx.save();
+  ctx.strokeStyle = colour("--muted")();
+  ctx.setLineDash([3, 2]);
+  ctx.beginPath();
+  ctx.moveTo(x, bbox.top);
+  ctx.lineTo(x, bbox.top + bbox.height);
+  ctx.stroke();
+  ctx.restore();
 }
 
-/** Which steps an axis shows: bars begin with the first action and need half a step at either side. */
-const span = (last, isBars) => (isBars ? [0.5, Math.max(last, FEW) + 0.5] : [0, Math.max(last, FEW)]);
+/** The chart in an element, made anew when its curves are others; `isBars` gives bars half a step of room at either side. */
+function chartIn(node, series, unit, isBars) {
+  const key = series.map(({ label }) => label).join();
+  const kept = charts.get(node);
+  if (kept?.key === key) return kept;
+  kept?.plot.destroy();
+  const options = {
+    width: Math.max(node.clientWidth, 100), height: HEIGHT, legend: { show: false }, cursor: { y: false, drag: { x: false } },
+    padding: [10, 8, 0, 0],
+    scales: {
+      x: { time: false, range: (_, low, high) => (isBars ? [0.5, Math.max(high, FEW) + 0.5] : [0, Math.max(high, FEW)]) },
+      y: { range: (_, low, high) => [0, Math.max(high * 1.05, 1e-9)] },
+    },
+    axes: [axis({ size: 22, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis({ size: 40, label: unit, labelSize: 12, labelFont: "10px sans-serif" })],
+    series: [{}, ...series.map((line) => ({ label: line.label, stroke: line.colour, width: 1.8, fill: isBars ? line.colour : undefined, paths: isBars ? BARS : undefined, points: { show: !isBars, size: 4, fill: line.colour } }))],
+    hooks: { draw: [drawMark] },
+  };
+  node.replaceChildren();
+  const chart = { key, plot: new uPlot(options, [[]], node), at: -1 };
+  charts.set(node, chart);
+  new ResizeObserver(() => node.clientWidth && chart.plot.setSize({ width: node.clientWidth, height: HEIGHT })).observe(node);
+  return chart;
+}
 
-class Plot {
-  constructor(node, { most, last, unit, isBars = false }) {
-    this.node = node;
-    [this.first, this.end] = span(last, isBars);
-    this.marks = ticks(Math.max(most, 1e-9) * 1.02);
-    this.top = Math.max(this.marks.at(-1), most);
-    node.replaceChildren();
-    node.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
-    for (const value of this.marks) {
-      node.append(svg("line", { x1: LEFT, x2: WIDTH - RIGHT, y1: this.y(value), y2: this.y(value), class: "plot-grid" }));
-      node.append(svg("text", { x: LEFT - 4, y: this.y(value) + 3.2, class: "plot-y" }, String(value)));
-    }
-    node.append(svg("text", { x: LEFT - 4, y: TOP - 8, class: "plot-unit" }, unit));
-    for (const step of ticks(this.end, 6).filter((s) => Number.isInteger(s) && s >= this.first && s <= this.end)) {
-      node.append(svg("text", { x: this.x(step), y: HEIGHT - 6, class: "plot-x" }, String(step)));
-    }
-    node.append(svg("text", { x: LEFT - 6, y: HEIGHT - 6, class: "plot-unit" }, "step"));
-  }
-
-  x(step) {
-    return LEFT + 4 + ((WIDTH - LEFT - RIGHT - 8) * (step - this.first)) / (this.end - this.first);
-  }
-
-  y(value) {
-    return HEIGHT - BOTTOM - ((HEIGHT - BOTTOM - TOP) * value) / this.top;
-  }
-
-  /** Where in the episode one looks. */
-  mark(step) {
-    if (step >= this.first) this.node.append(svg("line", { x1: this.x(step), x2: this.x(step), y1: TOP, y2: HEIGHT - BOTTOM, class: "plot-at" }));
-  }
+function draw(node, series, { unit, at, name }, isBars) {
+  const steps = [...new Set(series.flatMap(({ values }) => values.map(([step]) => step)))].sort((a, b) => a - b);
+  if (!steps.length) return empty(node, name);
+  const chart = chartIn(node, series, unit, isBars);
+  const rows = series.map(({ values }) => { const own = new Map(values); return steps.map((step) => own.get(step) ?? null); });
+  // What is stacked is drawn from the highest sum down, so that each layer covers what is not its own.
+  if (isBars) for (let i = rows.length - 2; i >= 0; i -= 1) rows[i] = rows[i].map((value, k) => value + rows[i + 1][k]);
+  chart.at = at;
+  chart.plot.setData([steps, ...rows]);
+  const latest = series.filter((line) => line.values.length)
+    .map((line) => `${line.label} ${Number(line.values.at(-1)[1].toPrecision(3))} ${unit}`);
+  node.setAttribute("aria-label", `${name}; after step ${steps.at(-1)}: ${latest.join(", ")}`);
+  return undefined;
 }
 
 /** Lines: [{ label, colour, values: [[step, value]] }]. */
-export function drawLines(node, series, { unit, at, name }) {
-  const values = series.flatMap((line) => line.values);
-  if (!values.length) return empty(node, name);
-  const [most, last] = [1, 0].map((place) => Math.max(...values.map((pair) => pair[place])));
-  const plot = new Plot(node, { most, last, unit });
-  plot.mark(at);
-  for (const { colour, values: own } of series) {
-    const points = own.map(([step, value]) => [plot.x(step), plot.y(value)]);
-    const path = points.map((p) => p.map((v) => v.toFixed(1)).join(" ")).join(" L");
-    node.append(svg("path", { d: `M${path}`, class: "plot-line", stroke: colour }));
-    const dot = points[own.findIndex(([step]) => step === at)] ?? points.at(-1);
-    if (dot) node.append(svg("circle", { cx: dot[0], cy: dot[1], r: 2.6, fill: colour }));
-  }
-  const latest = series.filter((line) => line.values.length)
-    .map((line) => `${line.label} ${Number(line.values.at(-1)[1].toPrecision(3))} ${unit}`);
-  node.setAttribute("aria-label", `${name}; after step ${values.at(-1)[0]}: ${latest.join(", ")}`);
-  return undefined;
-}
+export const drawLines = (node, series, options) => draw(node, series, options, false);
 
 /** Stacked bars: [{ label, colour, values: [[step, value]] }], the same steps in each. */
-export function drawBars(node, series, { unit, at, name }) {
-  const steps = series[0]?.values.map(([step]) => step) ?? [];
-  if (!steps.length) return empty(node, name);
-  const sums = steps.map((_, i) => series.reduce((sum, layer) => sum + layer.values[i][1], 0));
-  const plot = new Plot(node, { most: Math.max(...sums), last: steps.at(-1), unit, isBars: true });
-  plot.mark(at);
-  const width = Math.max(0.7 * Math.min(plot.x(2) - plot.x(1), 18), 1);
-  for (const [i, step] of steps.entries()) {
-    let below = 0;
-    for (const { label, colour, values } of series) {
-      const value = values[i][1];
-      const y = plot.y(below + value);
-      const bar = svg("rect", { x: plot.x(step) - width / 2, width, y, height: Math.max(plot.y(below) - y, 0), fill: colour });
-      bar.append(svg("title", {}, `${label}: ${value.toFixed(2)} ${unit}`));
-      node.append(bar);
-      below += value;
-    }
-  }
-  const latest = series.map((layer) => `${layer.label} ${layer.values.at(-1)[1].toFixed(2)} ${unit}`);
-  node.setAttribute("aria-label", `${name}; step ${steps.at(-1)}: ${latest.join(", ")}`);
-  return undefined;
-}
+export const drawBars = (node, series, options) => draw(node, series, options, true);
 
 function empty(node, name) {
-  node.replaceChildren(svg("text", { x: WIDTH / 2, y: HEIGHT / 2, class: "plot-empty" }, "comes with the first steps"));
-  node.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
+  charts.get(node)?.plot.destroy();
+  charts.delete(node);
+  node.replaceChildren(el("p", { className: "hint" }, "comes with the first steps"));
   node.setAttribute("aria-label", `${name}; no steps yet`);
 }
 
 export function drawLegend(node, series) {
-  node.replaceChildren(...series.map(({ label, colour }) => {
+  node.replaceChildren(...series.map(({ label, colour: own }) => {
     const swatch = el("span", { className: "swatch" });
-    swatch.style.background = colour;
+    swatch.style.background = own;
     return el("li", {}, swatch, label);
   }));
 }
 
-/** The step at a place on a chart over the steps up to `last`. */
-export function stepAt(node, clientX, last, isBars) {
-  const box = node.getBoundingClientRect();
-  const [first, end] = span(last, isBars);
-  const share = (((clientX - box.left) / box.width) * WIDTH - LEFT - 4) / (WIDTH - LEFT - RIGHT - 8);
-  return Math.min(Math.max(Math.round(first + share * (end - first)), Math.ceil(first)), last);
+/** The step at a place on a chart over the steps up to `last`; null where there is no chart. */
+export function stepAt(node, clientX, last) {
+  const plot = charts.get(node)?.plot;
+  if (!plot) return null;
+  const step = Math.round(plot.posToVal(clientX - plot.over.getBoundingClientRect().left, "x"));
+  return Math.min(Math.max(step, 0), last);
 }

@@ -1,4 +1,5 @@
 // Estimates of poses and light: asking for one, following it, and what came of it.
+import { zipSync } from "../vendor/fflate-0.8.3.js";
 import { get, post, remove, upload } from "./api.js";
 import { LatestImage } from "./cameras.js";
 import { drawCurves, drawKey } from "./curves.js";
@@ -6,7 +7,6 @@ import { byId, el, whileDisabled } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
 import { labelOf, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
-import { zipped } from "./zip.js";
 
 const PICTURE_MS = 700; // rendering takes time from the estimator
 const form = () => byId("new-estimate");
@@ -44,7 +44,9 @@ async function sendFolder(files) {
   if (!named.some(({ name }) => name.split("/").at(-1) === "observation.json")) {
     throw new Error("The folder holds no observation.json; an observation folder is expected.");
   }
-  await send(await zipped(named), named[0].name.split("/")[0]);
+  const entries = await Promise.all(named.map(async ({ name, blob }) => [name, new Uint8Array(await blob.arrayBuffer())]));
+  const zip = zipSync(Object.fromEntries(entries), { level: 0 }); // PNGs do not shrink
+  await send(new Blob([zip], { type: "application/zip" }), named[0].name.split("/")[0]);
 }
 
 // Following

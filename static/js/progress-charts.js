@@ -50,6 +50,9 @@ export function drawProgress(episode, at) {
 /** A click on a chart goes to its step; `lastStep` tells how many there are. */
 export function setUpProgress(lastStep, goTo) {
   for (const id of ["chart-distance", "chart-cost", "chart-time"]) {
-    byId(id).addEventListener("click", (event) => goTo(stepAt(byId(id), event.clientX, lastStep(), id === "chart-time")));
+    byId(id).addEventListener("click", (event) => {
+      const step = stepAt(byId(id), event.clientX, lastStep());
+      if (step !== null) goTo(step);
+    });
   }
 }
