@@ -40,7 +40,7 @@ from osfcore.errors import InvalidInput
 from osfcore.estimation.first_frame import estimate_first
 from osfcore.estimation.goal_image import estimate_goal
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.tracking import estimate_next, usual_residuals
+from osfcore.estimation.tracking import estimate_next, expected_residuals
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -138,7 +138,7 @@ class Episode:
         else:
             self._estimate = self._start
         self._estimate = _with_pusher(self._estimate, observation.pusher)
-        self._usual = usual_residuals(self._knowledge.models, observation, self._estimate.state)
+        self._usual = expected_residuals(self._knowledge.models, observation, self._estimate.state)
         self._weak = frozenset(_doubted(self._estimate))
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")

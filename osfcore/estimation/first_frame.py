@@ -1,9 +1,9 @@
 """The first frame: all poses and the light from images with masks (paper section 4.2).
 
-In the paper's order: the light is held overhead and each object is searched inside its own masks (eq. 5); then poses
-and light together explain the whole images (eq. 6). Deviations: the first part begins with every way an object can
-lie on a table, not with one guess, since orientation has many local minima; the light is found by a search of the
-hemisphere before CMA refines it; Gauss-Newton finishes what CMA began.
+In the paper's order: the light is held overhead and each object's pose is optimised by CMA-ES within its own masks
+(eq. 5); then CMA-ES optimises all poses and the light over whole images (eq. 6). Deviations: the first part starts from
+every resting orientation of an object rather than from one guess, since the loss has many local minima over
+orientations; a grid search of the hemisphere initialises the light; Gauss-Newton refines what CMA-ES finds.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, turned
+from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, yaw_hypotheses
 from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, ObjectView, ObservedViews, part_of, views_of
+from osfcore.estimation.objective.observed_views import FINE_SIDE, ObjectView, ObservedViews, crop_to_masks, views_of
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
 from osfcore.estimation.objective.photometric_loss import photometric_loss, residuals
 from osfcore.estimation.search.cma_es import CMAES
@@ -25,15 +25,15 @@ from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newto
 from osfcore.estimation.search.light_search import search_light
 from osfcore.estimation.search.multistart_cma import SHIFT_M, TURN_RAD, MultistartCMA
 from osfcore.estimation.search.pose_initialization import OVERHEAD, RankedPoses, initial_poses, rank_poses
+from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.estimation.uncertainty import gather, judged
+from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
-from osfcore.progress import Progress
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
 _LIGHT_RAD = 0.03  # the first spread of the light, where it was searched before
-_RIVALS = 3  # orientations of each object that the whole images choose from
+_HYPOTHESES = 3  # orientations of each object that the whole images choose from
 _RANKED_SHARP = 100
 _SHOWN = 24  # candidates of a ranking that are shown
 
@@ -44,11 +44,11 @@ class FirstFrameConfig:
 
     Attributes:
         starts: orientations of each object that CMA refines.
-        population: candidates per generation and start, masked (eq. 5).
-        generations: masked.
-        joint_population: candidates per generation of the whole scene (eq. 6).
+        population: of CMA-ES for one object and start, by the masked loss (eq. 5).
+        generations: likewise.
+        joint_population: of CMA-ES for the whole scene, by the photometric loss (eq. 6).
         joint_generations: likewise.
-        coarse_iterations: of the final descent on half the resolution.
+        coarse_iterations: of Gauss-Newton at half the resolution.
         fine_iterations: at full resolution.
         light: "search" for a search of the hemisphere before CMA, "cma" for CMA alone from overhead as in the paper,
             "overhead" to hold it there (to measure what knowing the light is worth).
@@ -65,7 +65,7 @@ class FirstFrameConfig:
 
 
 def estimate_first(
-    models: ObjectModels, observation: Observation, rng: np.random.Generator, effort: FirstFrameConfig | None = None
+    models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
 ) -> Iterator[EstimateStep]:
     """Find all poses and the light; the last step holds the estimate.
 
@@ -73,7 +73,7 @@ def estimate_first(
         models: fields of the objects and the table.
         observation: one or more views with masks.
         rng: of the searches.
-        effort: how much work to do.
+        config: how much work to do.
 
     Raises:
         InvalidInput: without masks, or if an object's masks are all empty.
@@ -81,7 +81,7 @@ def estimate_first(
     """
     models.check(observation.names)
     _check_masks(observation)
-    yield from _First(models, observation, rng, effort or FirstFrameConfig()).steps()
+    yield from _FirstFrameEstimator(models, observation, rng, config or FirstFrameConfig()).steps()
 
 
 def _check_masks(observation: Observation) -> None:
@@ -92,25 +92,22 @@ def _check_masks(observation: Observation) -> None:
             raise InvalidInput(f"mask of {name}", "empty in every view", "not empty in at least one view")
 
 
-class _First:
-    """The state of one estimation between its steps."""
+class _FirstFrameEstimator:
+    """One estimation; `steps` runs it."""
 
     def __init__(
-        self, models: ObjectModels, observation: Observation, rng: np.random.Generator, effort: FirstFrameConfig
+        self, models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig
     ) -> None:
-        self._models, self._rng, self._effort = models, rng, effort
+        self._models, self._rng, self._config = models, rng, config
         self._names, self._pusher = observation.names, observation.pusher
         self._coarse = views_of(observation, _COARSE_SIDE)
         self._middle = views_of(observation, _COARSE_SIDE, samples=2)
         self._rough = views_of(observation, _ROUGH_SIDE)
         self._sharp = views_of(observation, FINE_SIDE)
         self._fine = views_of(observation, FINE_SIDE, samples=2)
-        e = effort
-        count = len(self._names)
-        self._total = (
-            2 * count + 1 + e.generations + e.joint_generations + e.coarse_iterations + e.fine_iterations + count + 1
-        )
-        self._done = 0
+        searches = config.generations + config.joint_generations
+        refinements = config.coarse_iterations + config.fine_iterations
+        self._reporter = StepReporter(3 * len(self._names) + searches + refinements + 2)
         self._rivals: dict[int, float] = {}
 
     def steps(self) -> Iterator[EstimateStep]:
@@ -119,61 +116,63 @@ class _First:
         starts: list[RankedPoses] = []
         for name, part in zip(self._names, parts, strict=True):
             starts.append(initial_poses(self._models, name, part))
-            yield self._ranking("orientations", f"{name}: how it may lie", starts, OVERHEAD)
+            yield self._ranking_step("orientations", f"{name}: how it may lie", starts, OVERHEAD)
         light = OVERHEAD
-        if self._effort.light == "search":
-            light = search_light(self._models, self._rough, self._coarse, self._guess(starts, OVERHEAD))
-            yield self._ranking("light", "Shading and shadows", starts, light)
+        if self._config.light == "search":
+            light = search_light(self._models, self._rough, self._coarse, self._initial_guess(starts, OVERHEAD))
+            yield self._ranking_step("light", "Shading and shadows", starts, light)
             for n, name in enumerate(self._names):
-                starts[n] = self._ranked_again(n, starts[n], light)
-                yield self._ranking("orientations", f"{name}: under this light", starts, light)
-        starts = [found.distinct(self._effort.starts) for found in starts]
-        starts = yield from self._search_objects(better, starts, light)
-        guess = yield from self._search_together(self._guess(starts, light))
-        at = yield from self._descend(guess)
-        at = yield from self._compare(at, starts)
+                starts[n] = self._rerank(n, starts[n], light)
+                yield self._ranking_step("orientations", f"{name}: under this light", starts, light)
+        starts = [found.distinct(self._config.starts) for found in starts]
+        starts = yield from self._search_each(better, starts, light)
+        guess = yield from self._search_jointly(self._initial_guess(starts, light))
+        at = yield from self._refine(guess)
+        at = yield from self._compare_orientations(at, starts)
         yield self._finish(at)
 
-    def _ranked_again(self, n: int, starts: RankedPoses, light: np.ndarray) -> RankedPoses:
-        """In the order that the light gives, the best of them in full resolution: labels tell sides apart."""
+    def _rerank(self, n: int, starts: RankedPoses, light: np.ndarray) -> RankedPoses:
+        """Rank poses again under a known light, the best in full resolution, where labels tell sides apart."""
         for views, count in ((self._coarse, len(starts.losses)), (self._sharp, _RANKED_SHARP)):
             part, best = _visible_part(views, n), starts.best(count)
             starts = rank_poses(self._models, self._names[n], part, best.positions, best.quaternions, light)
         return starts
 
-    def _search_objects(
+    def _search_each(
         self, parts: list[ObjectView], starts: list[RankedPoses], light: np.ndarray
     ) -> Iterator[EstimateStep]:  # returns the refined starts
-        e, brightness = self._effort, self._effort.light == "cma"
-        swarms = [
+        """MultistartCMA of each object's pose by the masked loss (eq. 5), the light held."""
+        population, brightness = self._config.population, self._config.light == "cma"
+        searches = [
             MultistartCMA(
-                self._models, name, part, own, light, population=e.population, rng=self._rng, any_brightness=brightness
+                self._models, name, part, own, light, population=population, rng=self._rng, any_brightness=brightness
             )
             for name, part, own in zip(self._names, parts, starts, strict=True)
         ]
-        for _ in range(e.generations):
-            tried = [swarm.advance() for swarm in swarms]
+        for _ in range(self._config.generations):
+            tried = [search.advance() for search in searches]
             shown, losses = [t.candidates for t in tried], [t.loss for t in tried]
-            best = self._guess(starts, light)
+            best = self._initial_guess(starts, light)
             sigma = tried[0].sigma if tried else 1.0
-            yield self._step("objects", "Each object in its masks", best, shown, losses, sigma)
+            yield self._reporter.step("objects", "Each object in its masks", best, shown, losses, sigma)
         refined = []
-        for n, (name, swarm) in enumerate(zip(self._names, swarms, strict=True)):
-            part, ends = _visible_part(self._fine, n), swarm.ends()
+        for n, (name, search) in enumerate(zip(self._names, searches, strict=True)):
+            part, ends = _visible_part(self._fine, n), search.best_poses()
             found = rank_poses(
                 self._models, name, part, ends.position, ends.quaternion, light, any_brightness=brightness
             )
-            refined.append(found.distinct(_RIVALS))
+            refined.append(found.distinct(_HYPOTHESES))
         return refined
 
-    def _search_together(self, guess: SceneParameters) -> Iterator[EstimateStep]:  # returns the guess
-        e = self._effort
-        spread = {"search": _LIGHT_RAD, "cma": 0.6, "overhead": 0.0}[e.light]
+    def _search_jointly(self, guess: SceneParameters) -> Iterator[EstimateStep]:  # returns the guess
+        """CMA-ES over all poses and the light by the photometric loss of whole images (eq. 6)."""
+        config = self._config
+        spread = {"search": _LIGHT_RAD, "cma": 0.6, "overhead": 0.0}[config.light]
         scales = np.array([*([SHIFT_M / 2] * 3 + [TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
-        search = CMAES(scales, e.joint_population, self._rng)
+        search = CMAES(scales, config.joint_population, self._rng)
         best, least = guess, np.inf
-        for _ in range(e.joint_generations):
-            batch = guess.moved(np.concatenate([np.zeros((1, guess.size)), search.ask()]))
+        for _ in range(config.joint_generations):
+            batch = guess.perturbed(np.concatenate([np.zeros((1, guess.size)), search.ask()]))
             losses = photometric_loss(residuals(self._models, self._middle, batch))
             search.tell(losses[1:])
             k = int(np.argmin(losses))
@@ -183,44 +182,42 @@ class _First:
                 best = replace(guess, positions=found[0], quaternions=found[1], light=found[2])
             poses = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(self._names))]
             note = "All objects and the light"
-            yield self._step("together", note, best, poses, [], search.sigma, batch.lights, least)
+            yield self._reporter.step("together", note, best, poses, [], search.sigma, batch.lights, least)
         return best
 
-    def _descend(self, guess: SceneParameters) -> Iterator[EstimateStep]:  # returns the last Descent
-        light = None if self._effort.light == "overhead" else self._middle
+    def _refine(self, guess: SceneParameters) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Gauss-Newton over all poses and the light, coarse to fine."""
+        config = self._config
+        light = None if config.light == "overhead" else self._middle
         at = GaussNewtonState.at(guess)
-        e = self._effort
-        rounds = (self._middle, e.coarse_iterations), (self._fine, e.fine_iterations)
+        rounds = (self._middle, config.coarse_iterations), (self._fine, config.fine_iterations)
         for views, iterations in rounds:
             for step in gauss_newton(self._models, views, at, iterations=iterations, light=light):
                 at = step
-                yield self._polishing("The last millimetres", at)
+                yield self._reporter.refinement("The last millimetres", at)
         return at
 
-    def _compare(
+    def _compare_orientations(
         self, at: GaussNewtonState, starts: list[RankedPoses]
-    ) -> Iterator[EstimateStep]:  # returns the better Descent
-        """Put other orientations of each object into the scene and let the whole images decide."""
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Replace each object's orientation by any hypothesis under which the whole images fit better."""
         for n, found in enumerate(starts):
-            others = Pose.joined(Pose(found.positions, found.quaternions), turned(self._models, at.guess, n))
+            others = Pose.joined(Pose(found.positions, found.quaternions), yaw_hypotheses(self._models, at.guess, n))
             at, self._rivals[n] = compare_orientations(
                 self._models, self._coarse, self._middle, self._fine, at, n, others
             )
-            yield self._polishing(f"{self._names[n]}: the other way round", at)
+            yield self._reporter.refinement(f"{self._names[n]}: the other way round", at)
         return at
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        evidence = gather(self._models, self._fine, at.guess)
-        estimate = judged(at.guess, at.normals, evidence, self._rivals, light_held=self._effort.light == "overhead")
-        self._done = self._total - 1
-        step = self._polishing("Done" if estimate.trusted else estimate.reason, at)
-        return replace(step, stage="done", estimate=estimate)
+        fit = evaluate_fit(self._models, self._fine, at.guess)
+        estimate = estimate_with_uncertainty(
+            at.guess, at.normals, fit, self._rivals, light_held=self._config.light == "overhead"
+        )
+        return self._reporter.finish(at, estimate)
 
-    def _polishing(self, note: str, at: GaussNewtonState) -> EstimateStep:
-        return self._step("polish", note, at.guess, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
-
-    def _guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:
-        """The best of each object's poses; objects not looked at yet are put far below the table."""
+    def _initial_guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:
+        """The best of each object's poses; objects without any yet are put far below the table, out of view."""
         count = len(self._names)
         positions = np.tile([0.0, 0.0, -1.0], (count, 1))
         quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
@@ -228,31 +225,10 @@ class _First:
             positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
         return SceneParameters(self._names, positions, quaternions, light, self._pusher)
 
-    def _ranking(self, stage: Stage, note: str, starts: list[RankedPoses], light: np.ndarray) -> EstimateStep:
-        guess = self._guess(starts, light)
+    def _ranking_step(self, stage: Stage, note: str, starts: list[RankedPoses], light: np.ndarray) -> EstimateStep:
+        guess = self._initial_guess(starts, light)
         shown = [Pose(s.positions[:_SHOWN], s.quaternions[:_SHOWN]) for s in starts]
-        return self._step(stage, note, guess, shown, [float(s.losses[0]) for s in starts])
-
-    def _step(
-        self,
-        stage: Stage,
-        note: str,
-        guess: SceneParameters,
-        shown: list[Pose] | None = None,
-        losses: list[float] | None = None,
-        sigma: float = 1.0,
-        lights: np.ndarray | None = None,
-        loss: float = float("nan"),
-    ) -> EstimateStep:
-        self._done = min(self._done + 1, self._total)
-        candidates = None
-        if shown and len(shown) == len(self._names):
-            count = min(len(p.position) for p in shown)
-            candidates = Pose(
-                np.stack([p.position[:count] for p in shown], 1), np.stack([p.quaternion[:count] for p in shown], 1)
-            )
-        progress = Progress(self._done, self._total, note)
-        return EstimateStep(progress, stage, guess.state(), candidates, lights, sigma, tuple(losses or ()), loss)
+        return self._reporter.step(stage, note, guess, shown, [float(s.losses[0]) for s in starts])
 
 
 def _visible_part(views: ObservedViews, number: int) -> ObjectView:
@@ -260,7 +236,7 @@ def _visible_part(views: ObservedViews, number: int) -> ObjectView:
     assert views.masks is not None
     own = views.masks[:, number]
     if own.max() > 0.5:
-        return part_of(views, number)
+        return crop_to_masks(views, number)
     masks = views.masks.copy()
     masks[:, number] = own / own.max()
-    return part_of(replace(views, masks=masks), number)
+    return crop_to_masks(replace(views, masks=masks), number)

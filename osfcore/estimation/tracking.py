@@ -1,10 +1,9 @@
 """Later frames: no masks, started from the last estimate or from a predicted state (paper section 4.2, last part).
 
-Most objects stand where they were expected; the residual of each tells. What fits is only polished. What does not is
-looked for where a push may have taken it; if that does not lead to a fit, by CMA with a small spread around there; and
-if that does not either, lying in any other way. Fine images at last tell what is half a turn off, for the labels of
-cans are too small for coarse ones. The light is held unless the bare table stops looking as it should and another light
-mends that: then somebody moved the lamp.
+Objects whose photometric residual stays small are refined by Gauss-Newton from where they were expected. The others are
+searched in order of cost: along the pusher's motion (`motion_hypotheses`), by CMA-ES with a small spread, and in their
+other resting orientations. Fine images decide about yaw, since coarse ones do not resolve labels. The light is held
+unless the table's own residual grows and another light lowers it: then the lamp was moved and is searched again.
 """
 
 from __future__ import annotations
@@ -16,20 +15,36 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses.motion_hypotheses import lying_there, rolled_in_place, shoved, shoved_together
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, pose_losses, turned, with_pose
+from osfcore.estimation.hypotheses.motion_hypotheses import (
+    joint_push_hypotheses,
+    push_hypotheses,
+    resting_hypotheses,
+    rolling_hypotheses,
+)
+from osfcore.estimation.hypotheses.orientation_hypotheses import (
+    compare_orientations,
+    pose_losses,
+    with_pose,
+    yaw_hypotheses,
+)
 from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, ObservedViews, around, near, views_of
+from osfcore.estimation.objective.observed_views import (
+    FINE_SIDE,
+    ObservedViews,
+    crop_to_object,
+    crop_to_silhouette,
+    views_of,
+)
 from osfcore.estimation.objective.parametrization import POSE, SceneParameters
 from osfcore.estimation.objective.photometric_loss import loss_of, photometric_loss, residuals
 from osfcore.estimation.search.cma_es import CMAES
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
-from osfcore.estimation.search.light_search import elsewhere, search_light
+from osfcore.estimation.search.light_search import light_loss_ratio, search_light
+from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.estimation.uncertainty import Evidence, gather, judged, object_residuals
+from osfcore.estimation.uncertainty import FitQuality, estimate_with_uncertainty, evaluate_fit, object_residuals
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation, SceneState
-from osfcore.progress import Progress
 
 _ALLOWANCE, _MOST_USUAL = 1.25, 0.06  # times what is usual, which is no more than this [radiance]
 
@@ -75,13 +90,13 @@ class TrackingConfig:
     reach: float = 0.03
 
 
-def usual_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
+def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
     """By how much each object's images differ from what is rendered where it stands [radiance].
 
     Fields err, some more than others and more under some lights: what is normal here tells later what is not.
     """
     return object_residuals(
-        gather(models, views_of(observation, FINE_SIDE, samples=2), SceneParameters.of(state, observation.pusher))
+        evaluate_fit(models, views_of(observation, FINE_SIDE, samples=2), SceneParameters.of(state, observation.pusher))
     )
 
 
@@ -90,7 +105,7 @@ def estimate_next(
     observation: Observation,
     expected: SceneState,
     rng: np.random.Generator,
-    effort: TrackingConfig | None = None,
+    config: TrackingConfig | None = None,
     usual: Float[np.ndarray, "N"] | None = None,
 ) -> Iterator[EstimateStep]:
     """Find poses again; the last step holds the estimate.
@@ -100,8 +115,8 @@ def estimate_next(
         observation: one or more views; masks play no part.
         expected: the last estimate, or what was predicted from it, with the light as last estimated.
         rng: of the search.
-        effort: how much work to do.
-        usual: residuals that are normal for these objects here, see `usual_residuals`; none are expected by default.
+        config: how much work to do.
+        usual: residuals that are normal for these objects here, see `expected_residuals`; none are expected by default.
 
     Raises:
         InvalidInput: if the expected state is of other objects.
@@ -111,11 +126,11 @@ def estimate_next(
     if expected.names != observation.names:
         raise InvalidInput("objects of the expected state", ", ".join(expected.names), ", ".join(observation.names))
     allowed = np.zeros(len(expected.names)) if usual is None else _ALLOWANCE * np.minimum(usual, _MOST_USUAL)
-    yield from _Track(models, observation, expected, rng, effort or TrackingConfig(), allowed).steps()
+    yield from _Tracker(models, observation, expected, rng, config or TrackingConfig(), allowed).steps()
 
 
-class _Track:
-    """The state of one estimation between its steps."""
+class _Tracker:
+    """One estimation; `steps` runs it."""
 
     def __init__(
         self,
@@ -123,79 +138,79 @@ class _Track:
         observation: Observation,
         expected: SceneState,
         rng: np.random.Generator,
-        effort: TrackingConfig,
+        config: TrackingConfig,
         allowed: Float[np.ndarray, "N"],
     ) -> None:
         self._allowed = allowed
-        self._models, self._rng, self._effort = models, rng, effort
+        self._models, self._rng, self._config = models, rng, config
         self._guess = SceneParameters.of(expected, observation.pusher)
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._fine = views_of(observation, FINE_SIDE, samples=2)
         self._sharp = views_of(observation, FINE_SIDE)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
-        self._push = _push(expected.pusher, observation.pusher)
+        self._push = _pusher_motion(expected.pusher, observation.pusher)
         self._rivals: dict[int, float] = {}
-        self._looked: tuple[SceneParameters, Evidence] | None = None
-        self._done, self._total = 0, 4
+        self._looked: tuple[SceneParameters, FitQuality] | None = None
+        self._reporter = StepReporter(4)
 
     def steps(self) -> Iterator[EstimateStep]:
         at = GaussNewtonState.at(self._guess)
-        before = self._at_half(at.guess)
-        if before.surroundings > self._effort.lamp_above:
+        before = self._fit_at_half_size(at.guess)
+        if before.surroundings > self._config.lamp_above:
             at = yield from self._search_light(at)
-            before = self._at_half(at.guess)
-        misfit = object_residuals(before) > np.maximum(self._effort.stays_below, self._allowed)
+            before = self._fit_at_half_size(at.guess)
+        misfit = object_residuals(before) > np.maximum(self._config.stays_below, self._allowed)
         if misfit.any():
-            at = yield from self._descend(at, misfit, self._coarse, 1)
-            misfit &= self._misfits(at.guess)
+            at = yield from self._refine(at, misfit, self._coarse, 1)
+            misfit &= self._poorly_fitted(at.guess)
         moved = misfit
-        for look in (self._shove, self._search):
+        for look in (self._try_pushes, self._search):
             if misfit.any():
                 at = yield from look(at, misfit)
-                at = yield from self._settle(at, misfit)
-                misfit = misfit & self._misfits(at.guess)
+                at = yield from self._refine_coarse_to_fine(at, misfit)
+                misfit = misfit & self._poorly_fitted(at.guess)
         if misfit.any():
             at = yield from self._recover(at, misfit)
-            at = yield from self._descend(at, misfit, self._middle, self._effort.fine_sweeps)
-            misfit = misfit & self._misfits(at.guess)
-        at = yield from self._descend(at, ~moved, self._middle, 1)
-        at = yield from self._look_closely(at, moved & ~misfit)
+            at = yield from self._refine(at, misfit, self._middle, self._config.fine_sweeps)
+            misfit = misfit & self._poorly_fitted(at.guess)
+        at = yield from self._refine(at, ~moved, self._middle, 1)
+        at = yield from self._refine_finely(at, moved & ~misfit)
         yield self._finish(at)
 
-    def _at_half(self, guess: SceneParameters) -> Evidence:
+    def _fit_at_half_size(self, guess: SceneParameters) -> FitQuality:
         """How well a guess explains the images of half resolution."""
-        return gather(self._models, self._middle, guess)
+        return evaluate_fit(self._models, self._middle, guess)
 
-    def _misfits(self, guess: SceneParameters) -> Bool[np.ndarray, "N"]:
-        """Which objects do not fit where they were found."""
-        return object_residuals(self._at_half(guess)) > np.maximum(self._effort.fits_below, self._allowed)
+    def _poorly_fitted(self, guess: SceneParameters) -> Bool[np.ndarray, "N"]:
+        """Which objects have a residual above what is allowed."""
+        return object_residuals(self._fit_at_half_size(guess)) > np.maximum(self._config.fits_below, self._allowed)
 
-    def _search_light(self, at: GaussNewtonState) -> Iterator[EstimateStep]:  # returns the Descent
-        """The light that explains the images with the objects as expected, if it does so far better than the last."""
-        if elsewhere(self._models, self._rough, at.guess) > self._effort.lamp_hint:
+    def _search_light(self, at: GaussNewtonState) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Search the light with the objects where they were expected; keep it if the loss falls far enough."""
+        if light_loss_ratio(self._models, self._rough, at.guess) > self._config.lamp_hint:
             return at  # objects that moved are no reason to search on
         guess = replace(at.guess, light=search_light(self._models, self._rough, self._coarse, at.guess))
         here, there = (loss_of(self._models, self._coarse, one) for one in (at.guess, guess))
-        if there < self._effort.lamp_gain * here:
+        if there < self._config.lamp_gain * here:
             at = replace(at, guess=guess)
         yield self._step("light", "Shading and shadows", at)
         return at
 
-    def _descend(
+    def _refine(
         self, at: GaussNewtonState, moving: Bool[np.ndarray, "N"], views: ObservedViews, sweeps: int
-    ) -> Iterator[EstimateStep]:  # returns the Descent
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         objects = np.flatnonzero(moving).tolist()
         for step in gauss_newton(self._models, views, at, iterations=sweeps, objects=objects, until_settled=True):
             at = step
             yield self._step("polish", "The last millimetres", at)
         return at
 
-    def _settle(
+    def _refine_coarse_to_fine(
         self, at: GaussNewtonState, moving: Bool[np.ndarray, "N"]
-    ) -> Iterator[EstimateStep]:  # returns the Descent
-        """Descend as far as it goes; coarse images lead near, finer ones decide."""
-        e = self._effort
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Gauss-Newton from coarse to fine images."""
+        e = self._config
         for views, sweeps in (
             (self._rough, e.rough_sweeps),
             (self._coarse, e.sweeps),
@@ -204,128 +219,130 @@ class _Track:
             at = replace(
                 at, dampings=GaussNewtonState.at(at.guess).dampings
             )  # old ones tell nothing of where it is now
-            at = yield from self._descend(at, moving, views, sweeps)
+            at = yield from self._refine(at, moving, views, sweeps)
         return at
 
-    def _shove(
+    def _try_pushes(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
-    ) -> Iterator[EstimateStep]:  # returns the Descent
-        """How the push moved them together, then each alone."""
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Take the best of the motions that the push may have caused, for all objects together, then for each alone."""
         numbers = np.flatnonzero(misfit).tolist()
-        at = replace(at, guess=self._together(at.guess, numbers))
+        at = replace(at, guess=self._best_joint_push(at.guess, numbers))
         for n in numbers:
-            views = around(self._coarse, self._models, at.guess, n, reach=self._effort.reach)
-            tried = shoved(self._models, at.guess, n, self._push)
+            views = crop_to_object(self._coarse, self._models, at.guess, n, reach=self._config.reach)
+            tried = push_hypotheses(self._models, at.guess, n, self._push)
             losses = pose_losses(self._models, views, at.guess, n, tried)
             at = replace(at, guess=with_pose(at.guess, n, tried[int(losses.argmin())]))
-            at = replace(at, guess=self._rolled(at.guess, n))
+            at = replace(at, guess=self._best_rolling_pose(at.guess, n))
             yield self._step("together", f"{at.guess.names[n]}: where it was pushed", at)
         return at
 
     def _search(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
-    ) -> Iterator[EstimateStep]:  # returns the Descent
-        """Each by CMA."""
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """CMA-ES over the pose of each poorly fitted object."""
         for n in np.flatnonzero(misfit).tolist():
-            views = around(self._coarse, self._models, at.guess, n, reach=self._effort.reach)
-            at = yield from self._search_one(at, n, views)
+            views = crop_to_object(self._coarse, self._models, at.guess, n, reach=self._config.reach)
+            at = yield from self._search_object(at, n, views)
         return at
 
-    def _together(self, guess: SceneParameters, numbers: list[int]) -> SceneParameters:
-        """The guess with objects shoved along by the shares of the push that explain the whole images best."""
-        positions = shoved_together(guess, numbers, self._push)
-        batch = replace(guess.moved(np.zeros((len(positions), guess.size))), positions=positions)
+    def _best_joint_push(self, guess: SceneParameters, numbers: list[int]) -> SceneParameters:
+        """The guess with objects moved by the shares of the push that give the lowest photometric loss."""
+        positions = joint_push_hypotheses(guess, numbers, self._push)
+        batch = replace(guess.perturbed(np.zeros((len(positions), guess.size))), positions=positions)
         best = int(photometric_loss(residuals(self._models, self._coarse, batch)).argmin())
         return replace(guess, positions=positions[best])
 
-    def _rolled(self, guess: SceneParameters, n: int) -> SceneParameters:
-        """The guess with an object rolled farther or less far in place; how far it slipped nobody knows."""
-        tried = rolled_in_place(self._models, guess, n, self._push)
+    def _best_rolling_pose(self, guess: SceneParameters, n: int) -> SceneParameters:
+        """The guess with an object turned by the rolling angle of the lowest loss; how far it slipped is unknown."""
+        tried = rolling_hypotheses(self._models, guess, n, self._push)
         if len(tried.position) == 1:
             return guess
-        losses = pose_losses(self._models, around(self._middle, self._models, guess, n), guess, n, tried)
+        losses = pose_losses(self._models, crop_to_object(self._middle, self._models, guess, n), guess, n, tried)
         return with_pose(guess, n, tried[int(losses.argmin())])
 
-    def _search_one(
+    def _search_object(
         self, at: GaussNewtonState, n: int, views: ObservedViews
-    ) -> Iterator[EstimateStep]:  # returns the Descent
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """CMA over one object's pose."""
-        e, start = self._effort, at.guess
+        e, start = self._config, at.guess
         spread = np.array([e.shift, e.shift, e.shift / 3, e.turn / 2, e.turn / 2, e.turn])
         search = CMAES(spread, e.population, self._rng)
         best, least = start, np.inf
         for _ in range(e.generations):
             changes = np.zeros((1 + e.population, start.size))
             changes[1:, POSE * n : POSE * (n + 1)] = search.ask()
-            batch = start.moved(changes)
+            batch = start.perturbed(changes)
             losses = photometric_loss(residuals(self._models, views, batch))
             search.tell(losses[1:])
             k = int(np.argmin(losses))
             if losses[k] < least:
-                least, best = float(losses[k]), start.changed(changes[k])
+                least, best = float(losses[k]), start.updated(changes[k])
             step = self._step("together", f"{start.names[n]}: where it went", replace(at, guess=best))
             yield replace(step, candidates=Pose(batch.positions, batch.quaternions), sigma=search.sigma, loss=least)
         return replace(at, guess=best)
 
     def _recover(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
-    ) -> Iterator[EstimateStep]:  # returns the Descent
-        """What still does not fit may lie in another way, where it is or where it was before searches led astray."""
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Try all resting orientations of poorly fitted objects, at their present and at their expected position."""
         for n in np.flatnonzero(misfit).tolist():
-            others = Pose.joined(*(lying_there(self._models, guess, n) for guess in (at.guess, self._guess)))
-            at = self._challenge(at, n, others)
+            others = Pose.joined(*(resting_hypotheses(self._models, guess, n) for guess in (at.guess, self._guess)))
+            at = self._compare_orientations(at, n, others)
             yield self._step("together", f"{at.guess.names[n]}: lying in another way", at)
         return at
 
-    def _look_closely(
+    def _refine_finely(
         self, at: GaussNewtonState, moved: Bool[np.ndarray, "N"]
-    ) -> Iterator[EstimateStep]:  # returns the Descent
-        """What does not fit in fine images is refined in them; then it may still be turned wrongly."""
-        bad = self._fine_misfits(at.guess)
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Refine what does not fit in fine images; compare orientations of what still does not, or has moved."""
+        bad = self._poorly_fitted_finely(at.guess)
         if bad.any():
-            at = yield from self._descend(at, bad, self._fine, self._effort.closest_sweeps)
-            bad &= self._fine_misfits(at.guess)
+            at = yield from self._refine(at, bad, self._fine, self._config.closest_sweeps)
+            bad &= self._poorly_fitted_finely(at.guess)
         for n in np.flatnonzero(bad | moved).tolist():
-            others = turned(self._models, at.guess, n)
-            if bad[n] or self._looks_turned(at.guess, n, others):
-                others = Pose.joined(others, lying_there(self._models, at.guess, n))
-                at = self._challenge(at, n, others)
+            others = yaw_hypotheses(self._models, at.guess, n)
+            if bad[n] or self._may_be_turned(at.guess, n, others):
+                others = Pose.joined(others, resting_hypotheses(self._models, at.guess, n))
+                at = self._compare_orientations(at, n, others)
                 yield self._step("together", f"{at.guess.names[n]}: the other way round", at)
         return at
 
-    def _fine_misfits(self, guess: SceneParameters) -> Bool[np.ndarray, "N"]:
-        return object_residuals(self._closely(guess)) > np.maximum(self._effort.fits_finely_below, self._allowed)
+    def _poorly_fitted_finely(self, guess: SceneParameters) -> Bool[np.ndarray, "N"]:
+        return object_residuals(self._fit_finely(guess)) > np.maximum(self._config.fits_finely_below, self._allowed)
 
-    def _closely(self, guess: SceneParameters) -> Evidence:
-        """How well a guess explains the fine images; they are rendered again only for another guess."""
+    def _fit_finely(self, guess: SceneParameters) -> FitQuality:
+        """The fit in fine images; rendered again only for another guess."""
         if self._looked is None or self._looked[0] is not guess:
-            self._looked = guess, gather(self._models, self._fine, guess)
+            self._looked = guess, evaluate_fit(self._models, self._fine, guess)
         return self._looked[1]
 
-    def _looks_turned(self, guess: SceneParameters, n: int, others: Pose) -> bool:
-        """Whether an object looks no better than turned about the vertical: what is right looks far better."""
+    def _may_be_turned(self, guess: SceneParameters, n: int, others: Pose) -> bool:
+        """Whether the loss of some other yaw is within a factor of the present one's."""
         tried = Pose.joined(guess.state().poses[n][None], others)
-        here, *there = pose_losses(self._models, near(self._sharp, self._models, guess, n), guess, n, tried)
-        return min(there) < self._effort.turned_within * here
+        here, *there = pose_losses(
+            self._models, crop_to_silhouette(self._sharp, self._models, guess, n), guess, n, tried
+        )
+        return min(there) < self._config.turned_within * here
 
-    def _challenge(self, at: GaussNewtonState, n: int, others: Pose) -> GaussNewtonState:
+    def _compare_orientations(self, at: GaussNewtonState, n: int, others: Pose) -> GaussNewtonState:
         at, self._rivals[n] = compare_orientations(self._models, self._coarse, self._sharp, self._fine, at, n, others)
         return at
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        estimate = judged(at.guess, at.normals, self._closely(at.guess), self._rivals, light_held=True)
-        self._done = self._total - 1
-        step = self._step("done", "Done" if estimate.trusted else estimate.reason, at)
-        return replace(step, estimate=estimate)
+        estimate = estimate_with_uncertainty(
+            at.guess, at.normals, self._fit_finely(at.guess), self._rivals, light_held=True
+        )
+        return self._reporter.finish(at, estimate)
 
     def _step(self, stage: Stage, note: str, at: GaussNewtonState) -> EstimateStep:
-        self._done = min(self._done + 1, self._total)
-        progress = Progress(self._done, self._total, note)
-        losses = tuple(at.losses[:-1].tolist())
-        return EstimateStep(progress, stage, at.guess.state(), losses=losses, loss=float(at.losses[-1]))
+        losses = at.losses[:-1].tolist()
+        return self._reporter.step(stage, note, at.guess, losses=losses, loss=float(at.losses[-1]))
 
 
-def _push(before: Float[np.ndarray, "3"] | None, after: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, "3"]:
+def _pusher_motion(
+    before: Float[np.ndarray, "3"] | None, after: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "3"]:
     """How far the pusher went along the table; nothing if it was not there before or is not there now."""
     if before is None or after is None:
         return np.zeros(3)

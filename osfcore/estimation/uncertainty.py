@@ -11,7 +11,7 @@ from jaxtyping import Float
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
-from osfcore.estimation.search.gauss_newton import half_widths
+from osfcore.estimation.search.gauss_newton import difference_steps
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.render.types import SceneBatch
 
@@ -20,16 +20,16 @@ from osfcore.render.types import SceneBatch
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
-_MOST_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
-_LEAST_OVERLAP = 0.75  # of silhouette and mask
-_FEW_PX = 12.0  # of an object in all views together
+_MAX_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
+_MIN_OVERLAP = 0.75  # of silhouette and mask
+_MIN_PIXELS = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
-_CLOSE_CALL = 1.05
-_MOST_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths were within -1 and 4 mm
+_MIN_RIVAL_RATIO = 1.05
+_MAX_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths were within -1 and 4 mm
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Evidence:
+class FitQuality:
     """How well a guess explains the images.
 
     Attributes:
@@ -47,9 +47,9 @@ class Evidence:
     spread: float
 
 
-def gather(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> Evidence:
+def evaluate_fit(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> FitQuality:
     """Compare a guess with the images."""
-    batch: SceneBatch = guess.moved(np.zeros((1, guess.size)))
+    batch: SceneBatch = guess.perturbed(np.zeros((1, guess.size)))
     rendered = models.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
     assert rendered.opacity is not None
     opacity = rendered.opacity[0].astype(float)
@@ -63,19 +63,19 @@ def gather(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -
         either = np.maximum(opacity, views.masks).sum(axis=(0, 2, 3))
         overlap = both / np.maximum(either, 1e-6)
     surroundings = float(np.sqrt((elsewhere * squares).sum() / max(elsewhere.sum(), 1e-6)))
-    return Evidence(residuals * (pixels > 0), pixels, overlap, surroundings, float(squares.mean()))
+    return FitQuality(residuals * (pixels > 0), pixels, overlap, surroundings, float(squares.mean()))
 
 
-def object_residuals(evidence: Evidence) -> Float[np.ndarray, "N"]:
+def object_residuals(evidence: FitQuality) -> Float[np.ndarray, "N"]:
     """Root of mean square error of each object over its pixels in all views."""
     total = np.maximum(evidence.pixels.sum(axis=0), 1e-6)
     return np.sqrt((evidence.pixels * evidence.residuals**2).sum(axis=0) / total)
 
 
-def judged(
+def estimate_with_uncertainty(
     guess: SceneParameters,
     normals: Sequence[np.ndarray],
-    evidence: Evidence,
+    evidence: FitQuality,
     rivals: dict[int, float],
     *,
     light_held: bool = False,
@@ -99,7 +99,7 @@ def judged(
     light = 0.0 if light_held else _LIGHT_FACTOR * float(np.sqrt((deviations[-LIGHT:] ** 2).mean()))
     heights = np.zeros(count) if lowest is None else lowest
     doubts = tuple(
-        _doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf)) or _floating(heights[n])
+        _reason_for_doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
         for n in range(count)
     )
     doubtful = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
@@ -108,7 +108,7 @@ def judged(
 
 def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.ndarray:
     """Standard deviations of all numbers; a number that nothing tells about gets a very large one."""
-    widths, found, start = half_widths(count), [], 0
+    widths, found, start = difference_steps(count), [], 0
     for normal in normals:
         own = widths[start : start + len(normal)]
         start += len(normal)
@@ -118,23 +118,23 @@ def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.
     return np.concatenate(found)
 
 
-def _doubt(evidence: Evidence, n: int, position_std: float, rotation_std: float, rival: float) -> str:
+def _reason_for_doubt(evidence: FitQuality, n: int, position_std: float, rotation_std: float, rival: float) -> str:
     pixels = evidence.pixels[:, n]
-    if pixels.sum() < _FEW_PX:
+    if pixels.sum() < _MIN_PIXELS:
         return "it is hardly visible"
     residual = object_residuals(evidence)[n]
-    if evidence.overlap[n] < _LEAST_OVERLAP:
+    if evidence.overlap[n] < _MIN_OVERLAP:
         return f"its silhouette covers its masks by {evidence.overlap[n]:.0%} only"
-    if residual > _MOST_RESIDUAL:
+    if residual > _MAX_RESIDUAL:
         return f"its images differ from what was rendered by {residual:.2f}"
-    if rival < _CLOSE_CALL:
+    if rival < _MIN_RIVAL_RATIO:
         return "another orientation explains the images as well"
     if position_std > _MOST_POSITION_STD_M or rotation_std > _MOST_ROTATION_STD_RAD:
         return f"its pose is known to {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg only"
     return ""
 
 
-def _floating(height: float) -> str:
-    if abs(height) <= _MOST_HEIGHT_M:
+def _height_doubt(height: float) -> str:
+    if abs(height) <= _MAX_HEIGHT_M:
         return ""
     return f"it would {'float above' if height > 0 else 'sink into'} the table by {1000 * abs(height):.0f} mm"

@@ -14,16 +14,16 @@ from jaxtyping import Float
 
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.parametrization import SceneParameters
-from osfcore.estimation.objective.resting_orientations import about_z
+from osfcore.estimation.objective.resting_orientations import yaw_quaternions
 from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, quaternion_multiply, rotate
 
 _SHARES = (0.0, 0.5, 1.0)  # of the push, by which each of several objects may have moved
-_MOST_TOGETHER = 4  # objects whose shares are combined in all ways; of more, all have the same
+_MAX_COMBINED = 4  # objects whose shares are combined in all ways; of more, all have the same
 _NEAR_M = 0.02  # objects that no push explains are looked for this far around
 _ALONG = np.array([-0.3, 0.0, 0.3])  # shares of the push, around where an object is guessed
 _ACROSS = np.array([-0.25, 0.0, 0.25])
 _TURNS_RAD = np.array([-0.5, 0.0, 0.5])
-_LEAST_PUSH_M = 0.005
+_MIN_PUSH_M = 0.005
 _DOWN = np.array([0.0, 0.0, -1.0])
 _ROLLED_RAD = np.deg2rad([20.0, 40.0, 60.0, 80.0])  # along which a body that rolls is looked at
 _OBLIQUE_RAD = np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0])  # of an axis to the one square to a push
@@ -31,11 +31,11 @@ _ROLLS = 18  # equal steps of a whole roll
 _ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
 
 
-def shoved_together(
+def joint_push_hypotheses(
     guess: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "K N 3"]:
     """Positions of all objects if some were shoved along by shares of a push, in K ways; the first is the guess's."""
-    if len(numbers) <= _MOST_TOGETHER:
+    if len(numbers) <= _MAX_COMBINED:
         shares = np.array(list(product(_SHARES, repeat=len(numbers))))
     else:
         shares = np.tile(np.array(_SHARES)[:, None], (1, len(numbers)))
@@ -44,30 +44,32 @@ def shoved_together(
     return positions
 
 
-def shoved(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
+def push_hypotheses(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
     """Poses of one object, somewhat farther or less far along a push, beside it, turned, and rolled; a batch."""
     length = float(np.linalg.norm(push))
-    step = push if length > _LEAST_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
+    step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
     beside = np.array([-step[1], step[0], 0.0])
     shifts = (_ALONG[:, None, None] * step + _ACROSS[:, None] * beside).reshape(-1, 3)
-    turns = about_z(_TURNS_RAD)
+    turns = yaw_quaternions(_TURNS_RAD)
     slid = [(shift, turn) for shift in shifts for turn in turns]
     axis = _rolling_axis(models, guess, number, push)
-    rolled = [(shift, _roll(models, guess, number, axis, push + shift)) for shift in shifts] if axis.any() else []
-    return _placed(models, guess, number, *map(np.array, zip(*slid, *rolled, strict=True)))
+    rolled = [(shift, _roll_along(models, guess, number, axis, push + shift)) for shift in shifts] if axis.any() else []
+    return _combine_shifts_and_turns(models, guess, number, *map(np.array, zip(*slid, *rolled, strict=True)))
 
 
-def rolled_in_place(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
+def rolling_hypotheses(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
     """Poses of one object turned about the axis about which a push rolls it, its own first; a batch.
 
     Only its own pose if no push rolls it that way.
     """
     axis = _rolling_axis(models, guess, number, push)
     angles = np.arange(_ROLLS if axis.any() else 1) * 2 * np.pi / _ROLLS
-    return _placed(models, guess, number, np.zeros((len(angles), 3)), quaternion_exp(angles[:, None] * axis))
+    return _combine_shifts_and_turns(
+        models, guess, number, np.zeros((len(angles), 3)), quaternion_exp(angles[:, None] * axis)
+    )
 
 
-def lying_there(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
+def resting_hypotheses(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
     """Every way in which an object can lie where it is guessed to be; a batch."""
     resting = models.resting(guess.names[number])
     centre = guess.positions[number] + rotate(guess.quaternions[number], resting.centre)
@@ -83,11 +85,11 @@ def _rolling_axis(
     A body rolls about an axis if it can lie in every orientation on the way.
     """
     length = float(np.linalg.norm(push))
-    if length < _LEAST_PUSH_M:
+    if length < _MIN_PUSH_M:
         return np.zeros(3)
     resting, now = models.resting(guess.names[number]), guess.quaternions[number]
     lying = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
-    for axis in rotate(about_z(_OBLIQUE_RAD), np.array([-push[1], push[0], 0.0]) / length):
+    for axis in rotate(yaw_quaternions(_OBLIQUE_RAD), np.array([-push[1], push[0], 0.0]) / length):
         rolled = quaternion_multiply(quaternion_exp(_ROLLED_RAD[:, None] * axis), now[None])
         down = rotate(quaternion_conjugate(rolled), _DOWN)
         if ((down @ lying.T).max(axis=1) > np.cos(_ROLLING_RAD)).all():
@@ -95,7 +97,7 @@ def _rolling_axis(
     return np.zeros(3)
 
 
-def _roll(
+def _roll_along(
     models: ObjectModels, guess: SceneParameters, number: int, axis: np.ndarray, path: np.ndarray
 ) -> Float[np.ndarray, "4"]:
     """The rotation of a body that rolls along a path without slipping, its centre as high as it is now."""
@@ -105,7 +107,9 @@ def _roll(
     return quaternion_exp(axis * (forward @ path) / max(float(height), 0.25 * resting.radius))
 
 
-def _placed(models: ObjectModels, guess: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray) -> Pose:
+def _combine_shifts_and_turns(
+    models: ObjectModels, guess: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray
+) -> Pose:
     """An object shifted, and turned about its centre of mass."""
     centre, now = models.resting(guess.names[number]).centre, guess.quaternions[number]
     quaternions = quaternion_multiply(turns, now[None])

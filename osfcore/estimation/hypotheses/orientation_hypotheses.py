@@ -8,25 +8,25 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import ObservedViews, around
+from osfcore.estimation.objective.observed_views import ObservedViews, crop_to_object
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.objective.photometric_loss import loss_of, photometric_loss, residuals
-from osfcore.estimation.objective.resting_orientations import about_z
+from osfcore.estimation.objective.resting_orientations import yaw_quaternions
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
 from osfcore.geometry.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
-_SIFTED = 64  # rivals that are ranked again in coarse images
-_TRIED = 8  # of these, so many that differ are refined in rough images
-_KEPT = 3  # of these, so many are refined in coarse ones
+_RANKED_COARSE = 64  # rivals that are ranked again in coarse images
+_REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
+_REFINED_COARSE = 3  # of these, so many are refined in coarse ones
 _ITERATIONS, _FINE_ITERATIONS = 2, 3
 _CLOSE = 1.5  # a rival's loss, over that of the pose, up to which it is refined on fine images
 _SAME_RAD = np.deg2rad(12.0)
 
 
-def turned(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
+def yaw_hypotheses(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
     """An object turned in place about the vertical through its centre of mass, by equal steps; a batch of poses."""
-    turns = about_z(np.arange(1, _YAWS) * 2 * np.pi / _YAWS)
+    turns = yaw_quaternions(np.arange(1, _YAWS) * 2 * np.pi / _YAWS)
     quaternions = quaternion_multiply(turns, guess.quaternions[number][None])
     centre = models.resting(guess.names[number]).centre
     middle = guess.positions[number] + rotate(guess.quaternions[number], centre)
@@ -57,25 +57,25 @@ def compare_orientations(
     far = others[~same]
     if not len(far.position):
         return at, np.inf
-    own = around(rough, models, at.guess, number)
-    far = far[np.argsort(pose_losses(models, own, at.guess, number, far))[:_SIFTED]]
-    own = around(coarse, models, at.guess, number)
+    own = crop_to_object(rough, models, at.guess, number)
+    far = far[np.argsort(pose_losses(models, own, at.guess, number, far))[:_RANKED_COARSE]]
+    own = crop_to_object(coarse, models, at.guess, number)
     far = far[np.argsort(pose_losses(models, own, at.guess, number, far))]
-    tried = [_refined(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct(far)]
-    tried = sorted(tried, key=lambda one: loss_of(models, own, one.guess))[:_KEPT]
-    tried = [_refined(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in tried]
+    tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct_orientations(far)]
+    tried = sorted(tried, key=lambda one: loss_of(models, own, one.guess))[:_REFINED_COARSE]
+    tried = [_refine(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in tried]
     ends = [loss_of(models, own, descent.guess) for descent in tried]
     rival = tried[int(np.argmin(ends))]
     if min(ends) < _CLOSE * loss_of(models, own, at.guess):
-        rival = _refined(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
-    own = around(fine, models, at.guess, number)
+        rival = _refine(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
+    own = crop_to_object(fine, models, at.guess, number)
     here, there = (loss_of(models, own, guess) for guess in (at.guess, rival.guess))
     angle = rotation_angle(rival.guess.quaternions[number], at.guess.quaternions[number])
     ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
     return (replace(rival, losses=at.losses) if there < here else at), float(ratio)
 
 
-def _refined(
+def _refine(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, number: int, pose: Pose, iterations: int
 ) -> GaussNewtonState:
     """A descent of one object, begun in a pose; curvatures stay those of before until it moves."""
@@ -83,13 +83,13 @@ def _refined(
     return list(gauss_newton(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
-def _distinct(poses: Pose) -> list[int]:
+def _distinct_orientations(poses: Pose) -> list[int]:
     """Numbers of the first few poses that differ from each other."""
     kept: list[int] = []
     for k in range(len(poses.position)):
         if all(rotation_angle(poses.quaternion[k], poses.quaternion[o]) > _SAME_RAD * 1.5 for o in kept):
             kept.append(k)
-        if len(kept) == _TRIED:
+        if len(kept) == _REFINED_ROUGH:
             break
     return kept
 
@@ -109,7 +109,7 @@ def pose_losses(
     models: ObjectModels, views: ObservedViews, guess: SceneParameters, number: int, poses: Pose
 ) -> Float[np.ndarray, "K"]:
     """Loss of a scene with one object in K poses."""
-    batch = guess.moved(np.zeros((len(poses.position), guess.size)))
+    batch = guess.perturbed(np.zeros((len(poses.position), guess.size)))
     positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
     positions[:, number], quaternions[:, number] = poses.position, poses.quaternion
     return photometric_loss(residuals(models, views, replace(batch, positions=positions, quaternions=quaternions)))

@@ -1,4 +1,4 @@
-"""Scenes put together from sightings: which of them explain an image together, its light being unknown.
+"""Scenes put together from matches: which of them explain an image together, its light being unknown.
 
 Objects and light depend on each other: under a wrong light a wrong scene may look right. So it is begun under lights
 all over the hemisphere, on rough images, and the best of these scenes are sorted out on finer ones. Last, objects are
@@ -23,18 +23,18 @@ from osfcore.estimation.objective.photometric_loss import loss_of
 from osfcore.estimation.search.light_search import hemisphere, search_light
 from osfcore.geometry.poses import Pose
 
-AWAY = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
+OUT_OF_VIEW = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
 _LIGHTS = 40  # over the whole sphere, to begin with
 _KEPT_ROUGH, _KEPT = 8, 3  # of the scenes found under them, for another round, and for one on finer images
-_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, sightings for the second
+_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, matches for the second
 
 
-def assembled(
+def assemble_scene(
     models: ObjectModels,
     rough: ObservedViews,
     coarse: ObservedViews,
     start: SceneParameters,
-    sightings: list[TemplateMatches],
+    matches: list[TemplateMatches],
 ) -> Iterator[tuple[SceneParameters, float]]:
     """Put scenes together; yields the best so far and its loss, each time one more was tried.
 
@@ -43,24 +43,24 @@ def assembled(
         rough: images for all lights.
         coarse: images for the best of them.
         start: one scene to begin with; the others begin with no object.
-        sightings: of each object.
+        matches: of each object.
     """
-    yield from _Assembly(models, rough, coarse, sightings).scenes(start)
+    yield from _SceneAssembly(models, rough, coarse, matches).scenes(start)
 
 
-def reseated(
-    models: ObjectModels, views: ObservedViews, guess: SceneParameters, sightings: list[TemplateMatches]
+def reassign_poses(
+    models: ObjectModels, views: ObservedViews, guess: SceneParameters, matches: list[TemplateMatches]
 ) -> SceneParameters:
-    """In turn each object at the sighting that explains whole images better than its pose does; the same if none."""
-    for n, found in enumerate(sightings):
-        guess, _ = placed(models, views, guess, n, found)
+    """In turn each object at the match that explains whole images better than its pose does; the same if none."""
+    for n, found in enumerate(matches):
+        guess, _ = best_placement(models, views, guess, n, found)
     return guess
 
 
-def placed(
+def best_placement(
     models: ObjectModels, views: ObservedViews, guess: SceneParameters, n: int, found: TemplateMatches
 ) -> tuple[SceneParameters, float]:
-    """The guess with an object where the image is explained best, where it is or at a sighting; and the loss."""
+    """The guess with an object where the image is explained best, where it is or at a match; and the loss."""
     own, losses = loss_of(models, views, guess), _losses(models, views, guess, n, found)
     if losses.min(initial=np.inf) >= own:
         return guess, own
@@ -70,7 +70,7 @@ def placed(
 def _losses(
     models: ObjectModels, views: ObservedViews, guess: SceneParameters, n: int, found: TemplateMatches
 ) -> Float[np.ndarray, "K"]:
-    """Loss of the guess with an object at each of its sightings."""
+    """Loss of the guess with an object at each of its matches."""
     return pose_losses(models, views, guess, n, found.poses) if len(found.scores) else np.zeros(0)
 
 
@@ -79,21 +79,21 @@ def count_of_scenes(objects: int) -> int:
     return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
 
 
-def without(guess: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
+def without_objects(guess: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
     """The guess with some objects away."""
     for n in numbers:
-        guess = with_pose(guess, n, AWAY)
+        guess = with_pose(guess, n, OUT_OF_VIEW)
     return guess
 
 
-class _Assembly:
+class _SceneAssembly:
     def __init__(
-        self, models: ObjectModels, rough: ObservedViews, coarse: ObservedViews, sightings: list[TemplateMatches]
+        self, models: ObjectModels, rough: ObservedViews, coarse: ObservedViews, matches: list[TemplateMatches]
     ) -> None:
-        self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, sightings
+        self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, matches
 
     def scenes(self, start: SceneParameters) -> Iterator[tuple[SceneParameters, float]]:
-        empty = without(start, range(len(self._sightings)))
+        empty = without_objects(start, range(len(self._sightings)))
         scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
         for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
             found: list[tuple[SceneParameters, float]] = []
@@ -109,9 +109,9 @@ class _Assembly:
         yield self._alternated(guess, self._coarse)
 
     def _alternated(self, guess: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
-        """In turn each object at its best sighting, and the light."""
+        """In turn each object at its best match, and the light."""
         for n, found in enumerate(self._sightings):
-            guess, _ = placed(self._models, views, guess, n, found)
+            guess, _ = best_placement(self._models, views, guess, n, found)
         guess = replace(guess, light=search_light(self._models, self._rough, views, guess))
         return guess, loss_of(self._models, views, guess)
 
@@ -119,18 +119,18 @@ class _Assembly:
         """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
         best, least = guess, loss
         first, second = pair
-        rest = without(guess, pair)
+        rest = without_objects(guess, pair)
         others = self._sightings[second]
-        others = others.chosen(self._ranking(rest, second)[:_SECOND])
+        others = others.subset(self._ranking(rest, second)[:_SECOND])
         for k in self._best_places(rest, first):
             one = with_pose(rest, first, self._sightings[first].pose(k))
-            both, loss = placed(self._models, self._coarse, one, second, others)
+            both, loss = best_placement(self._models, self._coarse, one, second, others)
             if loss < least:
                 best, least = both, loss
         return best, least
 
     def _best_places(self, guess: SceneParameters, n: int) -> list[int]:
-        """Numbers of the sightings of an object that explain the image best, each in a place of its own."""
+        """Numbers of the matches of an object that explain the image best, each in a place of its own."""
         positions, kept = self._sightings[n].positions, []
         for k in self._ranking(guess, n).tolist():
             if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:

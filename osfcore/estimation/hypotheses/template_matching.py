@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
-from osfcore.estimation.objective.observed_views import ObservedViews, window
+from osfcore.estimation.objective.observed_views import ObservedViews, crop_camera
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotate
@@ -25,7 +25,7 @@ _REACH_M = WORKSPACE_HALF_M + 0.06
 _ANCHORS = 5  # along each side of the workspace; templates are rendered there, and slid by half the way between two
 _BLOCK_M = 0.025  # side of a square from which each orientation is kept once
 _RIDGE = 0.05
-_MOST_TABLE_ERROR = 0.3
+_MAX_TABLE_ERROR = 0.3
 _NEAR_M, _NEAR_RAD = 0.02, np.deg2rad(20.0)
 
 
@@ -52,11 +52,11 @@ class TemplateMatches:
         """One of them."""
         return Pose(self.positions[number], self.quaternions[number])
 
-    def near(self, position: Float[np.ndarray, "3"], reach: float) -> TemplateMatches:
+    def within(self, position: Float[np.ndarray, "3"], reach: float) -> TemplateMatches:
         """Those within `reach` [m] of a position."""
-        return self.chosen(np.flatnonzero(np.linalg.norm(self.positions - position, axis=1) < reach))
+        return self.subset(np.flatnonzero(np.linalg.norm(self.positions - position, axis=1) < reach))
 
-    def chosen(self, numbers: Int[np.ndarray, "C"]) -> TemplateMatches:
+    def subset(self, numbers: Int[np.ndarray, "C"]) -> TemplateMatches:
         """Some of them."""
         return TemplateMatches(self.positions[numbers], self.quaternions[numbers], self.scores[numbers])
 
@@ -69,13 +69,13 @@ def table_errors(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray
     image = views.images[0]
     share = (image * table).sum(axis=-1) / np.maximum((table * table).sum(axis=-1), 1e-6)
     errors = image - table * np.clip(share, 0.2, 1.05)[..., None]
-    return np.minimum((errors**2).sum(axis=-1), _MOST_TABLE_ERROR**2)
+    return np.minimum((errors**2).sum(axis=-1), _MAX_TABLE_ERROR**2)
 
 
 def scene_errors(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> Float[np.ndarray, "h w"]:
     """Squared error of the first view's pixels where a scene is thought to be known."""
-    rendered = models.together.render(guess.moved(np.zeros((1, guess.size))), views.cameras[:1], quality=QUALITY)
-    return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MOST_TABLE_ERROR**2)
+    rendered = models.together.render(guess.perturbed(np.zeros((1, guess.size))), views.cameras[:1], quality=QUALITY)
+    return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MAX_TABLE_ERROR**2)
 
 
 def match_templates(
@@ -96,18 +96,20 @@ def match_templates(
         name: of the object.
         quaternions: of the orientations.
         heights: for each of them.
-        most: how many sightings are kept.
+        most: how many matches are kept.
         behind: squared errors of the pixels without the object; `table_errors` by default.
     """
     camera, image = views.cameras[0], views.images[0]
     table = table_errors(models, views) if behind is None else behind
     grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
-    found = [_around(models, camera, image, table, name, quaternions, heights, (x, y)) for x in grid for y in grid]
+    found = [
+        _match_at_anchor(models, camera, image, table, name, quaternions, heights, (x, y)) for x in grid for y in grid
+    ]
     positions, turns, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return _thinned(positions, turns, scores, most)
+    return _non_maximum_suppression(positions, turns, scores, most)
 
 
-def _around(
+def _match_at_anchor(
     models: ObjectModels,
     camera: Camera,
     image: np.ndarray,
@@ -133,8 +135,8 @@ def _around(
     if not (-2 * half < x < width and -2 * half < y < height):
         return nothing  # the camera does not look there
     patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
-    scores = _scores(models, window(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, patches)
-    best = _best_of_blocks(scores, places, _BLOCK_M * per_metre)
+    scores = _scores(models, crop_camera(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, patches)
+    best = _best_per_block(scores, places, _BLOCK_M * per_metre)
     scores, places = np.take_along_axis(scores, best, axis=0).ravel(), places[best.ravel()]
     quaternions, heights = (np.tile(a, (len(best),) + (1,) * (a.ndim - 1)) for a in (quaternions, heights))
     pixels = np.tile(camera.project(positions), (len(best), 1)) + places
@@ -146,7 +148,7 @@ def _around(
     return found[on_table], quaternions[on_table], scores[on_table]
 
 
-def _best_of_blocks(scores: np.ndarray, places: np.ndarray, side: float) -> Int[np.ndarray, "B K"]:
+def _best_per_block(scores: np.ndarray, places: np.ndarray, side: float) -> Int[np.ndarray, "B K"]:
     """For each square block of shifted windows, and each template, the window where it scores best."""
     blocks = np.floor(places / max(side, 1.0)).astype(int)
     members = [np.flatnonzero((blocks == block).all(axis=1)) for block in np.unique(blocks, axis=0)]
@@ -194,7 +196,9 @@ def _scores(
     return of_table - (squares - explained)
 
 
-def _thinned(positions: np.ndarray, quaternions: np.ndarray, scores: np.ndarray, most: int) -> TemplateMatches:
+def _non_maximum_suppression(
+    positions: np.ndarray, quaternions: np.ndarray, scores: np.ndarray, most: int
+) -> TemplateMatches:
     """The best ones that differ in place or orientation."""
     order = np.argsort(-scores)
     positions, quaternions, scores = positions[order], quaternions[order], scores[order]

@@ -12,7 +12,7 @@ from osfcore.estimation.objective.observed_views import ObjectView
 from osfcore.render.types import SceneBatch
 
 COLOUR_WEIGHT = 6.0  # of the colours' part against that of the silhouette
-_MOST_ERROR = 0.3  # of radiance that counts: shadows of other objects are not rendered here
+_MAX_ERROR = 0.3  # of radiance that counts: shadows of other objects are not rendered here
 _LEAST_GAIN, _MOST_GAIN = 0.2, 4.0
 
 
@@ -63,7 +63,7 @@ def masked_loss(look: RenderedObject, part: ObjectView, *, any_brightness: bool 
         shown = rgb * both
         gain = (shown * part.rgb).sum(axis=(2, 3, 4)) / np.maximum((shown * shown).sum(axis=(2, 3, 4)), 1e-6)
         rgb = rgb * np.clip(gain, _LEAST_GAIN, _MOST_GAIN)[..., None, None, None]
-    errors = np.minimum(np.abs(rgb - part.rgb), _MOST_ERROR) * both
+    errors = np.minimum(np.abs(rgb - part.rgb), _MAX_ERROR) * both
     colour = errors.mean(axis=-1).sum(axis=(2, 3)) / part.area
     share = part.area / part.area.sum()
     return ((silhouette + COLOUR_WEIGHT * colour) * share).sum(axis=1).astype(float)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from osfcore.errors import UnknownName
-from osfcore.estimation.objective.resting_orientations import Resting, resting_orientations
+from osfcore.estimation.objective.resting_orientations import RestingOrientations, resting_orientations
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table_field import TableField
 from osfcore.render.scene_renderer import SceneRenderer
@@ -29,7 +29,7 @@ class ObjectModels:
             InvalidInput: if there is no such device.
         """
         self._fields = dict(fields)
-        self._resting: dict[str, Resting] = {}
+        self._resting: dict[str, RestingOrientations] = {}
         self.alone = SceneRenderer(fields, None, device=device)
         self.together = SceneRenderer(fields, table, device=device)
 
@@ -43,7 +43,7 @@ class ObjectModels:
             if name not in self._fields:
                 raise UnknownName("field", name, sorted(self._fields))
 
-    def resting(self, name: str) -> Resting:
+    def resting(self, name: str) -> RestingOrientations:
         """How an object can lie on a table, found when first asked for."""
         if name not in self._resting:
             self.check((name,))

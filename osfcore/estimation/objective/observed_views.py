@@ -48,15 +48,15 @@ def views_of(observation: Observation, side: int, *, samples: int = 1) -> Observ
     scale = min(1.0, side / max(height, width))
     size = (max(MIN_IMAGE_SIDE, round(width * scale)), max(MIN_IMAGE_SIDE, round(height * scale)))
     cameras = tuple(camera.resized(*size) for camera in observation.cameras)
-    images = np.stack([_resized(image, size) for image in observation.images])
+    images = np.stack([_resize(image, size) for image in observation.images])
     masks = observation.masks
     if masks is not None:
-        masks = np.stack([[_resized(mask, size) for mask in view] for view in masks.astype(np.float32)])
+        masks = np.stack([[_resize(mask, size) for mask in view] for view in masks.astype(np.float32)])
         masks = masks.reshape(len(cameras), len(observation.names), size[1], size[0])
     return ObservedViews(cameras, images, masks, observation.pusher, replace(QUALITY, samples_per_side=samples))
 
 
-def _resized(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:
+def _resize(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:
     image = np.ascontiguousarray(image, np.float32)
     return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
@@ -82,7 +82,7 @@ class ObjectView:
     quality: Quality
 
 
-def part_of(views: ObservedViews, number: int, *, margin: int = 3) -> ObjectView:
+def crop_to_masks(views: ObservedViews, number: int, *, margin: int = 3) -> ObjectView:
     """The part that shows object `number` by its masks, and `margin` pixels around it.
 
     Views in which its mask is empty are left out; at least one must not be.
@@ -92,18 +92,20 @@ def part_of(views: ObservedViews, number: int, *, margin: int = 3) -> ObjectView
     own = views.masks[shown, number]
     others = np.delete(views.masks[shown], number, axis=1)
     covered = others.max(axis=1) if others.shape[1] else np.zeros_like(own)
-    corners, (width, height) = _windows(own > 0.5, margin)
+    corners, (width, height) = _crop_windows(own > 0.5, margin)
 
     def cut(array: np.ndarray) -> np.ndarray:
         return np.stack([a[y : y + height, x : x + width] for a, (x, y) in zip(array, corners, strict=True)])
 
-    cameras = tuple(window(views.cameras[v], x, y, width, height) for v, (x, y) in zip(shown, corners, strict=True))
+    cameras = tuple(
+        crop_camera(views.cameras[v], x, y, width, height) for v, (x, y) in zip(shown, corners, strict=True)
+    )
     mask, valid = cut(own), cut(covered) < _OTHER_SHARE
     area = np.maximum((mask * valid).sum(axis=(1, 2)), 1)
     return ObjectView(cameras, cut(views.images[shown]) * mask[..., None], mask, valid, area, views.quality)
 
 
-def around(
+def crop_to_object(
     views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int, *, reach: float = 0.0
 ) -> ObservedViews:
     """The windows around one object of a guess, and `reach` [m] more, without masks.
@@ -127,14 +129,16 @@ def around(
     side = int(np.ceil(2 * max(half for *_, half in boxes)))
     w, h = min(max(side, MIN_IMAGE_SIDE), width), min(max(side, MIN_IMAGE_SIDE), height)
     corners = [(int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))) for _, x, y, _ in boxes]
-    cameras = tuple(window(views.cameras[v], x, y, w, h) for (v, *_), (x, y) in zip(boxes, corners, strict=True))
+    cameras = tuple(crop_camera(views.cameras[v], x, y, w, h) for (v, *_), (x, y) in zip(boxes, corners, strict=True))
     images = [views.images[v, y : y + h, x : x + w] for (v, *_), (x, y) in zip(boxes, corners, strict=True)]
     return ObservedViews(cameras, np.stack(images), None, views.pusher, views.quality)
 
 
-def near(views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int) -> ObservedViews:
+def crop_to_silhouette(
+    views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int
+) -> ObservedViews:
     """The windows around one object of a guess, of which only pixels in or just beside its silhouette count."""
-    own = around(views, models, guess, number)
+    own = crop_to_object(views, models, guess, number)
     alone = SceneBatch((guess.names[number],), guess.positions[None, [number]], guess.quaternions[None, [number]],
                        guess.light[None], None)  # fmt: skip
     rendered = models.alone.render(alone, own.cameras, quality=QUALITY, outputs={"opacity"})
@@ -145,14 +149,14 @@ def near(views: ObservedViews, models: ObjectModels, guess: SceneParameters, num
     return replace(own, images=own.images * only[..., None], only=only) if only.any() else own
 
 
-def window(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
     """The camera that sees a window of another's image, whose corner is at pixel (x, y)."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2, 2] -= x, y
     return replace(camera, intrinsics=intrinsics, width=width, height=height)
 
 
-def _windows(masks: Bool[np.ndarray, "V h w"], margin: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+def _crop_windows(masks: Bool[np.ndarray, "V h w"], margin: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
     """Corners (x, y) of windows around masks, none of them empty, and their common width and height [px]."""
     height, width = masks.shape[1:]
     boxes = []

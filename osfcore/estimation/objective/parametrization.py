@@ -54,7 +54,7 @@ class SceneParameters:
         """The guess as a state."""
         return SceneState(self.names, Pose(self.positions, self.quaternions), Light(self.light), self.pusher)
 
-    def moved(self, changes: Float[np.ndarray, "B P"]) -> SceneBatch:
+    def perturbed(self, changes: Float[np.ndarray, "B P"]) -> SceneBatch:
         """B scenes, each changed by one row."""
         count = len(self.names)
         poses = changes[:, : POSE * count].reshape(len(changes), count, POSE)
@@ -68,7 +68,7 @@ class SceneParameters:
         pusher = None if self.pusher is None else np.tile(self.pusher, (len(changes), 1))
         return SceneBatch(self.names, positions, quaternions, lights, pusher)
 
-    def changed(self, change: Float[np.ndarray, "P"]) -> SceneParameters:
+    def updated(self, change: Float[np.ndarray, "P"]) -> SceneParameters:
         """The guess changed by a vector."""
-        batch = self.moved(change[None])
+        batch = self.perturbed(change[None])
         return replace(self, positions=batch.positions[0], quaternions=batch.quaternions[0], light=batch.lights[0])

@@ -27,4 +27,4 @@ def photometric_loss(errors: Float32[np.ndarray, "B *pixels"]) -> Float[np.ndarr
 
 def loss_of(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
     """Loss of one scene."""
-    return float(photometric_loss(residuals(models, views, guess.moved(np.zeros((1, guess.size)))))[0])
+    return float(photometric_loss(residuals(models, views, guess.perturbed(np.zeros((1, guess.size)))))[0])

@@ -25,7 +25,7 @@ _YAWS = 24
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Resting:
+class RestingOrientations:
     """Orientations in which an object may lie on a table, each turned about the vertical in equal steps.
 
     Attributes:
@@ -47,20 +47,20 @@ class Resting:
         return float(pose.apply(self.hull)[:, 2].min())
 
 
-def resting_orientations(field: KiloOSF, *, yaws: int = _YAWS) -> Resting:
+def resting_orientations(field: KiloOSF, *, yaws: int = _YAWS) -> RestingOrientations:
     """Find them for a field; `yaws` steps about the vertical."""
     vertices, centre = _solid(field)
-    directions = sphere(_DIRECTIONS)
+    directions = fibonacci_sphere(_DIRECTIONS)
     heights = ((vertices - centre) @ directions.T).max(axis=0)
     down = _stable(directions, heights)
-    lying = np.array([_turned_down(directions[k]) for k in down])
-    turns = about_z(np.arange(yaws) * 2 * np.pi / yaws)
+    lying = np.array([_rotation_downwards(directions[k]) for k in down])
+    turns = yaw_quaternions(np.arange(yaws) * 2 * np.pi / yaws)
     quaternions = quaternion_multiply(turns[None], lying[:, None]).reshape(-1, 4)
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
-    return Resting(quaternions, np.repeat(heights[down], yaws), centre, radius, vertices)
+    return RestingOrientations(quaternions, np.repeat(heights[down], yaws), centre, radius, vertices)
 
 
-def sphere(count: int) -> Float[np.ndarray, "count 3"]:
+def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
     """Unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
@@ -69,7 +69,7 @@ def sphere(count: int) -> Float[np.ndarray, "count 3"]:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
 
 
-def about_z(angles: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K 4"]:
+def yaw_quaternions(angles: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K 4"]:
     """Turns about the vertical by angles [rad]."""
     return quaternion_exp(np.stack([np.zeros_like(angles), np.zeros_like(angles), angles], axis=1))
 
@@ -99,7 +99,7 @@ def _stable(directions: np.ndarray, heights: np.ndarray) -> list[int]:
     return kept
 
 
-def _turned_down(direction: np.ndarray) -> np.ndarray:
+def _rotation_downwards(direction: np.ndarray) -> np.ndarray:
     """A rotation that takes a unit vector to (0, 0, -1)."""
     axis = np.cross(direction, (0.0, 0.0, -1.0))
     sine = np.linalg.norm(axis)

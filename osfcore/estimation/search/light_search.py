@@ -14,15 +14,15 @@ from jaxtyping import Float
 from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
-from osfcore.estimation.objective.resting_orientations import sphere
+from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 
 _DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
 _FIRST_STEP_RAD = np.deg2rad(8.0)
 _ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
-_MOST_ERROR = 0.25  # of radiance that counts: objects may still be turned the wrong way
+_MAX_ERROR = 0.25  # of radiance that counts: objects may still be turned the wrong way
 _FIRST_SURVIVORS, _SURVIVORS = 6, 3  # a shadow that leaves one object and meets another makes a minimum of its own
-_AROUND = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
+_NEIGHBOUR_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
 
 
 def search_light(
@@ -40,13 +40,13 @@ def search_light(
     best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_FIRST_SURVIVORS]]
     step = _FIRST_STEP_RAD
     for _ in range(_ROUNDS):
-        tried = np.concatenate([_around(guess, light, step) for light in best])
+        tried = np.concatenate([_neighbours(guess, light, step) for light in best])
         best = tried[np.argsort(_losses(models, fine, guess, tried))[:_SURVIVORS]]
         step *= _SHRINKING
     return best[0]
 
 
-def elsewhere(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
+def light_loss_ratio(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
     """Loss under the best of directions all over the hemisphere, over that under the light of a guess."""
     directions = np.concatenate([guess.light[None], hemisphere()])
     losses = _losses(models, views, guess, directions)
@@ -55,19 +55,19 @@ def elsewhere(models: ObjectModels, views: ObservedViews, guess: SceneParameters
 
 def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
     """Where a light may be: those of `count` directions, spread over the whole sphere, that are high enough."""
-    directions = sphere(count)
+    directions = fibonacci_sphere(count)
     return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
 
 
-def _around(guess: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
-    changes = np.zeros((len(_AROUND), guess.size))
-    changes[:, -LIGHT:] = step * _AROUND
-    return replace(guess, light=light).moved(changes).lights
+def _neighbours(guess: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
+    changes = np.zeros((len(_NEIGHBOUR_OFFSETS), guess.size))
+    changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
+    return replace(guess, light=light).perturbed(changes).lights
 
 
 def _losses(
     models: ObjectModels, views: ObservedViews, guess: SceneParameters, lights: np.ndarray
 ) -> Float[np.ndarray, "B"]:
-    batch = replace(guess.moved(np.zeros((len(lights), guess.size))), lights=lights)
+    batch = replace(guess.perturbed(np.zeros((len(lights), guess.size))), lights=lights)
     rendered = models.together.render(batch, views.cameras, quality=QUALITY)
-    return np.minimum(np.abs(rendered.rgb - views.images), _MOST_ERROR).mean(axis=(1, 2, 3, 4))
+    return np.minimum(np.abs(rendered.rgb - views.images), _MAX_ERROR).mean(axis=(1, 2, 3, 4))

@@ -19,7 +19,7 @@ SHIFT_M, TURN_RAD = 4e-3, 0.12  # the first spread
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Generation:
+class CMAGeneration:
     """What was tried.
 
     Attributes:
@@ -66,20 +66,20 @@ class MultistartCMA:
         self._guesses = [SceneParameters((name,), p[None], q[None], light, None) for p, q in begun]
         self._searches = [CMAES(scales, population, rng) for _ in self._guesses]
 
-    def advance(self) -> Generation:
+    def advance(self) -> CMAGeneration:
         """Try one more generation of every search."""
-        batches = [g.moved(s.ask()) for g, s in zip(self._guesses, self._searches, strict=True)]
+        batches = [g.perturbed(s.ask()) for g, s in zip(self._guesses, self._searches, strict=True)]
         positions = np.concatenate([b.positions[:, 0] for b in batches])
         quaternions = np.concatenate([b.quaternions[:, 0] for b in batches])
         look = render_poses(self._models, self._name, self._part, positions, quaternions, self._light)
         losses = masked_loss(look, self._part, any_brightness=self._any_brightness)
         for search, own in zip(self._searches, losses.reshape(len(batches), -1), strict=True):
             search.tell(own)
-        return Generation(Pose(positions, quaternions), float(losses.min()), self._searches[0].sigma)
+        return CMAGeneration(Pose(positions, quaternions), float(losses.min()), self._searches[0].sigma)
 
-    def ends(self) -> Pose:
+    def best_poses(self) -> Pose:
         """The starts, and where each search is now."""
-        now = [g.changed(s.mean) for g, s in zip(self._guesses, self._searches, strict=True)]
+        now = [g.updated(s.mean) for g, s in zip(self._guesses, self._searches, strict=True)]
         return Pose(
             np.concatenate([self._starts.positions, *(g.positions for g in now)]),
             np.concatenate([self._starts.quaternions, *(g.quaternions for g in now)]),

@@ -10,16 +10,16 @@ from jaxtyping import Float
 from osfcore.estimation.objective.masked_loss import RenderedObject, masked_loss, render_poses
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import ObjectView
-from osfcore.estimation.objective.resting_orientations import Resting
+from osfcore.estimation.objective.resting_orientations import RestingOrientations
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import rotate, rotation_angle
 from osfcore.geometry.workspace import TABLE_SIDE_M
 
 OVERHEAD = np.array([0.0, 0.0, 1.0])
-_SETTLING_ROUNDS = 2
-_MOST_STEP_M = 0.05
+_CENTRING_ROUNDS = 2
+_MAX_STEP_M = 0.05
 _HEIGHT_WEIGHT = 4.0  # how firmly an object lies on the table, against one view's line of sight
-_FEW_PX = 3.0
+_MIN_PIXELS = 3.0
 _DISTINCT_RAD = np.deg2rad(25.0)
 
 
@@ -55,10 +55,10 @@ class RankedPoses:
 def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPoses:
     """Every way the object can lie, put where the masks are, under a light of unknown brightness from overhead."""
     resting = models.resting(name)
-    positions = _on_the_sight_lines(part, resting)
-    for _ in range(_SETTLING_ROUNDS):
+    positions = _positions_along_rays(part, resting)
+    for _ in range(_CENTRING_ROUNDS):
         look = render_poses(models, name, part, positions, resting.quaternions, OVERHEAD)
-        positions = _centred(look, part, positions)
+        positions = _centre_on_mask(look, part, positions)
     return rank_poses(models, name, part, positions, resting.quaternions, OVERHEAD, any_brightness=True)
 
 
@@ -79,7 +79,7 @@ def rank_poses(
     return RankedPoses(positions[order], quaternions[order], losses[order])
 
 
-def _on_the_sight_lines(part: ObjectView, resting: Resting) -> Float[np.ndarray, "K 3"]:
+def _positions_along_rays(part: ObjectView, resting: RestingOrientations) -> Float[np.ndarray, "K 3"]:
     """Positions at which the centre of mass is closest to the lines of sight through the masks' centroids.
 
     Its height over the table is nearly given by how the object lies, so one view is enough.
@@ -99,7 +99,9 @@ def _on_the_sight_lines(part: ObjectView, resting: Resting) -> Float[np.ndarray,
     return centres - rotate(resting.quaternions, resting.centre)
 
 
-def _centred(look: RenderedObject, part: ObjectView, positions: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B 3"]:
+def _centre_on_mask(
+    look: RenderedObject, part: ObjectView, positions: Float[np.ndarray, "B 3"]
+) -> Float[np.ndarray, "B 3"]:
     """Positions moved, by least squares over the views, so that silhouettes have the centroids of the masks."""
     wanted, _ = _centroids(part.mask * part.valid)
     found, sizes = _centroids(look.opacity * part.valid)
@@ -107,14 +109,14 @@ def _centred(look: RenderedObject, part: ObjectView, positions: Float[np.ndarray
     target = np.zeros((len(positions), 3))
     for view, camera in enumerate(part.cameras):
         slope = _projection_slope(camera, positions)
-        slope = slope * (sizes[:, view] > _FEW_PX)[:, None, None]
+        slope = slope * (sizes[:, view] > _MIN_PIXELS)[:, None, None]
         normal += np.swapaxes(slope, 1, 2) @ slope
         target += np.einsum("bij,bi->bj", slope, wanted[view] - found[:, view])
     if len(part.cameras) == 1:  # one view cannot tell distance from size; the object lies on the table
         normal[:, 2, 2] += 1e9
     step = np.linalg.solve(normal, target[..., None])[..., 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
-    return positions + step * np.minimum(1, _MOST_STEP_M / np.maximum(length, 1e-9))
+    return positions + step * np.minimum(1, _MAX_STEP_M / np.maximum(length, 1e-9))
 
 
 def _centroids(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,7 +47,7 @@ def observe(models, state, cameras, *, masks=True) -> Observation:
 
 def own_views(models, guess, cameras, quality=QUALITY) -> ObservedViews:
     """Views that the guess explains to the last bit."""
-    batch = guess.moved(np.zeros((1, guess.size)))
+    batch = guess.perturbed(np.zeros((1, guess.size)))
     rendered = models.together.render(batch, cameras, quality=quality, outputs={"rgb", "opacity"})
     return ObservedViews(tuple(cameras), rendered.rgb[0], rendered.opacity[0], guess.pusher, quality)
 

@@ -5,7 +5,7 @@ import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
-from osfcore.estimation.objective.resting_orientations import about_z
+from osfcore.estimation.objective.resting_orientations import yaw_quaternions
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_multiply
@@ -23,7 +23,7 @@ def pushed(truth):
     """The box pushed and turned, under another light."""
     position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
     position[0, :2] = -0.02, -0.06
-    quaternion[0] = quaternion_multiply(about_z(np.array([0.6]))[0], quaternion[0])
+    quaternion[0] = quaternion_multiply(yaw_quaternions(np.array([0.6]))[0], quaternion[0])
     return replace(truth, poses=Pose(position, quaternion), light=Light(np.array([-0.3, 0.4, 0.8])))
 
 

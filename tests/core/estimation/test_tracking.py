@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.estimation.objective.resting_orientations import about_z
+from osfcore.estimation.objective.resting_orientations import yaw_quaternions
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
@@ -25,7 +25,7 @@ def pushed(truth, shift, yaw):
     """The first object pushed and turned."""
     position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
     position[0, :2] += shift
-    quaternion[0] = quaternion_multiply(about_z(np.array([yaw]))[0], quaternion[0])
+    quaternion[0] = quaternion_multiply(yaw_quaternions(np.array([yaw]))[0], quaternion[0])
     return replace(truth, poses=Pose(position, quaternion))
 
 

@@ -6,7 +6,7 @@ import pytest
 from osfcore.estimation.objective.observed_views import QUALITY, views_of
 from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
-from osfcore.estimation.uncertainty import Evidence, gather, judged, object_residuals
+from osfcore.estimation.uncertainty import FitQuality, estimate_with_uncertainty, evaluate_fit, object_residuals
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOX, guess_of, own_views
 
@@ -24,8 +24,8 @@ def end(models, truth, views):
     return list(gauss_newton(models, views, GaussNewtonState.at(guess_of(truth)), iterations=1, light=views))[-1]
 
 
-def evidence_of(count=1, **change) -> Evidence:
-    plain = Evidence(np.full((2, count), 0.01), np.full((2, count), 50.0), np.ones(count), 0.01, 1e-4)
+def evidence_of(count=1, **change) -> FitQuality:
+    plain = FitQuality(np.full((2, count), 0.01), np.full((2, count), 50.0), np.ones(count), 0.01, 1e-4)
     return replace(plain, **change)
 
 
@@ -40,7 +40,9 @@ def normals(count=1, scale=1e6):
 
 
 def test_a_right_guess_is_trusted(models, views, end):
-    estimate = judged(end.guess, end.normals, gather(models, views, end.guess), {0: 3.0, 1: 2.0})
+    estimate = estimate_with_uncertainty(
+        end.guess, end.normals, evaluate_fit(models, views, end.guess), {0: 3.0, 1: 2.0}
+    )
     assert estimate.trusted
     assert estimate.doubts == ("", "")
     assert estimate.position_std.max() < 0.003
@@ -60,33 +62,33 @@ def test_a_right_guess_is_trusted(models, views, end):
     ],
 )
 def test_a_wrong_guess_is_doubted(models, views, end, change, words):
-    wrong = end.guess.changed(np.array([*change, *[0.0] * (POSE + LIGHT)]))
-    estimate = judged(wrong, end.normals, gather(models, views, wrong), {})
+    wrong = end.guess.updated(np.array([*change, *[0.0] * (POSE + LIGHT)]))
+    estimate = estimate_with_uncertainty(wrong, end.normals, evaluate_fit(models, views, wrong), {})
     assert words in estimate.doubts[0]
     assert not estimate.trusted
     assert estimate.reason.startswith(f"{BOX}: ")
 
 
 def test_a_wrong_light_is_doubted(models, truth, views, end):
-    wrong = end.guess.changed(np.array([*[0.0] * (2 * POSE), 1.5, 0.8]))
-    assert not judged(wrong, end.normals, gather(models, views, wrong), {}).trusted
+    wrong = end.guess.updated(np.array([*[0.0] * (2 * POSE), 1.5, 0.8]))
+    assert not estimate_with_uncertainty(wrong, end.normals, evaluate_fit(models, views, wrong), {}).trusted
 
 
 def test_evidence_of_the_truth_is_perfect(models, truth):
     own = own_views(models, guess_of(truth), default_cameras(48)[:2], FINE)
-    evidence = gather(models, own, guess_of(truth))
+    evidence = evaluate_fit(models, own, guess_of(truth))
     np.testing.assert_array_equal(evidence.residuals, 0)
     np.testing.assert_allclose(evidence.overlap, 1)
     np.testing.assert_allclose(evidence.pixels, own.masks.sum(axis=(2, 3)), rtol=1e-5)
     assert evidence.surroundings == evidence.spread == 0
-    assert gather(models, replace(own, masks=None), guess_of(truth)).overlap.tolist() == [1, 1]
+    assert evaluate_fit(models, replace(own, masks=None), guess_of(truth)).overlap.tolist() == [1, 1]
 
 
 def test_evidence_is_of_each_objects_pixels(models, truth):
     own = own_views(models, guess_of(truth), default_cameras(48)[:2], FINE)
     darker = own.images.copy()
     darker[1][own.masks[1, 0] > 0] -= np.float32(0.2)  # the box, in one view
-    evidence = gather(models, replace(own, images=darker), guess_of(truth))
+    evidence = evaluate_fit(models, replace(own, images=darker), guess_of(truth))
     assert evidence.residuals[1, 0] == pytest.approx(0.2, rel=1e-3)
     np.testing.assert_allclose(evidence.residuals[0], 0, atol=1e-6)
     assert evidence.residuals[1, 1] < 0.03  # which it touches in the image at most
@@ -98,9 +100,9 @@ def test_evidence_is_of_each_objects_pixels(models, truth):
 def test_an_empty_scene_has_evidence_of_the_table_alone(models):
     nothing = guess(0)
     own = own_views(models, nothing, default_cameras(48)[:1])
-    evidence = gather(models, replace(own, images=own.images + np.float32(0.1)), nothing)
+    evidence = evaluate_fit(models, replace(own, images=own.images + np.float32(0.1)), nothing)
     assert evidence.surroundings == pytest.approx(0.1, rel=1e-4)
-    estimate = judged(nothing, normals(0), evidence, {})
+    estimate = estimate_with_uncertainty(nothing, normals(0), evidence, {})
     assert estimate.trusted
     assert estimate.position_std.shape == (0,)
 
@@ -116,7 +118,7 @@ def test_each_doubt_is_told():
         "its pose is known to 150 mm and 6 deg only": ({}, {}, 1.0),
     }
     for words, (change, rivals, scale) in cases.items():
-        estimate = judged(guess(), normals(1, scale), evidence_of(**change), rivals)
+        estimate = estimate_with_uncertainty(guess(), normals(1, scale), evidence_of(**change), rivals)
         assert estimate.doubts == (words,)
         assert estimate.reason == (f"object0: {words}" if words else "")
 
@@ -124,21 +126,25 @@ def test_each_doubt_is_told():
 def test_what_cannot_stand_there_is_doubted_where_that_matters():
     words = {0.001: "", 0.02: "it would float above the table by 20 mm", -0.01: "it would sink into the table by 10 mm"}
     for height, doubt in words.items():
-        assert judged(guess(), normals(), evidence_of(), {}, lowest=np.array([height])).doubts == (doubt,)
-    assert judged(guess(), normals(), evidence_of(), {}).trusted
+        assert estimate_with_uncertainty(guess(), normals(), evidence_of(), {}, lowest=np.array([height])).doubts == (
+            doubt,
+        )
+    assert estimate_with_uncertainty(guess(), normals(), evidence_of(), {}).trusted
 
 
 def test_all_doubts_make_the_reason():
-    estimate = judged(guess(3), normals(3), evidence_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0})
+    estimate = estimate_with_uncertainty(
+        guess(3), normals(3), evidence_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0}
+    )
     assert estimate.doubts[1] == ""
     assert estimate.reason == f"object0: {estimate.doubts[0]}; object2: {estimate.doubts[2]}"
 
 
 def test_deviations_are_those_of_least_squares():
     """They grow with the error of a pixel, and shrink with the root of the curvature."""
-    first = judged(guess(), normals(), evidence_of(), {})
-    noisier = judged(guess(), normals(), evidence_of(spread=4e-4), {})
-    sharper = judged(guess(), normals(1, 1e8), evidence_of(), {})
+    first = estimate_with_uncertainty(guess(), normals(), evidence_of(), {})
+    noisier = estimate_with_uncertainty(guess(), normals(), evidence_of(spread=4e-4), {})
+    sharper = estimate_with_uncertainty(guess(), normals(1, 1e8), evidence_of(), {})
     for name in ("position_std", "rotation_std", "light_std"):
         here = getattr(first, name)
         np.testing.assert_allclose(getattr(noisier, name), 2 * here, rtol=1e-3)
@@ -148,12 +154,12 @@ def test_deviations_are_those_of_least_squares():
 
 def test_what_nothing_tells_about_is_not_known():
     nothing = [np.zeros((POSE, POSE)), np.zeros((LIGHT, LIGHT))]
-    estimate = judged(guess(), nothing, evidence_of(), {})
+    estimate = estimate_with_uncertainty(guess(), nothing, evidence_of(), {})
     assert estimate.position_std[0] > 0.1
     assert "its pose is known to" in estimate.doubts[0]
     assert estimate.light_std > 0.1
-    assert judged(guess(), nothing, evidence_of(), {}, light_held=True).light_std == 0
+    assert estimate_with_uncertainty(guess(), nothing, evidence_of(), {}, light_held=True).light_std == 0
     flat = np.diag([1e6, 1e6, 0, 0, 0, 1e6])  # an object that was slid over the table only
-    partly = judged(guess(), [flat, nothing[1]], evidence_of(), {})
+    partly = estimate_with_uncertainty(guess(), [flat, nothing[1]], evidence_of(), {})
     assert np.isfinite(partly.position_std[0])
-    assert partly.position_std[0] > judged(guess(), normals(), evidence_of(), {}).position_std[0]
+    assert partly.position_std[0] > estimate_with_uncertainty(guess(), normals(), evidence_of(), {}).position_std[0]

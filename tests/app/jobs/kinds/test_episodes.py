@@ -55,7 +55,7 @@ def sighted(monkeypatch, stage):  # noqa: F811
 
     for name in ("estimate_first", "estimate_next"):
         monkeypatch.setattr(core, name, found)
-    monkeypatch.setattr(core, "usual_residuals", lambda *_: np.zeros(len(NAMES)))
+    monkeypatch.setattr(core, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
 
 
 def entries(state):

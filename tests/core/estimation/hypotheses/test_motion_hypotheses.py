@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.motion_hypotheses import lying_there, rolled_in_place, shoved, shoved_together
+from osfcore.estimation.hypotheses.motion_hypotheses import (
+    joint_push_hypotheses,
+    push_hypotheses,
+    resting_hypotheses,
+    rolling_hypotheses,
+)
 from osfcore.geometry.poses import rotate, rotation_angle
 from tests.core.estimation.scenes import guess_of, lying, scene
 
@@ -10,7 +15,7 @@ PUSH = np.array([0.06, 0.03, 0.0])
 
 def test_objects_are_shoved_together_in_all_ways(truth):
     guess = guess_of(truth)
-    positions = shoved_together(guess, [0, 1], PUSH)
+    positions = joint_push_hypotheses(guess, [0, 1], PUSH)
     np.testing.assert_array_equal(positions[0], guess.positions)
     shifts = positions - guess.positions
     ways = {tuple(np.round(way @ PUSH / (PUSH @ PUSH), 6)) for way in shifts}
@@ -19,14 +24,14 @@ def test_objects_are_shoved_together_in_all_ways(truth):
 
 def test_who_was_not_shoved_stays(truth):
     guess = guess_of(truth)
-    positions = shoved_together(guess, [1], PUSH)
+    positions = joint_push_hypotheses(guess, [1], PUSH)
     np.testing.assert_array_equal(positions[:, 0], np.tile(guess.positions[0], (3, 1)))
     np.testing.assert_allclose(positions[:, 1] - guess.positions[1], np.outer([0, 0.5, 1], PUSH))
 
 
 def test_many_objects_share_one_share(plain):
     state = scene({name: lying(plain, "block", 0, 0.1 * k, 0) for k, name in enumerate("abcde")})
-    positions = shoved_together(guess_of(state), range(5), PUSH)
+    positions = joint_push_hypotheses(guess_of(state), range(5), PUSH)
     shifts = positions - guess_of(state).positions
     assert len(positions) == 3
     np.testing.assert_allclose(shifts, np.repeat(shifts[:, :1], 5, axis=1))
@@ -35,7 +40,7 @@ def test_many_objects_share_one_share(plain):
 def test_a_ball_rolls_without_slipping(plain):
     state = scene({"ball": lying(plain, "ball", 0, 0.0, 0.0)})
     guess = guess_of(state)
-    tried = shoved(plain, guess, 0, PUSH)
+    tried = push_hypotheses(plain, guess, 0, PUSH)
     slid, rolled = tried[:27], tried[27:]
     assert len(rolled.position) == 9
     centre = plain.resting("ball").centre
@@ -52,7 +57,7 @@ def test_a_ball_rolls_without_slipping(plain):
 @pytest.mark.parametrize("push", [np.zeros(3), np.array([1e-3, 0, 0])])
 def test_without_a_push_it_is_looked_for_around(models, truth, push):
     guess = guess_of(truth)
-    tried = shoved(models, guess, 0, push)
+    tried = push_hypotheses(models, guess, 0, push)
     centre = models.resting(guess.names[0]).centre
     there = tried.position + rotate(tried.quaternion, centre)
     shifts = there - (guess.positions[0] + rotate(guess.quaternions[0], centre))
@@ -63,7 +68,7 @@ def test_without_a_push_it_is_looked_for_around(models, truth, push):
 
 def test_every_way_of_lying_is_on_the_table_in_the_same_place(models, truth):
     guess = guess_of(truth)
-    tried, resting = lying_there(models, guess, 1), models.resting(guess.names[1])
+    tried, resting = resting_hypotheses(models, guess, 1), models.resting(guess.names[1])
     centres = tried.position + rotate(tried.quaternion, resting.centre)
     here = guess.positions[1] + rotate(guess.quaternions[1], resting.centre)
     np.testing.assert_allclose(centres[:, :2], np.tile(here[:2], (len(centres), 1)), atol=1e-12)
@@ -72,7 +77,7 @@ def test_every_way_of_lying_is_on_the_table_in_the_same_place(models, truth):
 
 def test_a_ball_may_have_rolled_any_way(plain):
     guess = guess_of(scene({"ball": lying(plain, "ball", 0, 0.0, 0.0)}))
-    tried, centre = rolled_in_place(plain, guess, 0, PUSH), plain.resting("ball").centre
+    tried, centre = rolling_hypotheses(plain, guess, 0, PUSH), plain.resting("ball").centre
     assert len(tried.position) == 18
     here = guess.positions[0] + rotate(guess.quaternions[0], centre)
     np.testing.assert_allclose(tried.position + rotate(tried.quaternion, centre), np.tile(here, (18, 1)), atol=1e-12)
@@ -86,12 +91,12 @@ def test_a_ball_may_have_rolled_any_way(plain):
 def test_what_stands_on_a_face_does_not_roll(models, truth):
     """Nothing of it is tried but sliding, and its own pose."""
     guess = guess_of(truth)
-    assert len(shoved(models, guess, 0, PUSH).position) == 27
-    alone = rolled_in_place(models, guess, 0, PUSH)
+    assert len(push_hypotheses(models, guess, 0, PUSH).position) == 27
+    alone = rolling_hypotheses(models, guess, 0, PUSH)
     np.testing.assert_allclose(alone.position, guess.positions[:1], atol=1e-12)
     np.testing.assert_allclose(alone.quaternion, guess.quaternions[:1], atol=1e-12)
 
 
 def test_nothing_rolls_without_a_push(plain):
     guess = guess_of(scene({"ball": lying(plain, "ball", 0, 0.0, 0.0)}))
-    assert len(rolled_in_place(plain, guess, 0, np.zeros(3)).position) == 1
+    assert len(rolling_hypotheses(plain, guess, 0, np.zeros(3)).position) == 1

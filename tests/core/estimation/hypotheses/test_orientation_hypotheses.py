@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, turned
+from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, yaw_hypotheses
 from osfcore.estimation.objective.observed_views import QUALITY
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.search.gauss_newton import GaussNewtonState
@@ -25,7 +25,7 @@ def fine(models, truth):
 @pytest.fixture(scope="module")
 def flips(models, truth):
     """Ways in which the box is turned about the vertical."""
-    return turned(models, guess_of(truth), 0)
+    return yaw_hypotheses(models, guess_of(truth), 0)
 
 
 def flipped(guess, flips) -> SceneParameters:
@@ -51,7 +51,7 @@ def test_turned_in_place_about_the_vertical(models, truth, flips):
 def test_a_flipped_object_is_turned_round(models, truth, coarse, fine, flips):
     wrong = flipped(guess_of(truth), flips)
     at, ratio = compare_orientations(
-        models, coarse, coarse, fine, GaussNewtonState.at(wrong), 0, turned(models, wrong, 0)
+        models, coarse, coarse, fine, GaussNewtonState.at(wrong), 0, yaw_hypotheses(models, wrong, 0)
     )
     shift, turn, _ = apart(at.guess, truth)
     assert shift[0] < 0.002
@@ -75,7 +75,9 @@ def test_a_ball_of_one_colour_is_a_close_call(plain):
     views = own_views(plain, guess, default_cameras(48)[:2])
     noise = np.random.default_rng(0).normal(0, 0.02, views.images.shape).astype(np.float32)
     views = replace(views, images=views.images + noise)
-    _, ratio = compare_orientations(plain, views, views, views, GaussNewtonState.at(guess), 0, turned(plain, guess, 0))
+    _, ratio = compare_orientations(
+        plain, views, views, views, GaussNewtonState.at(guess), 0, yaw_hypotheses(plain, guess, 0)
+    )
     assert 1 <= ratio < 1.05
 
 

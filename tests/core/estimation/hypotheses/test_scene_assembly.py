@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.estimation.hypotheses.orientation_hypotheses import with_pose
-from osfcore.estimation.hypotheses.scene_assembly import AWAY, assembled, count_of_scenes, reseated
+from osfcore.estimation.hypotheses.scene_assembly import OUT_OF_VIEW, assemble_scene, count_of_scenes, reassign_poses
 from osfcore.estimation.hypotheses.template_matching import TemplateMatches
 from osfcore.estimation.objective.observed_views import views_of
 from osfcore.geometry.cameras import goal_camera
@@ -21,7 +21,7 @@ def views(models, truth):
 def empty(truth):
     """Nothing on the table, under a light that is far from the right one."""
     guess = replace(guess_of(truth), light=np.array([0.0, -0.6, 0.8]))
-    return with_pose(with_pose(guess, 0, AWAY), 1, AWAY)
+    return with_pose(with_pose(guess, 0, OUT_OF_VIEW), 1, OUT_OF_VIEW)
 
 
 def sightings_at(truth, *shifts) -> list[TemplateMatches]:
@@ -34,8 +34,8 @@ def sightings_at(truth, *shifts) -> list[TemplateMatches]:
 
 
 def test_the_right_sightings_and_the_light_are_found_together(models, truth, views, empty):
-    sightings = sightings_at(truth, (0.07, 0, 0), (0, 0.05, 0), (0, 0, 0), (-0.1, 0.02, 0))
-    guess, _ = list(assembled(models, *views, empty, sightings))[-1]
+    matches = sightings_at(truth, (0.07, 0, 0), (0, 0.05, 0), (0, 0, 0), (-0.1, 0.02, 0))
+    guess, _ = list(assemble_scene(models, *views, empty, matches))[-1]
     shift, turn, light = apart(guess, guess_of(truth))
     assert shift.max() == 0
     assert turn.max() < 1e-6
@@ -44,34 +44,34 @@ def test_the_right_sightings_and_the_light_are_found_together(models, truth, vie
 
 def test_one_that_stands_in_anothers_place_is_moved(models, truth, views, empty):
     own, other = truth.poses.position
-    sightings = sightings_at(truth, (0, 0, 0), other - own)
-    sightings[1] = sightings_at(truth, (0, 0, 0), own - other)[1]
-    swapped = with_pose(with_pose(empty, 0, sightings[0].pose(1)), 1, sightings[1].pose(1))
-    guess, _ = list(assembled(models, *views, swapped, sightings))[-1]
+    matches = sightings_at(truth, (0, 0, 0), other - own)
+    matches[1] = sightings_at(truth, (0, 0, 0), own - other)[1]
+    swapped = with_pose(with_pose(empty, 0, matches[0].pose(1)), 1, matches[1].pose(1))
+    guess, _ = list(assemble_scene(models, *views, swapped, matches))[-1]
     assert apart(guess, guess_of(truth))[0].max() == 0
 
 
 def test_losses_fall_within_each_part_and_the_count_is_known(models, truth, views, empty):
-    steps = list(assembled(models, *views, empty, sightings_at(truth, (0.03, 0, 0), (0, 0, 0))))
+    steps = list(assemble_scene(models, *views, empty, sightings_at(truth, (0.03, 0, 0), (0, 0, 0))))
     assert len(steps) == count_of_scenes(2)
     rough = [loss for _, loss in steps[:8]]  # the lights to begin with are more than these
     assert np.all(np.diff(rough) <= 0)
 
 
 def test_what_nobody_sighted_stays_away(models, truth, views, empty):
-    sightings = [sightings_at(truth, (0, 0, 0))[0], TemplateMatches(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
-    guess, _ = list(assembled(models, *views, empty, sightings))[-1]
-    np.testing.assert_array_equal(guess.positions[1], AWAY.position)
+    matches = [sightings_at(truth, (0, 0, 0))[0], TemplateMatches(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
+    guess, _ = list(assemble_scene(models, *views, empty, matches))[-1]
+    np.testing.assert_array_equal(guess.positions[1], OUT_OF_VIEW.position)
     np.testing.assert_array_equal(guess.positions[0], truth.poses.position[0])
 
 
 def test_what_hides_is_put_where_it_was_seen(models, truth, views):
-    sightings = sightings_at(truth, (0.07, 0, 0), (0, 0, 0))
-    hidden = with_pose(guess_of(truth), 1, AWAY)
-    guess = reseated(models, views[1], hidden, sightings)
+    matches = sightings_at(truth, (0.07, 0, 0), (0, 0, 0))
+    hidden = with_pose(guess_of(truth), 1, OUT_OF_VIEW)
+    guess = reassign_poses(models, views[1], hidden, matches)
     assert apart(guess, guess_of(truth))[0].max() == 0
 
 
 def test_what_explains_the_image_stays(models, truth, views):
     right = guess_of(truth)
-    assert reseated(models, views[1], right, sightings_at(truth, (0.07, 0, 0), (0.01, 0, 0))) is right
+    assert reassign_poses(models, views[1], right, sightings_at(truth, (0.07, 0, 0), (0.01, 0, 0))) is right

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.scene_assembly import without
+from osfcore.estimation.hypotheses.scene_assembly import without_objects
 from osfcore.estimation.hypotheses.template_matching import TemplateMatches, match_templates, scene_errors, table_errors
 from osfcore.estimation.objective.observed_views import views_of
 from osfcore.geometry.cameras import Camera, goal_camera
@@ -65,7 +65,7 @@ def test_what_a_known_scene_leaves_unexplained(models, truth):
     views = image_of(models, truth, side=96)
     names, guess = truth.names, guess_of(truth)
     missing = names.index(BOX)
-    explained, unexplained = (scene_errors(models, views, g) for g in (guess, without(guess, [missing])))
+    explained, unexplained = (scene_errors(models, views, g) for g in (guess, without_objects(guess, [missing])))
     assert explained.mean() < 0.3 * unexplained.mean()  # what is left are edges
     quaternions = truth.poses.quaternion[[missing]]
     heights = truth.poses.position[[missing], 2]
@@ -93,7 +93,7 @@ def test_a_camera_among_the_objects_sees_what_is_before_it(models):
 def test_some_of_the_sightings():
     positions = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.1, 0, 0]])
     found = TemplateMatches(positions, np.tile([1.0, 0, 0, 0], (3, 1)), np.array([3.0, 2.0, 1.0]))
-    np.testing.assert_array_equal(found.near(np.array([0.01, 0, 0]), 0.02).scores, [3, 2])
-    np.testing.assert_array_equal(found.chosen(np.array([2, 0])).scores, [1, 3])
+    np.testing.assert_array_equal(found.within(np.array([0.01, 0, 0]), 0.02).scores, [3, 2])
+    np.testing.assert_array_equal(found.subset(np.array([2, 0])).scores, [1, 3])
     np.testing.assert_array_equal(found.pose(1).position, found.poses[1].position)
-    assert len(found.near(np.array([1.0, 0, 0]), 0.1).scores) == 0
+    assert len(found.within(np.array([1.0, 0, 0]), 0.1).scores) == 0

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.estimation.objective.observed_views import QUALITY, ObservedViews, around, near, part_of, views_of, window
+from osfcore.estimation.objective.observed_views import (
+    QUALITY,
+    ObservedViews,
+    crop_camera,
+    crop_to_masks,
+    crop_to_object,
+    crop_to_silhouette,
+    views_of,
+)
 from osfcore.estimation.objective.photometric_loss import residuals
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
@@ -88,7 +96,7 @@ def test_a_window_shows_the_pixels_of_the_whole(plain, guess, samples):
     batch = SceneBatch.of(guess.state())
     x, y, width, height = 13, 9, 30, 24
     whole = plain.together.render(batch, CAMERAS, quality=quality, outputs=OUTPUTS)
-    windows = [window(camera, x, y, width, height) for camera in CAMERAS]
+    windows = [crop_camera(camera, x, y, width, height) for camera in CAMERAS]
     part = plain.together.render(batch, windows, quality=quality, outputs=OUTPUTS)
     for name in ("rgb", "opacity", "depth"):
         cut = getattr(whole, name)
@@ -99,14 +107,14 @@ def test_a_window_shows_the_pixels_of_the_whole(plain, guess, samples):
 @given(x=st.integers(-50, 50), y=st.integers(-50, 50))
 def test_a_window_moves_pixels_by_its_corner(x, y):
     points = np.array([[0, 0, 0.04], [0.1, -0.2, 0.0]])
-    moved = window(CAMERAS[0], x, y, 20, 30)
+    moved = crop_camera(CAMERAS[0], x, y, 20, 30)
     assert (moved.width, moved.height) == (20, 30)
     np.testing.assert_allclose(moved.project(points) + [x, y], CAMERAS[0].project(points), atol=1e-9)
 
 
 def test_a_part_is_the_object_and_its_surroundings_by_its_masks(plain, guess, views):
     for number, name in enumerate(guess.names):
-        part = part_of(views, number, margin=4)
+        part = crop_to_masks(views, number, margin=4)
         height, width = part.mask.shape[1:]
         assert len({part.rgb.shape[1:3], part.valid.shape[1:], (height, width)}) == 1
         np.testing.assert_allclose(part.mask.sum(axis=(1, 2)), views.masks[:, number].sum(axis=(1, 2)), rtol=1e-3)
@@ -129,7 +137,7 @@ def test_a_part_is_the_object_and_its_surroundings_by_its_masks(plain, guess, vi
 def test_a_part_leaves_out_views_that_do_not_show_the_object(views):
     masks = views.masks.copy()
     masks[0, 0] = 0
-    part = part_of(replace(views, masks=masks), 0)
+    part = crop_to_masks(replace(views, masks=masks), 0)
     assert len(part.cameras) == len(part.rgb) == len(part.area) == 1
     assert part.cameras[0].T_world_camera is views.cameras[1].T_world_camera
 
@@ -137,9 +145,9 @@ def test_a_part_leaves_out_views_that_do_not_show_the_object(views):
 def test_what_others_cover_is_not_valid(views):
     masks = views.masks.copy()
     masks[:, 1] = 1 - masks[:, 0]
-    part = part_of(replace(views, masks=masks), 0)
+    part = crop_to_masks(replace(views, masks=masks), 0)
     np.testing.assert_array_equal(part.valid, 1 - part.mask < 0.3)
-    alone = part_of(replace(views, masks=masks[:, :1]), 0)
+    alone = crop_to_masks(replace(views, masks=masks[:, :1]), 0)
     assert alone.valid.all()
 
 
@@ -147,17 +155,17 @@ def test_what_others_cover_is_not_valid(views):
 def test_a_part_at_the_border_stays_in_the_image(views, corner):
     masks = np.zeros_like(views.masks)
     masks[:, 0, corner[1], corner[0]] = 1
-    part = part_of(replace(views, masks=masks), 0)
+    part = crop_to_masks(replace(views, masks=masks), 0)
     assert part.mask.shape == (2, 16, 16)
     assert part.area.tolist() == [1, 1]
 
 
 def test_around_are_windows_that_hold_the_object(plain, guess, views):
     for number in range(2):
-        own = around(views, plain, guess, number)
+        own = crop_to_object(views, plain, guess, number)
         assert own.masks is own.only is None
         assert own.images.shape[1] == own.images.shape[2] < 64
-        batch = guess.moved(np.zeros((1, guess.size)))
+        batch = guess.perturbed(np.zeros((1, guess.size)))
         np.testing.assert_allclose(residuals(plain, own, batch), 0, atol=ROUNDING)
         shown = plain.together.render(batch, own.cameras, quality=QUALITY, outputs={"opacity"}).opacity[0, :, number]
         np.testing.assert_allclose(shown.sum(axis=(1, 2)), views.masks[:, number].sum(axis=(1, 2)), rtol=1e-3)
@@ -166,17 +174,17 @@ def test_around_are_windows_that_hold_the_object(plain, guess, views):
 def test_around_leaves_out_cameras_that_look_elsewhere(plain, guess):
     away = view((0.5, 0, 0.4), (1.0, 0, 0.5), 64)
     both = own_views(plain, guess, [CAMERAS[0], away])
-    assert len(around(both, plain, guess, 0).cameras) == 1
+    assert len(crop_to_object(both, plain, guess, 0).cameras) == 1
     nowhere = own_views(plain, guess, [away])
-    own = around(nowhere, plain, guess, 0)
+    own = crop_to_object(nowhere, plain, guess, 0)
     np.testing.assert_array_equal(own.images, nowhere.images)
     assert own.masks is None
-    assert near(nowhere, plain, guess, 0).only is None
+    assert crop_to_silhouette(nowhere, plain, guess, 0).only is None
 
 
 def test_near_is_the_whole_image_inside_and_black_outside(plain, guess, views):
     for number in range(2):
-        own, wide = near(views, plain, guess, number), around(views, plain, guess, number)
+        own, wide = crop_to_silhouette(views, plain, guess, number), crop_to_object(views, plain, guess, number)
         np.testing.assert_array_equal(own.images, wide.images * own.only[..., None])
         batch = SceneBatch.of(guess.state())
         some = plain.together.render(batch, own.cameras, quality=own.quality, only=own.only).rgb[0]
@@ -188,8 +196,8 @@ def test_near_is_the_whole_image_inside_and_black_outside(plain, guess, views):
 
 
 def test_near_is_the_silhouette_and_three_pixels_beside_it(plain, guess, views):
-    own = near(views, plain, guess, 1)
-    batch = guess.moved(np.zeros((1, guess.size)))
+    own = crop_to_silhouette(views, plain, guess, 1)
+    batch = guess.perturbed(np.zeros((1, guess.size)))
     alone = SceneBatch(("ball",), batch.positions[:, [1]], batch.quaternions[:, [1]], batch.lights, None)
     silhouette = plain.alone.render(alone, own.cameras, quality=QUALITY, outputs={"opacity"}).opacity[0, :, 0] > 0
     for only, shown in zip(own.only, silhouette, strict=True):
@@ -202,7 +210,9 @@ def test_near_is_the_silhouette_and_three_pixels_beside_it(plain, guess, views):
 
 def test_the_light_does_not_choose_the_pixels(plain, guess, views):
     lit = replace(guess, light=Light.from_angles(1.0, 0.3).direction)
-    np.testing.assert_array_equal(near(views, plain, guess, 0).only, near(views, plain, lit, 0).only)
+    np.testing.assert_array_equal(
+        crop_to_silhouette(views, plain, guess, 0).only, crop_to_silhouette(views, plain, lit, 0).only
+    )
 
 
 def test_views_are_made_of_what_is_given(views):

@@ -23,7 +23,7 @@ def a_guess(rng, count=3, pusher=None) -> SceneParameters:
 def test_no_change_is_the_identity(seed, count):
     guess = a_guess(np.random.default_rng(seed), count)
     assert guess.size == POSE * count + LIGHT
-    batch = guess.moved(np.zeros((2, guess.size)))
+    batch = guess.perturbed(np.zeros((2, guess.size)))
     assert batch.names == guess.names
     for row in range(2):
         np.testing.assert_array_equal(batch.positions[row], guess.positions)
@@ -36,12 +36,12 @@ def test_whatever_the_change_it_leads_to_a_scene(seed, size):
     """Quaternions stay unit and the light stays over the table: a state refuses anything else."""
     rng = np.random.default_rng(seed)
     guess = a_guess(rng)
-    batch = guess.moved(size * rng.normal(size=(8, guess.size)))
+    batch = guess.perturbed(size * rng.normal(size=(8, guess.size)))
     np.testing.assert_allclose(np.linalg.norm(batch.quaternions, axis=-1), 1, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(batch.lights, axis=-1), 1, atol=1e-12)
     for light in batch.lights:
         Light(light)
-    assert isinstance(guess.changed(size * rng.normal(size=guess.size)).state(), SceneState)
+    assert isinstance(guess.updated(size * rng.normal(size=guess.size)).state(), SceneState)
 
 
 @pytest.mark.parametrize("elevation_deg", [5.0, 5.5, 20.0])
@@ -49,7 +49,7 @@ def test_whatever_the_change_it_leads_to_a_scene(seed, size):
 def test_the_light_is_held_above_the_lowest_elevation(elevation_deg, push):
     light = Light.from_angles(0.4, np.deg2rad(elevation_deg)).direction
     guess = SceneParameters((), np.zeros((0, 3)), np.zeros((0, 4)), light, None)
-    lights = guess.moved(push * np.array([[1.0, 0], [0, 1], [1, 1], [1, -1]])).lights
+    lights = guess.perturbed(push * np.array([[1.0, 0], [0, 1], [1, 1], [1, -1]])).lights
     assert np.rad2deg(np.arcsin(lights[:, 2])).min() >= MIN_LIGHT_ELEVATION_DEG
 
 
@@ -59,7 +59,7 @@ def test_translations_add_and_rotations_are_about_the_worlds_axes(seed):
     guess = a_guess(rng, 2)
     change = np.zeros(guess.size)
     change[POSE : POSE + 3], change[POSE + 3 : 2 * POSE] = shift, turn = 0.1 * rng.normal(size=(2, 3))
-    moved = guess.changed(change)
+    moved = guess.updated(change)
     np.testing.assert_array_equal(moved.positions[0], guess.positions[0])
     np.testing.assert_allclose(moved.positions[1], guess.positions[1] + shift)
     np.testing.assert_allclose(moved.quaternions[0], guess.quaternions[0], atol=1e-15)
@@ -76,7 +76,7 @@ def test_small_changes_of_the_light_are_angles(seed):
     light = Light.random(rng, min_elevation_deg=20).direction
     guess = SceneParameters((), np.zeros((0, 3)), np.zeros((0, 4)), light, None)
     change = 0.02 * rng.normal(size=2)
-    assert angle(guess.changed(change).light, light) == pytest.approx(np.linalg.norm(change), rel=5e-3)
+    assert angle(guess.updated(change).light, light) == pytest.approx(np.linalg.norm(change), rel=5e-3)
 
 
 @given(seed=SEEDS)
@@ -99,5 +99,5 @@ def test_a_guess_is_its_state():
     for name in ("positions", "quaternions", "light", "pusher"):
         np.testing.assert_allclose(getattr(again, name), getattr(guess, name), atol=1e-15)
     assert again.names == guess.names
-    np.testing.assert_array_equal(again.moved(np.zeros((3, again.size))).pusher, np.tile(guess.pusher, (3, 1)))
-    assert a_guess(np.random.default_rng(0)).moved(np.zeros((3, again.size))).pusher is None
+    np.testing.assert_array_equal(again.perturbed(np.zeros((3, again.size))).pusher, np.tile(guess.pusher, (3, 1)))
+    assert a_guess(np.random.default_rng(0)).perturbed(np.zeros((3, again.size))).pusher is None

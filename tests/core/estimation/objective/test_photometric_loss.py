@@ -27,7 +27,7 @@ def test_a_scene_explains_its_own_images_and_no_others(plain):
     views = own_views(plain, guess, [view(), view((0, 0.5, 0.4))])
     changes = np.zeros((3, guess.size))
     changes[1, 0], changes[2, 0] = 0.005, 0.01
-    errors = residuals(plain, views, guess.moved(changes))
+    errors = residuals(plain, views, guess.perturbed(changes))
     assert errors.shape == (3, 2, 32, 32, 3)
     assert errors.dtype == np.float32
     assert not errors[0].any()
@@ -39,14 +39,14 @@ def test_residuals_are_rendered_minus_observed(plain):
     guess = guess_of(state({"ball": (0, 0, 0.05)}))
     views = own_views(plain, guess, [view()])
     darker = ObservedViews(views.cameras, views.images - np.float32(0.25), None, None, views.quality)
-    errors = residuals(plain, darker, guess.moved(np.zeros((1, guess.size))))
+    errors = residuals(plain, darker, guess.perturbed(np.zeros((1, guess.size))))
     np.testing.assert_allclose(errors, 0.25, atol=1e-6)
 
 
 def test_the_loss_of_one_scene_is_that_of_a_batch_of_one(models, truth):
     guess = guess_of(truth)
     seen = own_views(models, guess, default_cameras(32)[:1])
-    moved = guess.changed(np.array([0.01] * 12 + [0.0, 0.0]))
+    moved = guess.updated(np.array([0.01] * 12 + [0.0, 0.0]))
     assert loss_of(models, seen, guess) == 0
-    batch = moved.moved(np.zeros((1, moved.size)))
+    batch = moved.perturbed(np.zeros((1, moved.size)))
     assert loss_of(models, seen, moved) == photometric_loss(residuals(models, seen, batch))[0] > 0

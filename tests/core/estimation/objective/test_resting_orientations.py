@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.resting_orientations import about_z, resting_orientations, sphere
+from osfcore.estimation.objective.resting_orientations import fibonacci_sphere, resting_orientations, yaw_quaternions
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from tests.core.render.scenes import ball, block
 
@@ -83,7 +83,7 @@ def test_real_objects_lie_in_a_few_ways(models):
 
 
 def test_the_sphere_is_even():
-    directions = sphere(500)
+    directions = fibonacci_sphere(500)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
     np.testing.assert_allclose(directions.mean(axis=0), 0, atol=5e-3)
     np.testing.assert_allclose(directions.T @ directions / 500, np.eye(3) / 3, atol=5e-3)
@@ -94,5 +94,5 @@ def test_the_sphere_is_even():
 
 
 def test_turns_about_the_vertical():
-    turned = rotate(about_z(np.array([0, np.pi / 2, np.pi])), np.array([1.0, 0, 2]))
+    turned = rotate(yaw_quaternions(np.array([0, np.pi / 2, np.pi])), np.array([1.0, 0, 2]))
     np.testing.assert_allclose(turned, [[1, 0, 2], [0, 1, 2], [-1, 0, 2]], atol=1e-12)

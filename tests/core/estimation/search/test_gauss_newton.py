@@ -6,7 +6,7 @@ import pytest
 from osfcore.estimation.objective.observed_views import QUALITY
 from osfcore.estimation.objective.parametrization import LIGHT, POSE
 from osfcore.estimation.objective.photometric_loss import photometric_loss, residuals
-from osfcore.estimation.search.gauss_newton import PLANAR_PARAMETERS, GaussNewtonState, gauss_newton, half_widths
+from osfcore.estimation.search.gauss_newton import PLANAR_PARAMETERS, GaussNewtonState, difference_steps, gauss_newton
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import apart, guess_of, own_views
 
@@ -19,11 +19,11 @@ def views(models, truth):
 
 
 def changed(truth, first=(0,) * 6, second=(0,) * 6, light=(0, 0)):
-    return guess_of(truth).changed(np.array([*first, *second, *light], float))
+    return guess_of(truth).updated(np.array([*first, *second, *light], float))
 
 
 def loss(models, views, guess) -> float:
-    return float(photometric_loss(residuals(models, views, guess.moved(np.zeros((1, guess.size)))))[0])
+    return float(photometric_loss(residuals(models, views, guess.perturbed(np.zeros((1, guess.size)))))[0])
 
 
 def ended(models, views, guess, **how) -> GaussNewtonState:
@@ -111,8 +111,8 @@ def test_no_iterations_are_none(models, truth, views):
 
 
 def test_half_widths_are_of_each_number():
-    assert half_widths(0).shape == (LIGHT,)
-    widths = half_widths(2)
+    assert difference_steps(0).shape == (LIGHT,)
+    widths = difference_steps(2)
     assert widths.shape == (2 * POSE + LIGHT,)
     np.testing.assert_array_equal(widths[:POSE], widths[POSE : 2 * POSE])
     assert np.all(widths > 0)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from osfcore.estimation.objective.observed_views import views_of
-from osfcore.estimation.search.light_search import elsewhere, search_light
+from osfcore.estimation.search.light_search import light_loss_ratio, search_light
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from tests.core.estimation.scenes import BOTTLE, BOX, angle, guess_of, lying, observe, scene
@@ -23,13 +23,13 @@ def test_the_light_of_a_scene_is_found(models, azimuth_deg, elevation_deg):
 def test_poses_need_not_be_right_to_the_degree(models, truth):
     guess = guess_of(truth)
     change = np.array([0.008, -0.005, 0.002, 0.05, 0, 0.1, -0.006, 0.007, 0, 0, 0.05, -0.12, 0, 0])
-    wrong = guess.changed(change)
+    wrong = guess.updated(change)
     assert np.rad2deg(angle(found(models, truth, wrong), truth.light.direction)) < 6
 
 
 def test_where_the_guess_has_its_light_plays_no_part(models, truth):
     guess = guess_of(truth)
-    other = guess.changed(np.array([0] * 12 + [0.6, -0.4]))
+    other = guess.updated(np.array([0] * 12 + [0.6, -0.4]))
     a, b = found(models, truth, guess), found(models, truth, other)
     np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(np.linalg.norm(a), 1)
@@ -38,6 +38,6 @@ def test_where_the_guess_has_its_light_plays_no_part(models, truth):
 def test_the_right_light_is_hardly_beaten_and_a_wrong_one_clearly(models, truth):
     seen = observe(models, truth, default_cameras(96)[:2], masks=False)
     guess = guess_of(truth)
-    wrong = guess.changed(np.array([0] * 12 + [0.6, -0.4]))
-    assert elsewhere(models, views_of(seen, 32), guess) > 1
-    assert elsewhere(models, views_of(seen, 32), wrong) < 0.5
+    wrong = guess.updated(np.array([0] * 12 + [0.6, -0.4]))
+    assert light_loss_ratio(models, views_of(seen, 32), guess) > 1
+    assert light_loss_ratio(models, views_of(seen, 32), wrong) < 0.5

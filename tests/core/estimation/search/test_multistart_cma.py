@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from osfcore.estimation.objective.masked_loss import masked_loss, render_poses
-from osfcore.estimation.objective.observed_views import part_of, views_of
+from osfcore.estimation.objective.observed_views import crop_to_masks, views_of
 from osfcore.estimation.search.multistart_cma import MultistartCMA
 from osfcore.estimation.search.pose_initialization import RankedPoses
 from tests.core.estimation.scenes import BOX
@@ -10,7 +10,7 @@ from tests.core.estimation.scenes import BOX
 
 @pytest.fixture(scope="module")
 def part(seen):
-    return part_of(views_of(seen, 48), 0)
+    return crop_to_masks(views_of(seen, 48), 0)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def losses_of(models, part, poses, truth):
 def test_a_search_ends_nearer_than_it_began(models, part, starts, truth):
     swarm = swarm_of(models, part, starts, truth)
     told = [swarm.advance() for _ in range(8)]
-    before, after = losses_of(models, part, swarm.ends(), truth)
+    before, after = losses_of(models, part, swarm.best_poses(), truth)
     assert after < before
     assert min(generation.loss for generation in told) < before
     assert told[0].candidates.position.shape == (10, 3)
@@ -49,7 +49,7 @@ def test_a_search_ends_nearer_than_it_began(models, part, starts, truth):
 
 
 def test_ends_begin_with_the_starts(models, part, starts, truth):
-    ends = swarm_of(models, part, starts, truth).ends()
+    ends = swarm_of(models, part, starts, truth).best_poses()
     np.testing.assert_array_equal(ends.position, np.repeat(starts.positions, 2, axis=0))
     np.testing.assert_allclose(ends.quaternion, np.repeat(starts.quaternions, 2, axis=0), atol=1e-12)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.estimation.objective.masked_loss import render_poses
-from osfcore.estimation.objective.observed_views import part_of, views_of
+from osfcore.estimation.objective.observed_views import crop_to_masks, views_of
 from osfcore.estimation.search.pose_initialization import OVERHEAD, RankedPoses, initial_poses, rank_poses
 from osfcore.geometry.poses import quaternion_exp, rotation_angle
 from tests.core.estimation.scenes import BOTTLE, BOX
@@ -13,7 +13,7 @@ from tests.core.estimation.scenes import BOTTLE, BOX
 @pytest.fixture(scope="module")
 def parts(seen, models):
     views = views_of(seen, 64)
-    return {name: part_of(views, number) for number, name in enumerate(seen.names)}
+    return {name: crop_to_masks(views, number) for number, name in enumerate(seen.names)}
 
 
 @pytest.fixture(scope="module")
