@@ -1,4 +1,8 @@
-"""How sure an estimate is: deviations from the curvature of the loss, doubts from what stays unexplained."""
+"""Uncertainty of an estimate: standard deviations from Gauss-Newton's normal matrices, doubts from residuals.
+
+The covariance of a block is s^2 (J^T W J)^-1 with s^2 the mean squared residual, inflated by factors that were
+calibrated on other scenes, because errors of neighbouring pixels are correlated and fields err as well.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,7 @@ from osfcore.estimation.search.gauss_newton import difference_steps
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.render.types import SceneBatch
 
-# Neighbouring pixels err alike and fields err too, so the textbook's covariance is too small by these factors, found on
-# scenes that no reported figure uses.
+# Calibrated on scenes that no reported figure uses.
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
@@ -30,7 +33,7 @@ _MAX_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths wer
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FitQuality:
-    """How well a guess explains the images.
+    """How well a rendered guess fits the images.
 
     Attributes:
         residuals: root of mean square error over the pixels of each object in each view; 0 where it shows in none.
@@ -66,16 +69,16 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, guess: SceneParamet
     return FitQuality(residuals * (pixels > 0), pixels, overlap, surroundings, float(squares.mean()))
 
 
-def object_residuals(evidence: FitQuality) -> Float[np.ndarray, "N"]:
+def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
     """Root of mean square error of each object over its pixels in all views."""
-    total = np.maximum(evidence.pixels.sum(axis=0), 1e-6)
-    return np.sqrt((evidence.pixels * evidence.residuals**2).sum(axis=0) / total)
+    total = np.maximum(fit.pixels.sum(axis=0), 1e-6)
+    return np.sqrt((fit.pixels * fit.residuals**2).sum(axis=0) / total)
 
 
 def estimate_with_uncertainty(
     guess: SceneParameters,
     normals: Sequence[np.ndarray],
-    evidence: FitQuality,
+    fit: FitQuality,
     rivals: dict[int, float],
     *,
     light_held: bool = False,
@@ -86,20 +89,23 @@ def estimate_with_uncertainty(
     Args:
         guess: what was found.
         normals: Gauss-Newton's matrices there, one for each object and one for the light.
-        evidence: how well it explains the images.
+        fit: of the guess.
         rivals: by object, the best loss of a different orientation over the loss of the one chosen.
         light_held: the light was given, not searched.
         lowest: height of each object's lowest point [m], if objects can only stand on the table.
+
+    Returns:
+        The estimate.
     """
     count = len(guess.names)
-    deviations = _deviations(normals, evidence.spread, count)
+    deviations = _deviations(normals, fit.spread, count)
     poses = deviations[: POSE * count].reshape(count, 2, 3)
     position = _POSITION_FACTOR * np.sqrt((poses[:, 0] ** 2).mean(axis=1))
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
     light = 0.0 if light_held else _LIGHT_FACTOR * float(np.sqrt((deviations[-LIGHT:] ** 2).mean()))
     heights = np.zeros(count) if lowest is None else lowest
     doubts = tuple(
-        _reason_for_doubt(evidence, n, position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
+        _reason_for_doubt(fit, n, position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
         for n in range(count)
     )
     doubtful = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
@@ -107,7 +113,7 @@ def estimate_with_uncertainty(
 
 
 def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.ndarray:
-    """Standard deviations of all numbers; a number that nothing tells about gets a very large one."""
+    """Standard deviations of all parameters; very large where the images do not constrain one."""
     widths, found, start = difference_steps(count), [], 0
     for normal in normals:
         own = widths[start : start + len(normal)]
@@ -118,13 +124,13 @@ def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.
     return np.concatenate(found)
 
 
-def _reason_for_doubt(evidence: FitQuality, n: int, position_std: float, rotation_std: float, rival: float) -> str:
-    pixels = evidence.pixels[:, n]
+def _reason_for_doubt(fit: FitQuality, n: int, position_std: float, rotation_std: float, rival: float) -> str:
+    pixels = fit.pixels[:, n]
     if pixels.sum() < _MIN_PIXELS:
         return "it is hardly visible"
-    residual = object_residuals(evidence)[n]
-    if evidence.overlap[n] < _MIN_OVERLAP:
-        return f"its silhouette covers its masks by {evidence.overlap[n]:.0%} only"
+    residual = object_residuals(fit)[n]
+    if fit.overlap[n] < _MIN_OVERLAP:
+        return f"its silhouette covers its masks by {fit.overlap[n]:.0%} only"
     if residual > _MAX_RESIDUAL:
         return f"its images differ from what was rendered by {residual:.2f}"
     if rival < _MIN_RIVAL_RATIO:

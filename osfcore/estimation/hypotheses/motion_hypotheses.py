@@ -1,7 +1,7 @@
-"""Where objects may be that do not stand where they were expected: how a pusher may have moved them.
+"""Motion hypotheses: poses that an object may have after a push, as starts of a search; their photometric loss decides.
 
-An object in the pusher's way was shoved along for part of the way. It kept its orientation, turned about the vertical,
-or rolled, as cans do; several in a row moved together. These are starts for a search, no prediction: images decide.
+An object moves by a share of the pusher's motion, alone or with others, and keeps its orientation, turns about the
+vertical, or rolls without slipping. Fast and deliberately coarse: not a dynamics model.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, q
 
 _SHARES = (0.0, 0.5, 1.0)  # of the push, by which each of several objects may have moved
 _MAX_COMBINED = 4  # objects whose shares are combined in all ways; of more, all have the same
-_NEAR_M = 0.02  # objects that no push explains are looked for this far around
+_NEAR_M = 0.02  # search radius where there was no push
 _ALONG = np.array([-0.3, 0.0, 0.3])  # shares of the push, around where an object is guessed
 _ACROSS = np.array([-0.25, 0.0, 0.25])
 _TURNS_RAD = np.array([-0.5, 0.0, 0.5])
 _MIN_PUSH_M = 0.005
 _DOWN = np.array([0.0, 0.0, -1.0])
-_ROLLED_RAD = np.deg2rad([20.0, 40.0, 60.0, 80.0])  # along which a body that rolls is looked at
+_ROLLED_RAD = np.deg2rad([20.0, 40.0, 60.0, 80.0])  # at which it is checked that a body can roll
 _OBLIQUE_RAD = np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0])  # of an axis to the one square to a push
 _ROLLS = 18  # equal steps of a whole roll
 _ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
@@ -34,7 +34,7 @@ _ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
 def joint_push_hypotheses(
     guess: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "K N 3"]:
-    """Positions of all objects if some were shoved along by shares of a push, in K ways; the first is the guess's."""
+    """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's."""
     if len(numbers) <= _MAX_COMBINED:
         shares = np.array(list(product(_SHARES, repeat=len(numbers))))
     else:
@@ -45,7 +45,7 @@ def joint_push_hypotheses(
 
 
 def push_hypotheses(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
-    """Poses of one object, somewhat farther or less far along a push, beside it, turned, and rolled; a batch."""
+    """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch."""
     length = float(np.linalg.norm(push))
     step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
     beside = np.array([-step[1], step[0], 0.0])
@@ -70,7 +70,7 @@ def rolling_hypotheses(models: ObjectModels, guess: SceneParameters, number: int
 
 
 def resting_hypotheses(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
-    """Every way in which an object can lie where it is guessed to be; a batch."""
+    """All resting orientations of an object at its guessed position; a batch."""
     resting = models.resting(guess.names[number])
     centre = guess.positions[number] + rotate(guess.quaternions[number], resting.centre)
     centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])
@@ -82,7 +82,7 @@ def _rolling_axis(
 ) -> Float[np.ndarray, "3"]:
     """Unit vector about which a push rolls a body forward, the one nearest to square to the push; zero if none.
 
-    A body rolls about an axis if it can lie in every orientation on the way.
+    A body can roll about an axis if it can rest in every orientation on the way.
     """
     length = float(np.linalg.norm(push))
     if length < _MIN_PUSH_M:
@@ -110,7 +110,7 @@ def _roll_along(
 def _combine_shifts_and_turns(
     models: ObjectModels, guess: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray
 ) -> Pose:
-    """An object shifted, and turned about its centre of mass."""
+    """One object shifted, and turned about its centre of mass."""
     centre, now = models.resting(guess.names[number]).centre, guess.quaternions[number]
     quaternions = quaternion_multiply(turns, now[None])
     middle = guess.positions[number] + rotate(now, centre) + shifts

@@ -1,4 +1,4 @@
-"""Whether an object might as well lie another way round: other orientations refined, and compared in its windows."""
+"""Orientation hypotheses of one object, refined by Gauss-Newton and compared by the photometric loss around it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newto
 from osfcore.geometry.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
-_RANKED_COARSE = 64  # rivals that are ranked again in coarse images
+_RANKED_COARSE = 64  # hypotheses that are ranked again in coarse images
 _REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
 _REFINED_COARSE = 3  # of these, so many are refined in coarse ones
 _ITERATIONS, _FINE_ITERATIONS = 2, 3
-_CLOSE = 1.5  # a rival's loss, over that of the pose, up to which it is refined on fine images
+_CLOSE = 1.5  # ratio to the present loss up to which a hypothesis is refined on fine images
 _SAME_RAD = np.deg2rad(12.0)
 
 
@@ -42,16 +42,19 @@ def compare_orientations(
     number: int,
     others: Pose,
 ) -> tuple[GaussNewtonState, float]:
-    """The better of a descent's pose of one object and its best rival, and by which factor the loser's loss is larger.
+    """Compare an object's orientation with the best of other hypotheses.
 
     Args:
         models: fields.
-        rough: images in which rivals are ranked, and refined at first, since they lead there from afar.
+        rough: images in which hypotheses are ranked and first refined: they have the widest basins of attraction.
         coarse: images in which the first of them are ranked again, and the best refined further.
         fine: images in which the best of them is compared.
         at: the scene so far.
         number: of the object.
         others: poses that it might have instead, a batch.
+
+    Returns:
+        The better scene, and the ratio of the worse loss to the better one; infinite without a distinct hypothesis.
     """
     same = rotation_angle(others.quaternion, at.guess.quaternions[number]) <= _SAME_RAD
     far = others[~same]
@@ -64,7 +67,7 @@ def compare_orientations(
     tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct_orientations(far)]
     tried = sorted(tried, key=lambda one: loss_of(models, own, one.guess))[:_REFINED_COARSE]
     tried = [_refine(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in tried]
-    ends = [loss_of(models, own, descent.guess) for descent in tried]
+    ends = [loss_of(models, own, refined.guess) for refined in tried]
     rival = tried[int(np.argmin(ends))]
     if min(ends) < _CLOSE * loss_of(models, own, at.guess):
         rival = _refine(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
@@ -78,13 +81,13 @@ def compare_orientations(
 def _refine(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, number: int, pose: Pose, iterations: int
 ) -> GaussNewtonState:
-    """A descent of one object, begun in a pose; curvatures stay those of before until it moves."""
+    """Gauss-Newton of one object from a pose; its normal matrix stays that of before until it moves."""
     rival = replace(at, guess=with_pose(at.guess, number, pose), dampings=GaussNewtonState.at(at.guess).dampings)
     return list(gauss_newton(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
 def _distinct_orientations(poses: Pose) -> list[int]:
-    """Numbers of the first few poses that differ from each other."""
+    """Indices of the first few poses that differ from each other."""
     kept: list[int] = []
     for k in range(len(poses.position)):
         if all(rotation_angle(poses.quaternion[k], poses.quaternion[o]) > _SAME_RAD * 1.5 for o in kept):

@@ -1,4 +1,4 @@
-"""The first frame's loss: one object alone, compared inside its masks (paper eq. 5), for many poses at once."""
+"""The masked loss: one object rendered alone against the images inside its masks (paper eq. 5), many poses at once."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import ObjectView
 from osfcore.render.types import SceneBatch
 
-COLOUR_WEIGHT = 6.0  # of the colours' part against that of the silhouette
-_MAX_ERROR = 0.3  # of radiance that counts: shadows of other objects are not rendered here
+COLOUR_WEIGHT = 6.0  # w: of the colour term against the silhouette term
+_MAX_ERROR = 0.3  # e_max [radiance]
 _LEAST_GAIN, _MOST_GAIN = 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RenderedObject:
-    """An object in B poses, as each view of its part would show it.
+    """Renderings of one object in B poses, cropped as its `ObjectView`.
 
     Attributes:
         rgb: over black.
@@ -46,15 +46,23 @@ def render_poses(
 
 
 def masked_loss(look: RenderedObject, part: ObjectView, *, any_brightness: bool = False) -> Float[np.ndarray, "B"]:
-    """How badly each pose explains the masks and the colours in them; 0 is perfect.
+    """Silhouette and colour error of each pose; 0 is perfect.
 
-    Deviations from paper eq. 5: absolute differences instead of squares, cut off, so that shadows cannot decide; the
-    silhouettes count on their own; pixels that other objects cover tell nothing.
+    With rendered opacity o, mask m, validity v, the mask's area A in each view, and P the pixels of both silhouettes:
+
+        L = sum_views A / sum(A) * [ sum |o - m| v / A  +  w * sum_P min(|c_rendered - c_observed|, e_max) / A ]
+
+    Deviations from paper eq. 5, the mean squared error inside the masks: absolute errors, truncated at e_max, so that
+    shadows of other objects, which are not rendered here, do not decide; the silhouette is a term of its own; pixels
+    that other objects may cover are left out.
 
     Args:
-        look: what was rendered.
-        part: what was observed.
-        any_brightness: compare up to one factor per pose and view: the light is not known yet.
+        look: rendered images of B poses.
+        part: the observed crop of each view.
+        any_brightness: scale colours by the least-squares factor of each pose and view: the light is not known yet.
+
+    Returns:
+        The loss of each pose.
     """
     silhouette = (np.abs(look.opacity - part.mask) * part.valid).sum(axis=(2, 3)) / part.area
     both = ((look.opacity > 0.5) & (part.mask > 0.5) & part.valid)[..., None]
@@ -65,5 +73,5 @@ def masked_loss(look: RenderedObject, part: ObjectView, *, any_brightness: bool 
         rgb = rgb * np.clip(gain, _LEAST_GAIN, _MOST_GAIN)[..., None, None, None]
     errors = np.minimum(np.abs(rgb - part.rgb), _MAX_ERROR) * both
     colour = errors.mean(axis=-1).sum(axis=(2, 3)) / part.area
-    share = part.area / part.area.sum()
-    return ((silhouette + COLOUR_WEIGHT * colour) * share).sum(axis=1).astype(float)
+    weights = part.area / part.area.sum()
+    return ((silhouette + COLOUR_WEIGHT * colour) * weights).sum(axis=1).astype(float)

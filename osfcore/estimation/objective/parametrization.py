@@ -1,8 +1,8 @@
-"""Scenes near a scene: poses and light as one vector of small changes.
+"""The parameter vector of a scene: changes of poses and light in the tangent space of a current scene.
 
-The vector holds, for each of N objects, a translation [m] and a rotation vector [rad], both along the world's axes, and
-then two angles of the light [rad] along two directions across it. Rotations are applied by the exponential map, so
-quaternions stay unit and nothing is singular.
+delta = (t_1, w_1, ..., t_N, w_N, a, b): for each of N objects a translation t [m] and a rotation vector w [rad] along
+the world's axes, p <- p + t, q <- exp(w) q; then two components of the light, l <- normalize(l + a e_1 + b e_2) with
+e_1, e_2 orthogonal to l. The exponential map has no singularities and keeps quaternions unit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LOWEST_SLOPE = np.tan(np.deg2rad(MIN_LIGHT_ELEVATION_DEG + 1e-3))
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneParameters:
-    """A scene as the search has it.
+    """The scene at which the parameter vector is zero.
 
     Attributes:
         names: of the N objects.
@@ -47,15 +47,15 @@ class SceneParameters:
 
     @property
     def size(self) -> int:
-        """Length of the vector of changes."""
+        """Length of the parameter vector."""
         return POSE * len(self.names) + LIGHT
 
     def state(self) -> SceneState:
-        """The guess as a state."""
+        """The scene as a state."""
         return SceneState(self.names, Pose(self.positions, self.quaternions), Light(self.light), self.pusher)
 
     def perturbed(self, changes: Float[np.ndarray, "B P"]) -> SceneBatch:
-        """B scenes, each changed by one row."""
+        """The B scenes that the rows of a batch of parameter vectors stand for."""
         count = len(self.names)
         poses = changes[:, : POSE * count].reshape(len(changes), count, POSE)
         positions = self.positions + poses[..., :3]
@@ -69,6 +69,6 @@ class SceneParameters:
         return SceneBatch(self.names, positions, quaternions, lights, pusher)
 
     def updated(self, change: Float[np.ndarray, "P"]) -> SceneParameters:
-        """The guess changed by a vector."""
+        """The scene that one parameter vector stands for."""
         batch = self.perturbed(change[None])
         return replace(self, positions=batch.positions[0], quaternions=batch.quaternions[0], light=batch.lights[0])

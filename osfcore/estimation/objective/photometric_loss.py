@@ -1,4 +1,4 @@
-"""The loss of whole scenes: objects, pusher, table and shadows against the images (paper eq. 6)."""
+"""The photometric loss of whole scenes: objects, pusher, table and shadows against the images (paper eq. 6)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.render.types import SceneBatch
 
-HUBER = 0.1  # radiance from which errors count linearly instead of squared
+HUBER = 0.1  # h [radiance]
 
 
 def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> Float32[np.ndarray, "B V h w 3"]:
@@ -20,11 +20,16 @@ def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> 
 
 
 def photometric_loss(errors: Float32[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B"]:
-    """Mean over all numbers of Huber's loss. Deviation from paper eq. 6: it is the square for small errors only."""
+    """Mean Huber loss over all pixels and colours of each scene.
+
+    rho(r) = r^2 / 2 for |r| < h, h (|r| - h / 2) otherwise, with h = HUBER.
+
+    Deviation from paper eq. 6, the mean square: outliers such as specular highlights count linearly.
+    """
     size = np.abs(errors.reshape(len(errors), -1))
     return np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER)).mean(axis=1, dtype=float)
 
 
 def loss_of(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
-    """Loss of one scene."""
+    """Photometric loss of one scene."""
     return float(photometric_loss(residuals(models, views, guess.perturbed(np.zeros((1, guess.size)))))[0])

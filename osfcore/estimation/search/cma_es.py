@@ -1,4 +1,8 @@
-"""Covariance matrix adaptation (CMA-ES), by the `cma` library: ask for candidates, tell their losses."""
+"""CMA-ES (Hansen, 2016, arXiv 1604.00772) by the `cma` library, in its ask-and-tell form.
+
+Candidates x_k ~ m + sigma N(0, C); the mean m moves to the weighted mean of the better half, and C and sigma adapt to
+the steps that succeeded.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from jaxtyping import Float
 
 
 class CMAES:
-    """One search around zero.
+    """One search that starts at zero.
 
     Args:
         scales: what one standard deviation is in each number of the vector; 0 holds a number still.

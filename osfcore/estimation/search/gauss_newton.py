@@ -1,11 +1,17 @@
-"""The last millimetres: damped Gauss-Newton on the loss of whole scenes, object by object, then the light.
+"""Damped Gauss-Newton (Levenberg-Marquardt) on the photometric loss: block coordinate descent over objects and light.
 
-All derivatives of a block come from one batch of images, of the windows around the object alone; what objects share,
-their shadows on each other, is small, and sweeping over them again takes care of it.
+For the parameters delta of one block, with residuals r, their Jacobian J by central differences, Huber weights
+w = min(1, h / |r|) (iteratively reweighted least squares) and D = diag(J^T W J), each iteration solves
 
-Deviation from the paper, which uses CMA throughout: near the solution the loss is smooth, and its slopes, taken over
-steps wide enough to bridge pixels, find the minimum in a few iterations. They also tell how sharp it is, which CMA's
-final spread does not.
+    (J^T W J + lambda D) delta = -J^T W r
+
+for several lambda at once, clips delta to a trust region, renders all candidates as one batch and keeps the best if it
+lowers the loss. Deviation from the textbook: the least damped steps are also tried scaled by 4 and 2, because texture
+makes Gauss-Newton underestimate the step far from the minimum. A block's images are cropped to the object; what blocks
+share, shadows on each other, is small, and further sweeps take care of it.
+
+Deviation from the paper, which uses CMA-ES throughout: near the solution the loss is smooth over differences wider than
+a pixel, so a few iterations suffice, and J^T W J gives the uncertainty, which CMA-ES's final spread does not.
 """
 
 from __future__ import annotations
@@ -23,18 +29,20 @@ from osfcore.estimation.objective.photometric_loss import HUBER, photometric_los
 
 PLANAR_PARAMETERS = (0, 1, 5)  # among an object's numbers: x, y and the turn about the vertical
 POSE_PARAMETERS = tuple(range(POSE))
-_SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of the differences
+_SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of central differences
 _MOST_SHIFT_M, _MOST_TURN_RAD, _MOST_LIGHT_RAD = 0.03, 0.4, 0.3
-_DAMPINGS = np.array([0.1, 0.1, 0.1, 1.0, 10.0, 100.0])  # tried at once, times the last good one
-_STEP_SCALES = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)  # far from the solution, texture makes Gauss-Newton's steps too short
+_DAMPINGS = np.array(
+    [0.1, 0.1, 0.1, 1.0, 10.0, 100.0]
+)  # lambda: these multiples of the last good one are tried at once
+_STEP_SCALES = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)  # of delta, for each of these lambdas
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e6
-_CONVERGED_RATIO = 0.97  # share of its loss before a sweep from which more sweeps promise little
+_CONVERGED_RATIO = 0.97  # of the losses after and before a sweep, from which on it counts as converged
 _TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GaussNewtonState:
-    """Where a descent is.
+    """The current iterate.
 
     Attributes:
         guess: the best scene so far.
@@ -68,7 +76,7 @@ def gauss_newton(
     numbers: Sequence[int] = POSE_PARAMETERS,
     until_settled: bool = False,
 ) -> Iterator[GaussNewtonState]:
-    """Descend; yields after each sweep over the objects and the light.
+    """Minimise the photometric loss; yields after each sweep over the objects and the light.
 
     Args:
         models: fields.
@@ -78,7 +86,10 @@ def gauss_newton(
         objects: which objects may move; all by default.
         light: images in which to search the light, coarse ones will do; None holds it.
         numbers: which of an object's six numbers may change, `POSE_PARAMETERS` or `PLANAR_PARAMETERS`.
-        until_settled: stop before if a sweep hardly lowers the objects' losses.
+        until_settled: stop when a sweep hardly lowers the objects' losses.
+
+    Yields:
+        The iterate after each sweep.
     """
     at = start
     moving = list(range(len(at.guess.names)) if objects is None else objects)
@@ -86,10 +97,10 @@ def gauss_newton(
     for _ in range(iterations):
         for n in moving:
             own = crop_to_silhouette(views, models, at.guess, n)
-            at = _normal_equations(models, own, at, n, np.array([POSE * n + k for k in numbers]))
+            at = _damped_step(models, own, at, n, np.array([POSE * n + k for k in numbers]))
         if light is not None:
             first = POSE * len(at.guess.names)
-            at = _normal_equations(models, light, at, len(at.guess.names), np.arange(first, first + LIGHT))
+            at = _damped_step(models, light, at, len(at.guess.names), np.arange(first, first + LIGHT))
         yield at
         loss = float(at.losses[moving].sum())
         if until_settled and loss > _CONVERGED_RATIO * before:
@@ -97,24 +108,24 @@ def gauss_newton(
         before = loss
 
 
-def _normal_equations(
+def _damped_step(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, block: int, numbers: Int[np.ndarray, "n"]
 ) -> GaussNewtonState:
-    """One iteration on some numbers of the vector of changes."""
+    """One damped step on some entries of the parameter vector (equation in the module's docstring)."""
     guess, half = at.guess, difference_steps(len(at.guess.names))
     probes = np.zeros((1 + 2 * len(numbers), guess.size))
     for row, number in enumerate(numbers):
         probes[1 + 2 * row, number], probes[2 + 2 * row, number] = half[number], -half[number]
     errors = residuals(models, views, guess.perturbed(probes)).reshape(len(probes), -1)
-    slopes = (errors[1::2] - errors[2::2]) / (2 * half[numbers, None].astype(np.float32))
+    jacobian = (errors[1::2] - errors[2::2]) / (2 * half[numbers, None].astype(np.float32))
     weights = np.minimum(1, HUBER / np.maximum(np.abs(errors[0]), _TINY))
-    normal = ((slopes * weights) @ slopes.T).astype(float)
-    gradient = slopes @ (weights * errors[0])
+    normal = ((jacobian * weights) @ jacobian.T).astype(float)
+    gradient = jacobian @ (weights * errors[0])
     dampings = at.dampings[block] * _DAMPINGS
     steps = np.zeros((len(dampings), guess.size))
-    for row, (damping, stretch) in enumerate(zip(dampings, _STEP_SCALES, strict=True)):
+    for row, (damping, scale) in enumerate(zip(dampings, _STEP_SCALES, strict=True)):
         damped = normal + np.diag(damping * np.diag(normal) + _TINY)
-        steps[row, numbers] = -stretch * np.linalg.solve(damped, gradient)
+        steps[row, numbers] = -scale * np.linalg.solve(damped, gradient)
     steps /= np.maximum(1, (np.abs(steps) / _max_step(len(guess.names))).max(axis=1, keepdims=True))
     here = float(photometric_loss(errors[:1])[0])
     losses = photometric_loss(residuals(models, views, guess.perturbed(steps)))
@@ -141,7 +152,7 @@ def _accept_step(
 
 
 def difference_steps(count: int) -> Float[np.ndarray, "P"]:
-    """Half the width of the differences that make slopes, for a scene of `count` objects."""
+    """Half the width of the central differences of each parameter, for a scene of `count` objects."""
     return np.array([*([_SHIFT_M] * 3 + [_TURN_RAD] * (POSE - 3)) * count, *[_LIGHT_RAD] * LIGHT])
 
 

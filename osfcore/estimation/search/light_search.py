@@ -1,7 +1,8 @@
-"""Where the light is, for objects whose poses are roughly known: shading of the table and cast shadows tell.
+"""Light search: the direction toward the light by coarse-to-fine grid search, given roughly known poses.
 
-A coarse grid over the hemisphere, then finer ones around the best directions. The table alone tells how high the light
-stands, shadows tell its side; neither needs poses that are right to the degree.
+A grid over the hemisphere, then shrinking 3 x 3 grids around the best directions, ranked by the truncated absolute
+error mean(min(|r|, e_max)) of renderings with shadows. The table's shading determines the light's elevation, cast shadows its
+azimuth; neither needs accurate poses.
 """
 
 from __future__ import annotations
@@ -20,21 +21,24 @@ from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 _DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
 _FIRST_STEP_RAD = np.deg2rad(8.0)
 _ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
-_MAX_ERROR = 0.25  # of radiance that counts: objects may still be turned the wrong way
-_FIRST_SURVIVORS, _SURVIVORS = 6, 3  # a shadow that leaves one object and meets another makes a minimum of its own
+_MAX_ERROR = 0.25  # e_max [radiance]: orientations may still be wrong
+_FIRST_SURVIVORS, _SURVIVORS = 6, 3  # local minima arise where shadows fall on other objects
 _NEIGHBOUR_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
 
 
 def search_light(
     models: ObjectModels, coarse: ObservedViews, fine: ObservedViews, guess: SceneParameters
 ) -> Float[np.ndarray, "3"]:
-    """Unit vector toward the light that explains the images best, the objects being where they are guessed.
+    """Unit vector toward the light under which a rendering of the guessed poses fits the images best.
 
     Args:
         models: fields.
         coarse: images to try the whole hemisphere on.
         fine: images to refine on.
         guess: objects and pusher; its light plays no part.
+
+    Returns:
+        The direction.
     """
     directions = hemisphere()
     best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_FIRST_SURVIVORS]]
@@ -47,7 +51,7 @@ def search_light(
 
 
 def light_loss_ratio(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
-    """Loss under the best of directions all over the hemisphere, over that under the light of a guess."""
+    """Least loss on the grid over the hemisphere, divided by the loss under the guess's own light."""
     directions = np.concatenate([guess.light[None], hemisphere()])
     losses = _losses(models, views, guess, directions)
     return float(losses[1:].min() / max(losses[0], 1e-12))

@@ -1,4 +1,4 @@
-"""One object, searched by CMA from several starts at once inside its masks (paper eq. 5)."""
+"""CMA-ES over one object's pose from several starts at once, by the masked loss (paper eq. 5)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHIFT_M, TURN_RAD = 4e-3, 0.12  # the first spread
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CMAGeneration:
-    """What was tried.
+    """One generation of all searches.
 
     Attributes:
         candidates: poses, of all starts together.
@@ -34,7 +34,7 @@ class CMAGeneration:
 
 
 class MultistartCMA:
-    """Searches around each of an object's starts.
+    """One CMA-ES for each start of an object; a generation of all is rendered as one batch.
 
     Args:
         models: fields.
@@ -67,7 +67,7 @@ class MultistartCMA:
         self._searches = [CMAES(scales, population, rng) for _ in self._guesses]
 
     def advance(self) -> CMAGeneration:
-        """Try one more generation of every search."""
+        """One more generation of every search."""
         batches = [g.perturbed(s.ask()) for g, s in zip(self._guesses, self._searches, strict=True)]
         positions = np.concatenate([b.positions[:, 0] for b in batches])
         quaternions = np.concatenate([b.quaternions[:, 0] for b in batches])
@@ -78,7 +78,7 @@ class MultistartCMA:
         return CMAGeneration(Pose(positions, quaternions), float(losses.min()), self._searches[0].sigma)
 
     def best_poses(self) -> Pose:
-        """The starts, and where each search is now."""
+        """The starts, and the mean of each search."""
         now = [g.updated(s.mean) for g, s in zip(self._guesses, self._searches, strict=True)]
         return Pose(
             np.concatenate([self._starts.positions, *(g.positions for g in now)]),

@@ -24,7 +24,7 @@ def end(models, truth, views):
     return list(gauss_newton(models, views, GaussNewtonState.at(guess_of(truth)), iterations=1, light=views))[-1]
 
 
-def evidence_of(count=1, **change) -> FitQuality:
+def fit_of(count=1, **change) -> FitQuality:
     plain = FitQuality(np.full((2, count), 0.01), np.full((2, count), 50.0), np.ones(count), 0.01, 1e-4)
     return replace(plain, **change)
 
@@ -74,13 +74,13 @@ def test_a_wrong_light_is_doubted(models, truth, views, end):
     assert not estimate_with_uncertainty(wrong, end.normals, evaluate_fit(models, views, wrong), {}).trusted
 
 
-def test_evidence_of_the_truth_is_perfect(models, truth):
+def test_fit_of_the_truth_is_perfect(models, truth):
     own = own_views(models, guess_of(truth), default_cameras(48)[:2], FINE)
-    evidence = evaluate_fit(models, own, guess_of(truth))
-    np.testing.assert_array_equal(evidence.residuals, 0)
-    np.testing.assert_allclose(evidence.overlap, 1)
-    np.testing.assert_allclose(evidence.pixels, own.masks.sum(axis=(2, 3)), rtol=1e-5)
-    assert evidence.surroundings == evidence.spread == 0
+    fit = evaluate_fit(models, own, guess_of(truth))
+    np.testing.assert_array_equal(fit.residuals, 0)
+    np.testing.assert_allclose(fit.overlap, 1)
+    np.testing.assert_allclose(fit.pixels, own.masks.sum(axis=(2, 3)), rtol=1e-5)
+    assert fit.surroundings == fit.spread == 0
     assert evaluate_fit(models, replace(own, masks=None), guess_of(truth)).overlap.tolist() == [1, 1]
 
 
@@ -88,21 +88,21 @@ def test_evidence_is_of_each_objects_pixels(models, truth):
     own = own_views(models, guess_of(truth), default_cameras(48)[:2], FINE)
     darker = own.images.copy()
     darker[1][own.masks[1, 0] > 0] -= np.float32(0.2)  # the box, in one view
-    evidence = evaluate_fit(models, replace(own, images=darker), guess_of(truth))
-    assert evidence.residuals[1, 0] == pytest.approx(0.2, rel=1e-3)
-    np.testing.assert_allclose(evidence.residuals[0], 0, atol=1e-6)
-    assert evidence.residuals[1, 1] < 0.03  # which it touches in the image at most
-    share = evidence.pixels[1, 0] / evidence.pixels[:, 0].sum()
-    assert object_residuals(evidence)[0] == pytest.approx(0.2 * np.sqrt(share), rel=1e-3)
-    assert evidence.surroundings < 0.05
+    fit = evaluate_fit(models, replace(own, images=darker), guess_of(truth))
+    assert fit.residuals[1, 0] == pytest.approx(0.2, rel=1e-3)
+    np.testing.assert_allclose(fit.residuals[0], 0, atol=1e-6)
+    assert fit.residuals[1, 1] < 0.03  # which it touches in the image at most
+    share = fit.pixels[1, 0] / fit.pixels[:, 0].sum()
+    assert object_residuals(fit)[0] == pytest.approx(0.2 * np.sqrt(share), rel=1e-3)
+    assert fit.surroundings < 0.05
 
 
-def test_an_empty_scene_has_evidence_of_the_table_alone(models):
+def test_an_empty_scene_has_fit_of_the_table_alone(models):
     nothing = guess(0)
     own = own_views(models, nothing, default_cameras(48)[:1])
-    evidence = evaluate_fit(models, replace(own, images=own.images + np.float32(0.1)), nothing)
-    assert evidence.surroundings == pytest.approx(0.1, rel=1e-4)
-    estimate = estimate_with_uncertainty(nothing, normals(0), evidence, {})
+    fit = evaluate_fit(models, replace(own, images=own.images + np.float32(0.1)), nothing)
+    assert fit.surroundings == pytest.approx(0.1, rel=1e-4)
+    estimate = estimate_with_uncertainty(nothing, normals(0), fit, {})
     assert estimate.trusted
     assert estimate.position_std.shape == (0,)
 
@@ -118,7 +118,7 @@ def test_each_doubt_is_told():
         "its pose is known to 150 mm and 6 deg only": ({}, {}, 1.0),
     }
     for words, (change, rivals, scale) in cases.items():
-        estimate = estimate_with_uncertainty(guess(), normals(1, scale), evidence_of(**change), rivals)
+        estimate = estimate_with_uncertainty(guess(), normals(1, scale), fit_of(**change), rivals)
         assert estimate.doubts == (words,)
         assert estimate.reason == (f"object0: {words}" if words else "")
 
@@ -126,25 +126,21 @@ def test_each_doubt_is_told():
 def test_what_cannot_stand_there_is_doubted_where_that_matters():
     words = {0.001: "", 0.02: "it would float above the table by 20 mm", -0.01: "it would sink into the table by 10 mm"}
     for height, doubt in words.items():
-        assert estimate_with_uncertainty(guess(), normals(), evidence_of(), {}, lowest=np.array([height])).doubts == (
-            doubt,
-        )
-    assert estimate_with_uncertainty(guess(), normals(), evidence_of(), {}).trusted
+        assert estimate_with_uncertainty(guess(), normals(), fit_of(), {}, lowest=np.array([height])).doubts == (doubt,)
+    assert estimate_with_uncertainty(guess(), normals(), fit_of(), {}).trusted
 
 
 def test_all_doubts_make_the_reason():
-    estimate = estimate_with_uncertainty(
-        guess(3), normals(3), evidence_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0}
-    )
+    estimate = estimate_with_uncertainty(guess(3), normals(3), fit_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0})
     assert estimate.doubts[1] == ""
     assert estimate.reason == f"object0: {estimate.doubts[0]}; object2: {estimate.doubts[2]}"
 
 
 def test_deviations_are_those_of_least_squares():
     """They grow with the error of a pixel, and shrink with the root of the curvature."""
-    first = estimate_with_uncertainty(guess(), normals(), evidence_of(), {})
-    noisier = estimate_with_uncertainty(guess(), normals(), evidence_of(spread=4e-4), {})
-    sharper = estimate_with_uncertainty(guess(), normals(1, 1e8), evidence_of(), {})
+    first = estimate_with_uncertainty(guess(), normals(), fit_of(), {})
+    noisier = estimate_with_uncertainty(guess(), normals(), fit_of(spread=4e-4), {})
+    sharper = estimate_with_uncertainty(guess(), normals(1, 1e8), fit_of(), {})
     for name in ("position_std", "rotation_std", "light_std"):
         here = getattr(first, name)
         np.testing.assert_allclose(getattr(noisier, name), 2 * here, rtol=1e-3)
@@ -154,12 +150,12 @@ def test_deviations_are_those_of_least_squares():
 
 def test_what_nothing_tells_about_is_not_known():
     nothing = [np.zeros((POSE, POSE)), np.zeros((LIGHT, LIGHT))]
-    estimate = estimate_with_uncertainty(guess(), nothing, evidence_of(), {})
+    estimate = estimate_with_uncertainty(guess(), nothing, fit_of(), {})
     assert estimate.position_std[0] > 0.1
     assert "its pose is known to" in estimate.doubts[0]
     assert estimate.light_std > 0.1
-    assert estimate_with_uncertainty(guess(), nothing, evidence_of(), {}, light_held=True).light_std == 0
+    assert estimate_with_uncertainty(guess(), nothing, fit_of(), {}, light_held=True).light_std == 0
     flat = np.diag([1e6, 1e6, 0, 0, 0, 1e6])  # an object that was slid over the table only
-    partly = estimate_with_uncertainty(guess(), [flat, nothing[1]], evidence_of(), {})
+    partly = estimate_with_uncertainty(guess(), [flat, nothing[1]], fit_of(), {})
     assert np.isfinite(partly.position_std[0])
-    assert partly.position_std[0] > estimate_with_uncertainty(guess(), normals(), evidence_of(), {}).position_std[0]
+    assert partly.position_std[0] > estimate_with_uncertainty(guess(), normals(), fit_of(), {}).position_std[0]
