@@ -1,8 +1,13 @@
-"""The plain renderer: every ray, every sample, in PyTorch, in any dtype, on any device.
+"""The reference renderer: compositional volume rendering of OSFs in PyTorch, every ray and every sample.
 
-It says what the fast path must compute, and it is what a GPU runs. Along a ray, the samples of all objects are sorted
-by distance and composited (paper eq. 3, each radiance weighted by density); the light that reaches a point is what the
-other objects let through (transmittance along the way to the light), as a shadow map of unlimited resolution would say.
+It defines what the fast path must compute, and it is what a GPU runs. For each ray, each object's field is sampled in
+its own frame (paper eq. 1); a sample's radiance is rho L_light with one distant light (eq. 2); the samples of all
+objects are sorted by distance and composited by `volume_rendering` (eq. 3).
+
+Deviations from eq. 3: the radiance of a point is the mean of the objects' radiances weighted by their densities (as in
+compositional NeRFs), not their sum, so that overlapping objects do not shine twice as bright; and the light that
+reaches a point is the transmittance of all other objects along the ray toward the light, the limit of a shadow map of
+unlimited resolution.
 """
 
 from __future__ import annotations
@@ -23,13 +28,14 @@ from osfcore.geometry.poses import quaternion_to_matrix
 from osfcore.geometry.states import SceneState
 from osfcore.render.solids import pusher_field
 from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
+from osfcore.render.volume_rendering import accumulate_along_rays, final_transmittance, render_weights
 
 _RAYS_AT_ONCE = 4096
 _FAR = 1e9
 
 
 class _Placed(NamedTuple):
-    """An object where it stands."""
+    """An object in its pose."""
 
     query: KiloQuery
     extent: Float[Tensor, "2 3"]  # of what is occupied, in its own frame [m]
@@ -38,10 +44,10 @@ class _Placed(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """Samples of one object along R rays; unused slots have no depth."""
+    """Samples of one object along R rays; unused slots have no optical thickness."""
 
-    distance: Float[Tensor, "R S"]
-    depth: Float[Tensor, "R S"]
+    t_mids: Float[Tensor, "R S"]  # distances of the samples [m]
+    taus: Float[Tensor, "R S"]  # optical thickness
     radiance: Float[Tensor, "R S 3"]
 
 
@@ -72,7 +78,7 @@ def render_reference(
     """
     batch = SceneBatch.of(state)
     check_request(fields, batch, (camera,), outputs)
-    return _render(fields, table, batch, (camera,), torch.device("cpu"), dtype, quality, outputs)
+    return _render_batch(fields, table, batch, (camera,), torch.device("cpu"), dtype, quality, outputs)
 
 
 def render_on_device(
@@ -80,7 +86,7 @@ def render_on_device(
     quality: Quality, outputs: frozenset[str] | set[str], only: Bool[np.ndarray, "V h w"] | None = None,
 ) -> Rendered:  # fmt: skip
     """A batch in single precision on a PyTorch device."""
-    rendered = _render(fields, table, batch, cameras, torch.device(device), torch.float32, quality, outputs)
+    rendered = _render_batch(fields, table, batch, cameras, torch.device(device), torch.float32, quality, outputs)
     if only is None:
         return rendered
     return Rendered(
@@ -92,7 +98,7 @@ def render_on_device(
 
 
 @torch.no_grad()
-def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001
+def _render_batch(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001
     queries = {name: KiloQuery(fields[name], dtype=dtype, device=device) for name in dict.fromkeys(batch.names)}
     extents = {name: _extent(fields[name]) for name in queries}
     pusher = None  # not among the named ones: an object may have any name
@@ -116,7 +122,7 @@ def _render(fields, table, batch, cameras, device, dtype, quality, outputs) -> R
             query, extent, centres = pusher
             placed.append(_Placed(query, tensor(extent), tensor(np.eye(3)), tensor(centres[b])))
         for v, camera in enumerate(cameras):
-            colours, shares, depths = _image(placed, table, tensor(light), camera, quality, tensor)
+            colours, shares, depths = _render_image(placed, table, tensor(light), camera, quality, tensor)
             rgb[b, v], depth[b, v] = colours.cpu().numpy(), depths.cpu().numpy()
             opacity[b, v] = shares[:count].cpu().numpy()
     return Rendered(
@@ -134,7 +140,7 @@ def _extent(field: KiloOSF) -> np.ndarray:
     return np.stack([np.maximum(low - field.voxel, box[0]), np.minimum(high + field.voxel, box[1])])
 
 
-def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN202
+def _render_image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN202
     """Colours (h, w, 3), shares of the objects (N, h, w) and z-depths (h, w) of one image."""
     s = quality.samples_per_side
     height, width = camera.height, camera.width
@@ -144,8 +150,8 @@ def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN2
     columns = torch.arange(width * s, device=light.device, dtype=light.dtype) + 0.5
     v, u = torch.meshgrid(rows / s, columns / s, indexing="ij")
     places = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
-    directions = torch.nn.functional.normalize(places @ numbers[3:].view(3, 3).T, dim=-1)
-    parts = [_rays(placed, table, light, numbers[:3], d, quality, tensor) for d in directions.split(_RAYS_AT_ONCE)]
+    rays_d = torch.nn.functional.normalize(places @ numbers[3:].view(3, 3).T, dim=-1)
+    parts = [_render_rays(placed, table, light, numbers[:3], d, quality, tensor) for d in rays_d.split(_RAYS_AT_ONCE)]
     colour, shares, distance, weight = (torch.cat(part) for part in zip(*parts, strict=True))
 
     def pixels(values: Tensor) -> Tensor:
@@ -153,65 +159,63 @@ def _image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN2
         return values.view(height, s, width, s, -1).mean(dim=(1, 3))
 
     whole = pixels(weight[:, None])[..., 0]
-    z = distance * (directions @ axis)
+    z = distance * (rays_d @ axis)
     depth = torch.where(whole > 1e-3, pixels(z[:, None])[..., 0] / whole.clamp(min=1e-9), 0)
     return pixels(colour), pixels(shares).permute(2, 0, 1), depth
 
 
-def _rays(placed, table, light, origin, directions, quality, tensor):  # noqa: ANN001, ANN202
-    """Radiance (R, 3), shares of the objects (R, N), weighted distance (R) and weight (R) of rays from one point."""
-    count = len(directions)
-    table_t = _meet_table(table, origin, directions)
-    samples = [_object_samples(placed, n, light, origin, directions, table_t, quality) for n in range(len(placed))]
-    owner = torch.cat([torch.full((s.distance.shape[1],), n) for n, s in enumerate(samples)] or [torch.zeros(0)])
+def _render_rays(placed, table, light, rays_o, rays_d, quality, tensor):  # noqa: ANN001, ANN202
+    """Radiance (R, 3), objects' weights (R, N), weighted distance (R) and total weight (R) of rays from one point."""
+    count = len(rays_d)
+    table_t = _intersect_table(table, rays_o, rays_d)
+    samples = [_sample_object(placed, n, light, rays_o, rays_d, table_t, quality) for n in range(len(placed))]
+    owner = torch.cat([torch.full((s.t_mids.shape[1],), n) for n, s in enumerate(samples)] or [torch.zeros(0)])
     if samples:
-        distance, order = torch.cat([s.distance for s in samples], dim=1).sort(dim=1)
-        depth = torch.cat([s.depth for s in samples], dim=1).gather(1, order)
+        t_mids, order = torch.cat([s.t_mids for s in samples], dim=1).sort(dim=1)
+        taus = torch.cat([s.taus for s in samples], dim=1).gather(1, order)
         radiance = torch.cat([s.radiance for s in samples], dim=1).gather(1, order[..., None].expand(-1, -1, 3))
     else:
-        distance, depth, order = (directions.new_zeros(count, 0) for _ in range(3))
-        radiance = directions.new_zeros(count, 0, 3)
-    before = torch.cumsum(depth, dim=1) - depth
-    weights = torch.exp(-before) * -torch.expm1(-depth)
-    left = torch.exp(-depth.sum(dim=1))
-    colour = (weights[..., None] * radiance).sum(dim=1)
-    owners = owner.to(directions.device)[order.long()] if samples else order
-    shares = torch.stack([(weights * (owners == n)).sum(dim=1) for n in range(len(placed))] or [left[:0]], dim=-1)
-    shares = shares if placed else directions.new_zeros(count, 0)
+        t_mids, taus, order = (rays_d.new_zeros(count, 0) for _ in range(3))
+        radiance = rays_d.new_zeros(count, 0, 3)
+    weights, remaining = render_weights(taus), final_transmittance(taus)
+    colour = accumulate_along_rays(weights, radiance)
+    owners = owner.to(rays_d.device)[order.long()] if samples else order
+    shares = torch.stack([(weights * (owners == n)).sum(dim=1) for n in range(len(placed))] or [remaining[:0]], dim=-1)
+    shares = shares if placed else rays_d.new_zeros(count, 0)
     hit = table_t < _FAR
-    seen = (weights * distance.clamp(max=_FAR)).sum(dim=1) + torch.where(hit, left * table_t, 0)
-    weight = weights.sum(dim=1) + left * hit
+    distance = (weights * t_mids.clamp(max=_FAR)).sum(dim=1) + torch.where(hit, remaining * table_t, 0)
+    weight = weights.sum(dim=1) + remaining * hit
     if table is not None:
         behind = tensor(table.background).expand(count, 3).clone()
-        points = origin + table_t[hit, None] * directions[hit]
-        visible = _visibility(placed, -1, points, light, quality)
+        points = rays_o + table_t[hit, None] * rays_d[hit]
+        visible = _light_transmittance(placed, -1, points, light, quality)
         direct = tensor(table.direct(light.cpu().double().numpy()[None])[0])
         behind[hit] = _albedo(table, points, tensor) * (tensor(table.ambient) + visible[:, None] * direct)
-        colour = colour + left[:, None] * behind
-    return colour, shares, seen, weight
+        colour = colour + remaining[:, None] * behind
+    return colour, shares, distance, weight
 
 
-def _meet_table(table: TableField | None, origin: Tensor, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
+def _intersect_table(table: TableField | None, rays_o: Tensor, rays_d: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
     """Distance to the table [m]; very far for rays that miss it."""
-    far = torch.full_like(directions[:, 0], _FAR)
-    if table is None or origin[2] <= 0:
+    far = torch.full_like(rays_d[:, 0], _FAR)
+    if table is None or rays_o[2] <= 0:
         return far
-    down = directions[:, 2] < -1e-9
-    t = torch.where(down, -origin[2] / torch.where(down, directions[:, 2], -1), far)
-    places = origin[:2] + t[:, None] * directions[:, :2]
+    down = rays_d[:, 2] < -1e-9
+    t = torch.where(down, -rays_o[2] / torch.where(down, rays_d[:, 2], -1), far)
+    places = rays_o[:2] + t[:, None] * rays_d[:, :2]
     return torch.where(down & (places.abs() <= table.half_side).all(dim=-1), t, far)
 
 
-def _sample_places(
+def _march(
     placed: _Placed,
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
+    rays_o: Float[Tensor, "R 3"],
+    rays_d: Float[Tensor, "R 3"],
     far: Float[Tensor, "R"],
     step: float,
 ) -> Iterator[tuple[Float[Tensor, "R"], Float[Tensor, "R"]]]:
-    """Distances of the samples within an object's extent, one after another, and which rays have one there."""
-    safe = torch.where(directions.abs() < 1e-9, 1e-9, directions)
-    a, b = (placed.extent[0] - origins) / safe, (placed.extent[1] - origins) / safe
+    """Ray marching within an object's extent: yields distances of the next samples, and which rays have one there."""
+    safe = torch.where(rays_d.abs() < 1e-9, 1e-9, rays_d)
+    a, b = (placed.extent[0] - rays_o) / safe, (placed.extent[1] - rays_o) / safe
     near = torch.minimum(a, b).amax(dim=-1).clamp(min=0)
     end = torch.minimum(torch.maximum(a, b).amin(dim=-1), far)
     k = torch.ceil(near / step - 0.5)
@@ -222,51 +226,51 @@ def _sample_places(
         k = k + 1
 
 
-def _into(placed: _Placed, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+def _to_object_frame(placed: _Placed, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     return (points - placed.position) @ placed.rotation.T
 
 
-def _object_samples(placed, n, light, origin, directions, table_t, quality) -> _Samples:  # noqa: ANN001
-    """All samples of object n, lit by what the others let through."""
+def _sample_object(placed, n, light, rays_o, rays_d, table_t, quality) -> _Samples:  # noqa: ANN001
+    """All samples of object n along each ray: tau_i = sigma_i delta, radiance from the OSF (paper eqs. 1 and 2)."""
     own = placed[n]
     step = quality.step_voxels * own.query.voxel
-    local_origin = _into(own, origin[None]).expand_as(directions)
-    local_directions, local_light = directions @ own.rotation.T, own.rotation @ light
-    distances, depths, radiances = [], [], []
-    for t, used in _sample_places(own, local_origin, local_directions, table_t, step):
-        depth, radiance = torch.zeros_like(t), torch.zeros_like(directions)
-        x = (local_origin + t[:, None] * local_directions)[used]
+    local_o = _to_object_frame(own, rays_o[None]).expand_as(rays_d)
+    local_d, local_light = rays_d @ own.rotation.T, own.rotation @ light
+    t_mids, taus, radiances = [], [], []
+    for t, used in _march(own, local_o, local_d, table_t, step):
+        tau, radiance = torch.zeros_like(t), torch.zeros_like(rays_d)
+        x = (local_o + t[:, None] * local_d)[used]
         if len(x):
             sigma = own.query.density(x)
             some = sigma > 0
             inside = used.nonzero()[:, 0][some]
-            depth[inside] = sigma[some] * step
+            tau[inside] = sigma[some] * step
             light_there = local_light.expand(len(inside), 3)
-            scatter = own.query(x[some], light_there, local_directions[inside])
-            points = origin + t[inside, None] * directions[inside]
-            visible = _visibility(placed, n, points, light, quality)
+            scatter = own.query(x[some], light_there, local_d[inside])
+            points = rays_o + t[inside, None] * rays_d[inside]
+            visible = _light_transmittance(placed, n, points, light, quality)
             radiance[inside] = scatter.ambient + visible[:, None] * scatter.direct
-        distances.append(torch.where(used, t, _FAR))
-        depths.append(depth)
+        t_mids.append(torch.where(used, t, _FAR))
+        taus.append(tau)
         radiances.append(radiance)
-    if not distances:
-        nothing = directions.new_zeros(len(directions), 0)
-        return _Samples(nothing, nothing, directions.new_zeros(len(directions), 0, 3))
-    return _Samples(torch.stack(distances, 1), torch.stack(depths, 1), torch.stack(radiances, 1))
+    if not t_mids:
+        nothing = rays_d.new_zeros(len(rays_d), 0)
+        return _Samples(nothing, nothing, rays_d.new_zeros(len(rays_d), 0, 3))
+    return _Samples(torch.stack(t_mids, 1), torch.stack(taus, 1), torch.stack(radiances, 1))
 
 
-def _visibility(placed, skip, points, light, quality) -> Float[Tensor, "R"]:  # noqa: ANN001
-    """Share of the light that reaches points in the world past all objects but one."""
+def _light_transmittance(placed, skip, points, light, quality) -> Float[Tensor, "R"]:  # noqa: ANN001
+    """Transmittance from points in the world toward the light through all objects but one: their shadow."""
     total = points.new_zeros(len(points))
     for n, other in enumerate(placed):
         if n == skip or not len(points):
             continue
-        origins = _into(other, points)
-        direction = (other.rotation @ light).expand_as(origins)
+        rays_o = _to_object_frame(other, points)
+        direction = (other.rotation @ light).expand_as(rays_o)
         step = quality.shadow_voxels * other.query.voxel
-        for t, used in _sample_places(other, origins, direction, torch.full_like(total, _FAR), step):
+        for t, used in _march(other, rays_o, direction, torch.full_like(total, _FAR), step):
             if used.any():
-                x = (origins + t[:, None] * direction)[used]
+                x = (rays_o + t[:, None] * direction)[used]
                 total[used] += other.query.density(x) * step
     return torch.exp(-total)
 

@@ -1,8 +1,8 @@
 """Light search: the direction toward the light by coarse-to-fine grid search, given roughly known poses.
 
 A grid over the hemisphere, then shrinking 3 x 3 grids around the best directions, ranked by the truncated absolute
-error mean(min(|r|, e_max)) of renderings with shadows. The table's shading determines the light's elevation, cast shadows its
-azimuth; neither needs accurate poses.
+error mean(min(|r|, e_max)) of renderings with shadows. The table's shading determines the light's elevation, cast
+shadows its azimuth; neither needs accurate poses.
 """
 
 from __future__ import annotations

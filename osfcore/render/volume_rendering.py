@@ -1,0 +1,63 @@
+"""Volume rendering along rays: from densities at samples to the weight of each sample and to a pixel's value.
+
+Emission and absorption along a ray r(t) = o + t d (paper eq. 3, NeRF eq. 1) are
+
+    L = integral of T(t) sigma(r(t)) L_out(r(t)) dt,        T(t) = exp(-integral from t_n to t of sigma(r(s)) ds).
+
+With density and radiance constant over intervals of length delta_i, this is exactly the sum
+
+    tau_i   = sigma_i delta_i                               optical thickness
+    alpha_i = 1 - exp(-tau_i)                               share of the light that interval i absorbs and scatters
+    T_i     = exp(-sum of tau_j over j < i)                 share that reaches interval i
+    w_i     = T_i alpha_i                                   weight of sample i
+    L       = sum of w_i L_i + T_end L_behind,              T_end = exp(-sum of all tau_i).
+
+A worked example: one ray with an empty sample and two that each let half of the light through.
+
+    >>> taus = torch.log(torch.tensor([[1.0, 2.0, 2.0]]))
+    >>> alphas_from_thickness(taus).tolist()
+    [[0.0, 0.5, 0.5]]
+    >>> transmittance(taus).tolist()
+    [[1.0, 1.0, 0.5]]
+    >>> weights = render_weights(taus)
+    >>> weights.tolist()
+    [[0.0, 0.5, 0.25]]
+    >>> final_transmittance(taus).tolist()
+    [0.25]
+    >>> red_then_blue = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    >>> accumulate_along_rays(weights, red_then_blue).tolist()
+    [[0.5, 0.0, 0.25]]
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def alphas_from_thickness(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
+    """Opacity of each sample, alpha_i = 1 - exp(-tau_i); exact for thin samples as well."""
+    return -torch.expm1(-taus)
+
+
+def transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
+    """Share of the light that reaches each sample, T_i = exp(-sum of tau_j over j < i); samples by distance."""
+    return torch.exp(-(torch.cumsum(taus, dim=1) - taus))
+
+
+def final_transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays"]:
+    """Share of the light that passes all samples, T_end."""
+    return torch.exp(-taus.sum(dim=1))
+
+
+def render_weights(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
+    """Weight of each sample, w_i = T_i alpha_i; the weights of a ray and T_end sum to 1."""
+    return transmittance(taus) * alphas_from_thickness(taus)
+
+
+def accumulate_along_rays(
+    weights: Float[Tensor, "rays samples"], values: Float[Tensor, "rays samples channels"]
+) -> Float[Tensor, "rays channels"]:
+    """Weighted sum of the samples' values: colours give the ray's radiance, distances its expected depth."""
+    return (weights[..., None] * values).sum(dim=1)
