@@ -46,6 +46,11 @@ class Hub:
 
         return leave
 
+    @property
+    def subscribers(self) -> int:
+        """How many listen now."""
+        return len(self._listeners)
+
     def publish(self, event: object) -> None:
         """Tell everyone. A listener that fails is logged and does not keep the others from hearing."""
         for listener in self._listeners:

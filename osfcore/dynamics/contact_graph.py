@@ -29,7 +29,7 @@ from osfcore.dynamics.contact_geometry import (
 )
 from osfcore.dynamics.motion import Motion, Sweep
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import Gap, dot
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 
@@ -143,7 +143,7 @@ def _extent(
     length = direction.norm(dim=1, keepdim=True)
     unit = torch.where(length > 1e-6, direction / length.clamp(min=1e-6), direction.new_tensor([1.0, 0.0]))
     directions = torch.nn.functional.pad(unit, (0, 1))[:, None]
-    return table.extents(number[tuple(rows)], turns.matrix(motion.quaternion[tuple(rows)]), directions)[:, 0]
+    return table.extents(number[tuple(rows)], rotations.matrix(motion.quaternion[tuple(rows)]), directions)[:, 0]
 
 
 def _spread(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N"]:
@@ -158,8 +158,8 @@ def _gather(
 ) -> tuple[Graph, Solids]:
     """The chosen objects side by side, without pairs yet, and their convex parts."""
     scene, slot = chosen.nonzero().unbind(1)
-    frame = turns.facing(sweep.heading[scene])
-    rotation = frame @ turns.matrix(motion.quaternion[scene, slot])
+    frame = rotations.facing(sweep.heading[scene])
+    rotation = frame @ rotations.matrix(motion.quaternion[scene, slot])
     origin = torch.nn.functional.pad(motion.pusher[scene], (0, 1))
     vectors = torch.stack(
         [

@@ -18,7 +18,7 @@ from torch.nn import functional
 from osfcore.dynamics.contact_graph import Graph
 from osfcore.dynamics.limit_surface import lever, slide
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import Gap, dot
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 
@@ -58,7 +58,7 @@ class Inputs(NamedTuple):
 
 def inputs(table: ShapeTable, graph: Graph) -> Inputs:
     """All that the network needs."""
-    turn = turns.facing(_directions(graph))
+    turn = rotations.facing(_directions(graph))
     guess = _give_way(graph, graph.pusher.after, turn)
     pushed = graph.touched.nonzero()[:, 0]
     edges = torch.cat([_from_pusher(graph, pushed, turn), _between(graph, turn)])

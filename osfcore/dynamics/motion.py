@@ -12,7 +12,7 @@ from torch.nn import functional
 from osfcore.dynamics.pusher_path import SUBSTEPS
 from osfcore.dynamics.recorded_states import SLEEP_M, SLEEP_RAD
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import circle
 
 _MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
@@ -61,7 +61,7 @@ def lowest_point(
     """
     around = functional.pad(_ASIDE * circle(8, centre.device), (0, 1), value=-1.0)
     down = torch.cat([centre.new_tensor([[0.0, 0.0, -1.0]]), around])
-    return centre[:, 2] + table.farthest(number, turns.matrix(quaternion), down)[..., 2].amin(dim=1)
+    return centre[:, 2] + table.farthest(number, rotations.matrix(quaternion), down)[..., 2].amin(dim=1)
 
 
 def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B 2"]:
@@ -85,7 +85,7 @@ def going_on(former: Motion, motion: Motion) -> Motion:
     less exact, see docs/dynamics.md.) What moved by less than an estimate may err is at rest.
     """
     opposite = former.quaternion * former.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])
-    turn = turns.logarithm(turns.multiply(motion.quaternion, opposite))
+    turn = rotations.logarithm(rotations.multiply(motion.quaternion, opposite))
     shift = motion.centre - former.centre
     moved = (shift.norm(dim=-1, keepdim=True) > _MOVED_M) | (turn.norm(dim=-1, keepdim=True) > _MOVED_RAD)
     return motion._replace(linear=shift * moved / SUBSTEPS, angular=turn * moved / SUBSTEPS)

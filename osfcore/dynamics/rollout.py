@@ -16,7 +16,7 @@ from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.poses import rotate
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
@@ -99,7 +99,7 @@ class PushModel:
         """One scene in which nothing moves."""
         assert state.pusher is not None  # checked
         quaternion = self._tensor(state.poses.quaternion[order])
-        centre = self._tensor(state.poses.position[order]) + turns.rotate(quaternion, self._table.centre[number[0]])
+        centre = self._tensor(state.poses.position[order]) + rotations.rotate(quaternion, self._table.centre[number[0]])
         lowest = lowest_point(self._table, number[0], centre.float(), quaternion.float())
         still = torch.zeros_like(centre, dtype=torch.float32)[None]
         pusher = self._tensor(state.pusher[:2]).float()[None]

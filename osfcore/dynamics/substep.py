@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from osfcore.dynamics.contact_graph import build_graph
-from osfcore.dynamics.features import SHIFT_M, TURN_RAD, corrections, inputs, mirrored
+from osfcore.dynamics.features import SHIFT_M, TURN_RAD, Inputs, corrections, inputs, mirrored
 from osfcore.dynamics.motion import Motion, Sweep, lowest_point
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.recorded_states import SLEEP_M, SLEEP_RAD
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 
 
 def advance(
@@ -40,23 +40,14 @@ def advance(
     )
     if not len(graph.scene):
         return rest
-    seen = inputs(table, graph)
-    if mirror is None:
-        answer = network(seen.nodes, seen.edges, seen.receiver, seen.sender)
-    else:
-        flags = mirror[graph.scene]
-        nodes, edges = mirrored(seen.nodes, flags, "node"), mirrored(seen.edges, flags[seen.receiver], "edge")
-        answer = mirrored(network(nodes, edges, seen.receiver, seen.sender), flags, "motion")
-    answer = answer + corrections(seen)
-    scale = answer.new_tensor([SHIFT_M] * 3 + [TURN_RAD] * 3)
-    vectors = (answer * scale).view(-1, 2, 3) @ seen.frame
-    linear, angular = vectors.unbind(1)
+    features = inputs(table, graph)
+    linear, angular = _predict_motion(network, features, None if mirror is None else mirror[graph.scene])
     awake = (linear.norm(dim=1) > SLEEP_M) | (angular.norm(dim=1) > SLEEP_RAD)
     linear, angular = linear * awake[:, None], angular * awake[:, None]
     place = (graph.scene, graph.slot)
     quaternion = motion.quaternion[place]
     quaternion = torch.where(
-        awake[:, None], turns.unit(turns.multiply(turns.exponential(angular), quaternion)), quaternion
+        awake[:, None], rotations.unit(rotations.multiply(rotations.exponential(angular), quaternion)), quaternion
     )
     centre = motion.centre[place] + linear
     sunk = motion.floor[place] - lowest_point(table, graph.number, centre, quaternion)
@@ -71,3 +62,23 @@ def advance(
         pusher=pusher,
         floor=motion.floor,
     )
+
+
+def _predict_motion(
+    network: PropagationNetwork, features: Inputs, mirror: Bool[Tensor, "M"] | None
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """Translations [m] and rotation vectors [rad] in the world that the network predicts for M objects.
+
+    The network's output is a residual over the quasi-static correction, in units of typical motions, in each object's
+    own frame along the heading; with `mirror`, it sees reflected features and its output is reflected back.
+    """
+    if mirror is None:
+        residual = network(features.nodes, features.edges, features.receiver, features.sender)
+    else:
+        nodes = mirrored(features.nodes, mirror, "node")
+        edges = mirrored(features.edges, mirror[features.receiver], "edge")
+        residual = mirrored(network(nodes, edges, features.receiver, features.sender), mirror, "motion")
+    motion = residual + corrections(features)
+    scale = motion.new_tensor([SHIFT_M] * 3 + [TURN_RAD] * 3)
+    linear, angular = ((motion * scale).view(-1, 2, 3) @ features.frame).unbind(1)
+    return linear, angular

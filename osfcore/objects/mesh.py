@@ -81,15 +81,7 @@ def textured_mesh(
         InvalidInput: if it is under 5 mm or over 1 m long, or has too many triangles.
     """
     vertices, faces, uv = np.asarray(vertices, float), np.asarray(faces, np.int64), np.asarray(uv, float)
-    if len(faces) == 0 or len(vertices) == 0:
-        raise CorruptFile(source, "it holds no triangles")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise CorruptFile(source, "its faces name vertices that do not exist")
-    vertices, faces, uv = _referenced(vertices, faces, uv)
-    if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
-        raise CorruptFile(source, "it has coordinates that are not finite")
-    if len(faces) > MAX_FACES:
-        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
+    vertices, faces, uv = _check_triangles(vertices, faces, uv, source)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     _check_size(high - low, source)
     vertices = vertices - (low + high) / 2
@@ -108,6 +100,22 @@ def textured_mesh(
         uv=np.clip(uv, 0, 1).astype(np.float32),
         texture=texture if is_clean else clean_texture(texture, uv, faces),
     )
+
+
+def _check_triangles(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, source: Path | str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The vertices that faces name, if all of them are there and finite."""
+    if len(faces) == 0 or len(vertices) == 0:
+        raise CorruptFile(source, "it holds no triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CorruptFile(source, "its faces name vertices that do not exist")
+    vertices, faces, uv = _referenced(vertices, faces, uv)
+    if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
+        raise CorruptFile(source, "it has coordinates that are not finite")
+    if len(faces) > MAX_FACES:
+        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
+    return vertices, faces, uv
 
 
 def _check_size(extents: Float[np.ndarray, "3"], source: Path | str) -> None:

@@ -1,5 +1,6 @@
 """One running service for all tests that do not stop or break it."""
 
+import contextlib
 import http.client
 import json
 import os
@@ -14,8 +15,10 @@ from starlette.testclient import TestClient
 
 from app.api.app_factory import create_app
 from app.services.service_settings import Settings
+from app.storage.database import Store
 
 LOCALHOST = "http://localhost"
+LONG = {"kind": "collect_table", "params": {"images": 5000, "size": 16, "seed": 0}}
 
 
 def until(condition, timeout_s=20.0):
@@ -35,6 +38,22 @@ def running(library, data_dir, **settings):
         shutil.copytree(library.root, data_dir / "objects", copy_function=os.link)
     app = create_app(Settings(data_dir=data_dir, **{"demo_scene": False, **settings}))
     return TestClient(app, base_url=LOCALHOST, raise_server_exceptions=False)
+
+
+def keep_busy(client):
+    """Start a job that keeps its turn, so that nothing else that is asked for begins; returns its name."""
+    job = client.post("/api/jobs", json=LONG).json()["id"]
+    until(lambda: client.get(f"/api/jobs/{job}").json()["done"] > 0)
+    client.post(f"/api/jobs/{job}/pause")
+    return job
+
+
+def leave_running(data_dir, job):
+    """Let a job that waits, of a service that was stopped, be one that ran when that happened."""
+    with contextlib.closing(Store(data_dir)) as store:
+        for number, fields in store.jobs():
+            if fields["id"] == job:
+                store.save_job(job, number, {**fields, "state": "running"})
 
 
 @pytest.fixture(scope="session")

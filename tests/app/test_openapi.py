@@ -19,13 +19,11 @@ from schemathesis.specs.openapi.checks import (
 from app.api.app_factory import create_app
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
-from app.jobs.outcomes import JobStopped, after
 from app.services.episodes import FILES
 from app.services.service_settings import Settings
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
-from tests.app.api.routes.test_jobs import LONG
-from tests.app.conftest import running, until
+from tests.app.conftest import keep_busy, leave_running, running
 from tests.app.services.test_goals import photo
 
 CHECKS = (
@@ -70,19 +68,21 @@ def made(library, tmp_path_factory):
 
     A paused job keeps its turn: whatever examples queue never runs.
     """
-    with running(library, tmp_path_factory.mktemp("openapi"), max_scenes=400) as client:
-        stand.app = client.app
+    data_dir = tmp_path_factory.mktemp("openapi")
+    with running(library, data_dir, max_scenes=400) as client:
         scene = client.post("/api/scenes", json={"seed": 3, "count": 2}).json()
-        job = client.post("/api/jobs", json=LONG).json()
-        until(lambda: client.get(f"/api/jobs/{job['id']}").json()["done"] > 0)
-        client.post(f"/api/jobs/{job['id']}/pause")
-        estimate = client.post("/api/estimates").json()
+        keep_busy(client)
         goal = client.post("/api/goals", json={"random": {}}).json()
         episode = client.post("/api/episodes", json={"goal": goal["id"]}).json()
-        interrupt(client.app.state.services.runner.jobs, episode["id"])
+        leave_results(client.app.state.services.runner.jobs.folder(episode["id"]))
+    leave_running(data_dir, episode["id"])
+    with running(library, data_dir, max_scenes=400) as client:
+        stand.app = client.app
+        job = keep_busy(client)
+        estimate = client.post("/api/estimates").json()
         yield {
             "scene": scene["id"],
-            "job": job["id"],
+            "job": job,
             "camera": "0",
             "estimate": estimate["id"],
             "goal": goal["id"],
@@ -91,12 +91,10 @@ def made(library, tmp_path_factory):
         }
 
 
-def interrupt(jobs, name):
-    """Leave an episode that waits as if the service had stopped after its first look."""
-    folder = jobs.folder(name)
+def leave_results(folder):
+    """As an episode does after its first look."""
     write_png(folder / FRAMES_FOLDER / "000.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_json(folder / REPORT_FILE, {"steps": [], "noticed": []})
-    jobs._set(after(jobs.get(name), JobStopped(), folder))
 
 
 def reach(case, made):

@@ -33,7 +33,7 @@ from osfcore.dynamics.training.windows import Batch, Recording, batch, record
 from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
 from osfcore.io.push_file import PushEpisode, read_sound_pushes
@@ -337,7 +337,7 @@ def distance(motion: Motion, pieces: Batch, step: int) -> Tensor:
 
 def _sine(a: Tensor, b: Tensor) -> Tensor:
     """Sine of half the angle between orientations."""
-    between = turns.multiply(b * b.new_tensor([1.0, -1.0, -1.0, -1.0]), a)
+    between = rotations.multiply(b * b.new_tensor([1.0, -1.0, -1.0, -1.0]), a)
     return (between[..., 1:].square().sum(dim=-1) + 1e-12).sqrt()
 
 

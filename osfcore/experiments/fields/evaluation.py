@@ -172,7 +172,7 @@ def evaluate_fields(config: EvaluateFields, fields: FieldLibrary, assets: AssetL
     for name in names:
         objects[name] = yield from _told(_object_alone(config, name, fields, assets), len(objects), total)
     _write_sheet(config.out / "objects.png", [_titled(result, 0, name) for name, result in objects.items()])
-    figures = {name: _field_figures(result, fields.info(name).path) for name, result in objects.items()}
+    figures = {name: field_figures(result, fields.info(name).path) for name, result in objects.items()}
     scenes: list[TaskResult] = []
     run = _Scenes(config, names, fields, assets)
     for number in range(tasks):
@@ -195,7 +195,7 @@ def evaluate_set(config: EvaluateSet) -> Iterator[EvaluationStep]:
     name = config.data.resolve().name
     result = yield from _told(_measured(name, config.weights, config.data), 0, 1)
     _write_sheet(config.out / "objects.png", result.shown)
-    report = FieldsReport({name: _field_figures(result, config.weights)})
+    report = FieldsReport({name: field_figures(result, config.weights)})
     yield EvaluationStep(1, 1, "Everything is measured", report)
 
 
@@ -335,7 +335,7 @@ def _told(notes: _Notes[_ResultT], done: int, total: int) -> Generator[Evaluatio
             return stop.value
 
 
-def _field_figures(result: TaskResult, weights: Path) -> FieldFigures:
+def field_figures(result: TaskResult, weights: Path) -> FieldFigures:
     """Figures with size and training time, which are read anew each time."""
     try:
         minutes = float(json.loads(weights.with_suffix(".json").read_text())["minutes"])

@@ -20,7 +20,7 @@ from osfcore.dynamics.contact_geometry import outlines
 from osfcore.dynamics.limit_surface import lever, slide
 from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import dot, gap_between, gap_to_point
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 
@@ -43,7 +43,7 @@ def push(
 
 def _outlines(table: ShapeTable, number: Tensor, motion: Motion) -> Float[Tensor, "B N K 2"]:
     """Outlines around the centres of mass."""
-    rotation = turns.matrix(motion.quaternion.flatten(0, 1))
+    rotation = rotations.matrix(motion.quaternion.flatten(0, 1))
     return outlines(table, number.flatten(), rotation, torch.zeros_like(rotation[:, 0])).unflatten(0, number.shape)
 
 
@@ -117,7 +117,7 @@ def _moved(
     centre, quaternion, outline = motion.centre.clone(), motion.quaternion.clone(), outline.clone()
     centre[place] = centre[place] + functional.pad(way[:, :2], (0, 1))
     turn = functional.pad(way[:, 2:], (2, 0))
-    quaternion[place] = turns.unit(turns.multiply(turns.exponential(turn), quaternion[place]))
+    quaternion[place] = rotations.unit(rotations.multiply(rotations.exponential(turn), quaternion[place]))
     cosine, sine = way[:, 2].cos()[:, None], way[:, 2].sin()[:, None]
     x, y = outline[place].unbind(-1)
     outline[place] = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)

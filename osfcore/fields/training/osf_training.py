@@ -179,10 +179,10 @@ class Teacher:
         loss.backward()
         self._optimiser.step()
         if self._count % self.recipe.rebake == 0:
-            self._bake()
+            self.update_proposal()
         return float(loss.detach())
 
-    def _bake(self) -> None:
+    def update_proposal(self) -> None:
         """Propose samples where the network now has density, and thinly around."""
         grid = self._proposal
         g = np.full(grid.index.shape, EMPTY_G, np.float32)

@@ -10,7 +10,7 @@ from app.episodes.headless import run_episode, stage_of
 from app.episodes.request import EpisodeOrder
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Observed, Planning, Stepped
-from osfcore.errors import CorruptFile, UnknownName
+from osfcore.errors import CorruptFile, OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.planning.pose_cost import PoseGoal
@@ -36,6 +36,13 @@ def worlds(monkeypatch):
 
     monkeypatch.setattr(run, "given", noted)
     return begun
+
+
+def assert_closed(worlds):
+    """One simulation was begun, and it is gone."""
+    (world,) = worlds
+    with pytest.raises(OsfError, match="table is empty"):
+        world.truth()
 
 
 @pytest.fixture
@@ -95,7 +102,7 @@ def test_every_step_tells_what_is_being_done(order, told, worlds):
     assert [step.report is None for step in steps] == [True] * (len(steps) - 1) + [False]
     assert steps[-1].report["outcome"] == "reached"
     assert {path.name for path in order.out.iterdir()} >= {REPORT_FILE, RECORDING_FILE}
-    assert [world._physics for world in worlds] == [None]
+    assert_closed(worlds)
 
 
 def test_the_order_reaches_the_episode(order, told):
@@ -111,8 +118,8 @@ def test_who_stops_asking_ends_it(order, told, worlds):
     with contextlib.closing(run_episode(order)) as steps:
         while not isinstance(next(steps).event, Acted):
             pass
-        assert worlds[0]._physics is not None
-    assert worlds[0]._physics is None
+        assert worlds[0].truth().names == NAMES
+    assert_closed(worlds)
     report = json.loads((order.out / REPORT_FILE).read_text())  # what was done is kept
     assert (report["outcome"], report["steps_done"]) == (None, 0)
 
@@ -135,7 +142,7 @@ def test_what_cannot_be_known_leaves_no_world_behind(order, worlds, monkeypatch)
     monkeypatch.setattr(run, "knowledge_of", broken)
     with pytest.raises(CorruptFile):
         list(run_episode(order))
-    assert [world._physics for world in worlds] == [None]
+    assert_closed(worlds)
     assert not order.out.exists()
 
 

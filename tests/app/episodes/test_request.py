@@ -162,4 +162,4 @@ def test_a_refusal_leaves_no_simulation_behind(order, tmp_path, monkeypatch, cha
         changes = {"goal": tmp_path / changes["goal"]}
     with pytest.raises((InvalidInput, CorruptFile)):
         orders.given(replace(order, **changes))
-    assert [world._physics for world in worlds] == [None]
+    assert_closed(worlds)

@@ -5,9 +5,12 @@ import pytest
 
 from app.processes.neural_messages import DrawView, Predicted, PredictPushes
 from app.processes.predict_process import PushPredictor
+from osfcore.dynamics import push_models
+from osfcore.dynamics.rollout import PushModel
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from tests.app.processes.conftest import BOX, SIZE_M
 from tests.app.processes.fields import write_box
@@ -48,31 +51,31 @@ def test_refusals(oracle, state):
 
 
 def test_what_is_not_finite_is_not_told(oracle, state, monkeypatch):
-    class Wild:
-        def rollout(self, state, actions, before):
-            from osfcore.geometry.rollouts import Rollouts
+    def wild(_model, state, _actions, _before):
+        return Rollouts(state.names, np.full((1, 7, 1, 3), np.nan), np.zeros((1, 7, 1, 4)), np.zeros((1, 7, 3)))
 
-            nowhere = np.full((1, 7, 1, 3), np.nan)
-            return Rollouts(state.names, nowhere, np.zeros((1, 7, 1, 4)), np.zeros((1, 7, 3)))
-
-    monkeypatch.setattr(oracle, "_model", lambda names: Wild())
+    monkeypatch.setattr(PushModel, "rollout", wild)
     with pytest.raises(OsfError, match="out of all bounds"):
         oracle.answer(PredictPushes("a", state, TOWARD))
 
 
-def test_models_are_kept_until_a_field_changes_and_order_does_not_matter(fields_dir, state, tmp_path):
+def test_models_are_kept_until_a_field_changes_and_order_does_not_matter(fields_dir, state, tmp_path, monkeypatch):
+    loads, real = [], push_models.load_push_model
+    monkeypatch.setattr(push_models, "load_push_model", lambda *args: (loads.append(args), real(*args))[1])
     shutil.copytree(fields_dir, tmp_path / "own")
     other = "006_mustard_bottle"
     write_box(tmp_path / "own", other, SIZE_M, (0.1, 0.1, 0.1))
     oracle = PushPredictor(tmp_path / "own")
-    first = oracle._model((BOX, other))
-    assert oracle._model((other, BOX)) is first
     poses = Pose(np.array([[0.05, -0.02, 0.04], [0.05, 0.2, 0.04]]), np.tile([1.0, 0, 0, 0], (2, 1)))
     both = beside(SceneState((BOX, other), poses, state.light, state.pusher))
-    assert oracle.answer(PredictPushes("a", both, TOWARD)).rollouts.names == (BOX, other)
+    swapped = SceneState((other, BOX), poses[::-1], state.light, both.pusher)
+    for asked in (both, swapped):
+        assert oracle.answer(PredictPushes("a", asked, TOWARD)).rollouts.names == asked.names
+    assert len(loads) == 1
     write_box(tmp_path / "own", BOX, 2 * SIZE_M, (0.1, 0.1, 0.1))
-    assert oracle._model((BOX, other)) is not first
+    oracle.answer(PredictPushes("a", both, TOWARD))
+    assert len(loads) == 2
     (tmp_path / "own" / "dynamics").mkdir(exist_ok=True)
     (tmp_path / "own" / "dynamics" / "pushes.safetensors").write_bytes(b"broken")
     with pytest.raises(CorruptFile):
-        oracle._model((BOX, other))
+        oracle.answer(PredictPushes("a", both, TOWARD))

@@ -5,7 +5,7 @@ import pytest
 
 from app.services.fields import FieldCatalogue, ShippedField
 from osfcore.errors import UnknownName
-from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo
+from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
 
 
 @pytest.fixture
@@ -37,6 +37,6 @@ def test_what_was_trained_here_is_told_and_can_be_deleted(shelf, tmp_path):
 
 def test_what_is_shipped_stays(shelf, monkeypatch):
     shipped = FieldInfo("mug", "shipped", Path("mug.safetensors"), 7, {})
-    monkeypatch.setattr(shelf._library, "info", lambda name: shipped)
+    monkeypatch.setattr(FieldLibrary, "info", lambda _library, _name: shipped)
     with pytest.raises(ShippedField, match="mug is shipped"):
         shelf.remove("mug")

@@ -15,7 +15,7 @@ from app.services.event_hub import Hub
 from app.services.goals import GOAL_SIDE, Draft, DraftChanged, DraftUnsound, Goals, GoalsChanged, NoDraft, NoTable
 from app.services.runner import SceneHeld
 from app.storage.database import CannotStore
-from app.storage.goal_store import TooManyGoals
+from app.storage.goal_store import GoalStore, TooManyGoals
 from app.storage.photos import PhotoRefused
 from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
@@ -253,7 +253,7 @@ def test_a_draft_outlives_a_disk_that_is_full(goals, runner, monkeypatch):
     def full(*_):
         raise CannotStore("goals", "No space left on device")
 
-    monkeypatch.setattr(goals._store, "keep", full)
+    monkeypatch.setattr(GoalStore, "keep", full)
     with pytest.raises(CannotStore):
         goals.keep_draft("A")
     assert goals.draft is begun

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from starlette.requests import ClientDisconnect
 
-import app.services.image_sets
-from app.services.image_sets import ImageSets, TooManySets, examine
-from app.storage.uploads import UploadRefused
+from app.services.image_sets import Examined, ImageSets, TooManySets, examine
+from app.storage.uploads import Examiner, UploadRefused
 from osfcore.errors import CorruptFile, UnknownName
 from tests.core.fields.sets import edit, write_set
 
@@ -122,11 +121,11 @@ def test_there_is_an_end_to_what_is_kept(sets, archive):
 
 
 def test_uploads_at_the_same_time_do_not_overrun_the_limit(sets, archive, tmp_path, monkeypatch):
-    def look(folder):
+    async def examine_at_once(_examiner, folder):
         (folder / "set.zip").unlink()
-        return app.services.image_sets.Examined(1, 1, "a set")
+        return Examined(1, 1, "a set")
 
-    monkeypatch.setattr(sets._examiner, "_examine", look)
+    monkeypatch.setattr(Examiner, "examine", examine_at_once)
 
     async def chunks():
         yield archive

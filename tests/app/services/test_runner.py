@@ -174,7 +174,7 @@ def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
     scene = runner.create_scene(names=(BOX,), seed=3)
     job = runner.jobs.submit(LONG[0], dict(LONG[1]))
     until(lambda: runner.jobs.get(job.id).done > 0)
-    runner.jobs._jobs[job.id].params["scene"] = scene.id
+    runner.jobs.change(job.id, {"scene": scene.id})
     for command in (
         lambda: runner.act(scene.id, [(0.1, 0, 0)]),
         lambda: runner.reset_scene(scene.id),

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, Motion, going_on, headings, lowest_point, sleeping
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.poses import quaternion_exp, rotate
 from tests.core.dynamics.scenes import NAMES, crowd, hull, start
 
@@ -83,7 +83,7 @@ def test_velocities_are_means_over_the_action_before(shapes, table):
     turn = torch.tensor([0.0, 0.0, -0.4])
     before = now._replace(
         centre=now.centre - torch.tensor([0.02, 0.0, 0.0]),
-        quaternion=turns.multiply(turns.exponential(turn).expand_as(now.quaternion), now.quaternion),
+        quaternion=rotations.multiply(rotations.exponential(turn).expand_as(now.quaternion), now.quaternion),
     )
     moving = going_on(before, now)
     torch.testing.assert_close(moving.linear, torch.tensor([0.005, 0.0, 0.0]).expand_as(now.linear), atol=1e-6, rtol=0)

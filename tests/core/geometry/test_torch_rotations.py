@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from osfcore.geometry import poses
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 
 rng = np.random.default_rng(0)
 VECTORS = np.concatenate([rng.normal(size=(50, 3)), 1e-6 * rng.normal(size=(5, 3)), np.zeros((1, 3)), 20 * np.eye(3)])
@@ -18,13 +18,13 @@ def tensor(array) -> torch.Tensor:
 def test_products_rotations_and_matrices_are_those_of_poses():
     q, p = tensor(QUATERNIONS), tensor(OTHERS)
     v = rng.normal(size=(len(QUATERNIONS), 3))
-    np.testing.assert_allclose(turns.multiply(q, p), poses.quaternion_multiply(QUATERNIONS, OTHERS), atol=1e-12)
-    np.testing.assert_allclose(turns.matrix(q), poses.quaternion_to_matrix(QUATERNIONS), atol=1e-12)
-    np.testing.assert_allclose(turns.rotate(q, tensor(v)), poses.rotate(QUATERNIONS, v), atol=1e-12)
+    np.testing.assert_allclose(rotations.multiply(q, p), poses.quaternion_multiply(QUATERNIONS, OTHERS), atol=1e-12)
+    np.testing.assert_allclose(rotations.matrix(q), poses.quaternion_to_matrix(QUATERNIONS), atol=1e-12)
+    np.testing.assert_allclose(rotations.rotate(q, tensor(v)), poses.rotate(QUATERNIONS, v), atol=1e-12)
 
 
 def test_exponential_is_that_of_poses():
-    found = turns.exponential(tensor(VECTORS)).numpy()
+    found = rotations.exponential(tensor(VECTORS)).numpy()
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(poses.rotation_angle(found, QUATERNIONS), 0, atol=1e-7)
 
@@ -32,37 +32,37 @@ def test_exponential_is_that_of_poses():
 def test_a_product_is_one_rotation_after_the_other():
     q, p = tensor(QUATERNIONS), tensor(OTHERS)
     v = tensor(rng.normal(size=(len(QUATERNIONS), 3)))
-    both = turns.rotate(turns.multiply(q, p), v)
-    torch.testing.assert_close(both, turns.rotate(q, turns.rotate(p, v)))
-    torch.testing.assert_close(both, (turns.matrix(q) @ (turns.matrix(p) @ v[..., None]))[..., 0])
+    both = rotations.rotate(rotations.multiply(q, p), v)
+    torch.testing.assert_close(both, rotations.rotate(q, rotations.rotate(p, v)))
+    torch.testing.assert_close(both, (rotations.matrix(q) @ (rotations.matrix(p) @ v[..., None]))[..., 0])
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 3), (4, 2, 3)])
 def test_any_batch(shape):
     vector = torch.randn(*shape, generator=torch.Generator().manual_seed(0))
-    q = turns.exponential(vector)
+    q = rotations.exponential(vector)
     assert q.shape == (*shape[:-1], 4)
-    assert turns.matrix(q).shape == (*shape, 3)
-    assert turns.rotate(q, vector).shape == shape
-    torch.testing.assert_close(turns.rotate(q, vector), vector)  # the axis stays
+    assert rotations.matrix(q).shape == (*shape, 3)
+    assert rotations.rotate(q, vector).shape == shape
+    torch.testing.assert_close(rotations.rotate(q, vector), vector)  # the axis stays
 
 
 def test_exponential_is_smooth_at_zero():
     vector = torch.zeros(4, 3, requires_grad=True)
-    turns.exponential(vector)[:, 1:].sum().backward()
+    rotations.exponential(vector)[:, 1:].sum().backward()
     assert vector.grad is not None
     torch.testing.assert_close(vector.grad, torch.full((4, 3), 0.5))
 
 
 def test_unit_keeps_the_direction():
     q = tensor(QUATERNIONS)
-    torch.testing.assert_close(turns.unit(7.3 * q), q)
+    torch.testing.assert_close(rotations.unit(7.3 * q), q)
 
 
 def test_facing_takes_a_direction_to_x_and_keeps_the_vertical():
     angles = torch.linspace(-3, 3, 7)
     direction = torch.stack([angles.cos(), angles.sin(), torch.zeros(7)], dim=1)
-    frame = turns.facing(direction[:, :2])
+    frame = rotations.facing(direction[:, :2])
     torch.testing.assert_close((frame @ direction[..., None])[..., 0], torch.eye(3)[:1].expand(7, 3), atol=1e-6, rtol=0)
     torch.testing.assert_close(frame @ frame.transpose(1, 2), torch.eye(3).expand(7, 3, 3), atol=1e-6, rtol=0)
     assert torch.equal(frame[:, 2], torch.eye(3)[2].expand(7, 3))

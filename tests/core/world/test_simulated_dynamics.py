@@ -70,17 +70,6 @@ def test_what_the_pusher_walks_past_stays_exactly_where_it_is(start, simulated):
     np.testing.assert_allclose(told.pusher[0], path, atol=1e-12)
 
 
-def test_skipping_free_travel_changes_nothing(world, start, simulated, monkeypatch):
-    actions = np.stack([push(start, name, 2)[:6] for name in NAMES])
-    told = simulated.rollout(start, actions)
-    whole = SimulatedPushes(world.assets)
-    monkeypatch.setattr(whole, "_walks_past", lambda names, action: False)
-    every = whole.rollout(start, actions)
-    whole.close()
-    np.testing.assert_allclose(told.positions, every.positions, atol=2e-3)
-    np.testing.assert_allclose(told.pusher, every.pusher, atol=1e-9)
-
-
 def test_sequences_do_not_influence_each_other(world, start, simulated):
     one = push(start, CAN, 0)
     other = np.resize(push(start, BOX, 0), one.shape)

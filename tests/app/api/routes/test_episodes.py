@@ -8,24 +8,20 @@ import pytest
 
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
-from app.jobs.outcomes import JobStopped, after
 from osfcore.io.image_file import write_png
 from osfcore.io.scene_file import Scene, scene_to_json
-from tests.app.api.routes.test_jobs import LONG
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import until
+from tests.app.conftest import LONG, keep_busy, leave_running, running
 
 BOX = "003_cracker_box"
 
 
 @pytest.fixture
 def busy(service):
-    """A job that keeps its turn, so that nothing that is asked for begins."""
-    job = service.post("/api/jobs", json=LONG).json()
-    until(lambda: service.get(f"/api/jobs/{job['id']}").json()["done"] > 0)
-    service.post(f"/api/jobs/{job['id']}/pause")
+    """A job that keeps its turn."""
+    job = keep_busy(service)
     yield job
-    service.delete(f"/api/jobs/{job['id']}")
+    service.delete(f"/api/jobs/{job}")
 
 
 def poses_of(scene):
@@ -41,13 +37,27 @@ def waiting(service, scene, busy):
     service.delete(f"/api/episodes/{accepted.json()['id']}")
 
 
+@pytest.fixture(scope="module")
+def restarted(library, tmp_path_factory):
+    """A service that had been stopped after an episode's first look, and the episode as it was asked for."""
+    data_dir = tmp_path_factory.mktemp("restarted")
+    with running(library, data_dir) as client:
+        keep_busy(client)
+        scene = client.post("/api/scenes", json={"seed": 1, "objects": [BOX]}).json()
+        episode = client.post("/api/episodes", json={"poses": poses_of(scene)}).json()
+    leave_running(data_dir, episode["id"])
+    with running(library, data_dir) as client:
+        yield client, episode
+
+
 @pytest.fixture
-def interrupted(services, scene, waiting):
-    """As if the service had stopped after the first look."""
-    jobs, name = services.runner.jobs, waiting["id"]
-    folder, record = jobs.folder(name), services.runner.scene(scene["id"])
+def interrupted(restarted):
+    """The client, the episode's name and its folder."""
+    client, episode = restarted
+    runner = client.app.state.services.runner
+    folder, record = runner.jobs.folder(episode["id"]), runner.scene(episode["scene"])
     write_png(folder / FRAMES_FOLDER / "000.png", np.full((HEIGHT, WIDTH, 3), 99, np.uint8))
-    millimetres = {entry["name"]: 1.5 for entry in scene["objects"]}
+    millimetres = dict.fromkeys(episode["objects"], 1.5)
     step = {
         "step": 0,
         "seconds": {"first": 9.5},
@@ -59,8 +69,7 @@ def interrupted(services, scene, waiting):
     }
     notice = {"step": 0, "matter": "lamp", "text": "The lamp was moved."}
     (folder / REPORT_FILE).write_text(json.dumps({"steps": [step], "noticed": [notice]}))
-    jobs._set(after(jobs.get(name), JobStopped(), folder))
-    return name
+    return client, episode["id"], folder
 
 
 def test_an_episode_waits_for_its_turn(service, scene, waiting):
@@ -121,7 +130,7 @@ def test_poses_that_are_none_are_refused_at_once(service, scene):
 )  # fmt: skip
 def test_missing_episodes_and_jobs_of_other_kinds_are_not_found(service, busy, method, tail):
     body = {"json": {"steps": 5}} if method == "patch" else {}
-    for name in ("none", busy["id"]):
+    for name in ("none", busy):
         is_problem(getattr(service, method)(f"/api/episodes/{name}{tail}", **body), 404)
 
 
@@ -154,8 +163,9 @@ def test_orders_reach_the_job(service, services, waiting, monkeypatch):
     assert (settings["steps"], settings["plan"]["samples"]) == (5, 8)  # what is left out stays
 
 
-def test_one_that_was_interrupted_still_shows_what_it_has_done(service, interrupted):
-    address = f"/api/episodes/{interrupted}"
+def test_one_that_was_interrupted_still_shows_what_it_has_done(interrupted):
+    service, name, _ = interrupted
+    address = f"/api/episodes/{name}"
     told = service.get(address).json()
     assert told["status"] == "interrupted"
     assert "the steps until then are kept" in told["error"]
@@ -169,21 +179,22 @@ def test_one_that_was_interrupted_still_shows_what_it_has_done(service, interrup
     is_problem(service.get(f"{address}/frames/0.png?part=other"), 422)
     is_problem(service.get(f"{address}/files/..%2f..%2fservice.sqlite3"), 404)
     is_problem(service.delete(address), 409)
-    (listed,) = [one for one in service.get("/api/episodes").json()["episodes"] if one["id"] == interrupted]
+    (listed,) = [one for one in service.get("/api/episodes").json()["episodes"] if one["id"] == name]
     assert listed == {**told, "steps": [], "notices": []}
 
 
 @pytest.mark.parametrize("report", ["{", '{"steps": [{}]}', '{"steps": [], "noticed": [1]}', '{"steps": [5]}'])
-def test_a_damaged_report_is_told_and_does_not_hide_the_list(service, services, interrupted, report):
-    (services.runner.jobs.folder(interrupted) / REPORT_FILE).write_text(report)
-    detail = is_problem(service.get(f"/api/episodes/{interrupted}"), 409)["detail"]
+def test_a_damaged_report_is_told_and_does_not_hide_the_list(interrupted, report):
+    service, name, folder = interrupted
+    (folder / REPORT_FILE).write_text(report)
+    detail = is_problem(service.get(f"/api/episodes/{name}"), 409)["detail"]
     assert REPORT_FILE in detail
-    assert interrupted in [one["id"] for one in service.get("/api/episodes").json()["episodes"]]
+    assert name in [one["id"] for one in service.get("/api/episodes").json()["episodes"]]
 
 
 def test_its_events_end_with_it(live):
     _, scene = live.request("POST", "/api/scenes", {"seed": 1, "objects": [BOX]})
-    _, running = live.request("POST", "/api/jobs", LONG)
+    _, job = live.request("POST", "/api/jobs", LONG)
     _, episode = live.request("POST", "/api/episodes", {"poses": poses_of(scene)})
     told = []
     with urllib.request.urlopen(f"{live.url}/api/episodes/{episode['id']}/events", timeout=60) as stream:
@@ -194,5 +205,5 @@ def test_its_events_end_with_it(live):
                     live.request("DELETE", f"/api/episodes/{episode['id']}")
     assert {job["id"] for job in told} == {episode["id"]}
     assert (told[0]["state"], told[-1]["state"], told[-1]["kind"]) == ("queued", "cancelled", "episode")
-    live.request("DELETE", f"/api/jobs/{running['id']}")
+    live.request("DELETE", f"/api/jobs/{job['id']}")
     live.request("DELETE", f"/api/scenes/{scene['id']}")

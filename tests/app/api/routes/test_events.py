@@ -86,7 +86,10 @@ def test_nonsense_as_last_number_is_no_matter(live, last):
         stream.next("scene")
 
 
-def test_live_images_come_only_where_asked_for(live, shown):
+def test_live_images_come_only_where_asked_for(live, shown, monkeypatch):
+    runner, changes = live.services.runner, []
+    watch_frames = runner.watch_frames
+    monkeypatch.setattr(runner, "watch_frames", lambda change: (changes.append(change), watch_frames(change)))
     with Stream(live, "?frames=1") as stream:
         _, _, frame = stream.next("frame")
         assert frame["scene"] == shown["id"]
@@ -96,15 +99,15 @@ def test_live_images_come_only_where_asked_for(live, shown):
         live.request("PATCH", f"/api/scenes/{shown['id']}", {"light": {"position": [0, 0, 1]}})
         while frame["revision"] <= shown["revision"]:
             frame = stream.next("frame")[2]
-    until(lambda: live.services.runner._watchers == 0)
+    until(lambda: changes == [1, -1])
 
 
 def test_streams_that_left_are_forgotten(live):
-    before = len(live.services.runner.hub._listeners)
+    before = live.services.runner.hub.subscribers
     for _ in range(20):
         with Stream(live) as stream:
             stream.next("scene")
-    until(lambda: len(live.services.runner.hub._listeners) == before)
+    until(lambda: live.services.runner.hub.subscribers == before)
 
 
 def test_notices_reach_the_page(live):

@@ -59,7 +59,7 @@ def held(service, services, scene):
     """The scene, while a job drives it."""
     job = service.post("/api/jobs", json=LONG).json()
     until(lambda: service.get(f"/api/jobs/{job['id']}").json()["done"] > 0)
-    services.runner.jobs._jobs[job["id"]].params["scene"] = scene["id"]
+    services.runner.jobs.change(job["id"], {"scene": scene["id"]})
     yield scene
     service.delete(f"/api/jobs/{job['id']}")
 

@@ -7,10 +7,11 @@ import pytest
 
 import osfcore.control.closed_loop as core
 from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, RECORDING_FILE, REPORT_FILE, VIDEO_FILE
-from app.jobs.context import JobContext
+from app.jobs.context import JobContext, JobControl
 from app.jobs.job import INPUTS
-from app.jobs.kinds.episodes import EpisodeProgress, _moved, episode_job, settings_of
-from app.jobs.worker import _extras
+from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
+from app.jobs.worker import KINDS, run_job
+from app.processes.job_messages import RunJob
 from app.processes.plan_summary import PlanSketch
 from osfcore.control.events import Acted, Looking, Observed, Planning, Stepped
 from osfcore.errors import InvalidInput
@@ -109,7 +110,14 @@ def test_what_is_told_rises_and_names_every_part_of_the_loop(place, stage, sight
 def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
     for step in episode_job(params(stage), place):
         assert step.must_be_told == (step.seen is not None and not isinstance(step.seen, Looking))
-        assert {*_extras(step)} == {"stage", "steps", "outcome", "text"}
+
+
+def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
+    told = []
+    steps = [EpisodeProgress(1, 2, "Pushing", stage="act", steps=1)]
+    monkeypatch.setitem(KINDS, "episode", lambda _params, _place: iter(steps))
+    run_job(RunJob("episode", {}, place.data_dir, place.folder), JobControl(told.append), told.append)
+    assert told[0].result == {"stage": "act", "steps": 1, "outcome": None, "text": None}
 
 
 def test_the_report_is_there_after_every_round(place, stage, sighted):  # noqa: F811
@@ -134,13 +142,15 @@ def test_where_nobody_knows_the_true_goal_nothing_is_said_of_it(place, stage, si
 @pytest.mark.parametrize(
     ("shift", "turn", "moved"), [(0, 0, ()), (0.003, 0, ()), (0.01, 0, NAMES[1:]), (0, 1, NAMES[1:])]
 )
-def test_an_object_that_stays_did_not_have_to_move(stage, shift, turn, moved):  # noqa: F811
+def test_an_object_that_stays_did_not_have_to_move(place, stage, sighted, shift, turn, moved):  # noqa: F811
     start = stage.world.truth()
     places, turns = start.poses.position.copy(), start.poses.quaternion.copy()
     places[1, 0] += shift
     turns[1] = quaternion_multiply(quaternion_exp(np.array([0, 0, float(turn)])), turns[1])
-    assert _moved(start, replace(start, poses=Pose(places, -turns))) == tuple(moved)
-    assert _moved(start, None) == ()
+    truth = entries(replace(start, poses=Pose(places, -turns)))
+    with contextlib.closing(episode_job(params(stage, truth=truth), place)) as steps:
+        next(step for step in steps if step.ends_round)
+    assert report_of(place)["moved"] == list(moved)
 
 
 def test_settings_may_change_on_the_way(place, stage, sighted):  # noqa: F811

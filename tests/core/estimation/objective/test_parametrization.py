@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import orthogonal_basis, quaternion_exp, quaternion_multiply, rotation_angle
-from osfcore.geometry.states import SceneState
 from tests.core.estimation.scenes import angle
 
 SEEDS = st.integers(0, 10**6)
@@ -41,7 +40,7 @@ def test_whatever_the_change_it_leads_to_a_scene(seed, size):
     np.testing.assert_allclose(np.linalg.norm(batch.lights, axis=-1), 1, atol=1e-12)
     for light in batch.lights:
         Light(light)
-    assert isinstance(guess.updated(size * rng.normal(size=guess.size)).state(), SceneState)
+    guess.updated(size * rng.normal(size=guess.size)).state()
 
 
 @pytest.mark.parametrize("elevation_deg", [5.0, 5.5, 20.0])

@@ -2,8 +2,7 @@ import numpy as np
 
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.experiments.benchmarks import rollouts as bench_dynamics
-from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, bench_rollouts, rollout_rate
-from osfcore.geometry.rollouts import check_actions
+from osfcore.experiments.benchmarks.rollouts import bench_rollouts, rollout_rate
 from tests.core.experiments.pushes import shapes
 
 
@@ -15,9 +14,3 @@ def test_rollouts_are_timed_in_a_scene_where_most_paths_meet_something(monkeypat
     assert np.isclose(costs.rollout_steps_per_s, 400 / costs.rollout_s)
     assert costs.touched_share > 0.3
     assert rollout_rate(PropagationNetwork(8, 1), shapes()) > 0
-
-
-def test_paths_are_actions():
-    actions = bench_dynamics._paths(np.random.default_rng(0))
-    assert check_actions(actions).shape == (1000, 10, 3)
-    assert len(BENCH_NAMES) == 3

@@ -8,6 +8,7 @@ from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from osfcore.geometry.states import SceneState
+from osfcore.world.collection.policies import DirectedPolicy
 from tests.core.experiments.solids import SOLIDS
 
 CAMERAS = default_cameras(32)[:2]
@@ -66,15 +67,21 @@ def test_an_episode_is_the_same_for_the_same_draw(draw, library, pushes):
 
 
 def test_pushes_that_move_nothing_are_drawn_again(draw, library, monkeypatch):
-    real, calls = module._pushes, []
+    made = []
 
-    def lazy(world, state, rng, steps):
-        calls.append(1)
-        return [state] * steps if len(calls) < 3 else real(world, state, rng, steps)
+    class Lazy(DirectedPolicy):
+        """The first two rest."""
 
-    monkeypatch.setattr(module, "_pushes", lazy)
+        def __init__(self, *args):
+            super().__init__(*args)
+            made.append(self)
+
+        def action(self, state):
+            return np.zeros(3) if len(made) < 3 else super().action(state)
+
+    monkeypatch.setattr(module, "DirectedPolicy", Lazy)
     found = episode(draw, library, CAMERAS[:1])
-    assert found.redrawn == len(calls) - 1 >= 2
+    assert found.redrawn == len(made) - 1 >= 2
     assert max(found.moved_m) >= 0.05
 
 

@@ -183,7 +183,7 @@ def test_weights_may_come_without_metrics(solids, tmp_path):
     for metrics in (None, "[]", '{"minutes": "many"}', "{", f'{{"minutes": {10**400}}}', "[" * 100_000):
         if metrics is not None:
             bare.with_suffix(".json").write_text(metrics)
-        figures = module._field_figures(module.TaskResult({**_figures(), "images": 1}, ()), bare)
+        figures = field_figures(module.TaskResult({**_figures(), "images": 1}, ()), bare)
         assert figures.minutes is None
 
 

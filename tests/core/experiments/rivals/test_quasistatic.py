@@ -5,7 +5,7 @@ import torch
 from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.shapes.object_shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
 from osfcore.experiments.rivals.quasistatic import push
-from osfcore.geometry import torch_rotations as turns
+from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import circle, gap_between, gap_to_point
 from osfcore.geometry.poses import quaternion_exp
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
@@ -46,7 +46,7 @@ def pushed(placed, shifts, pusher=(0.0, 0.0)):
 
 def outline_of(kind, motion, slot) -> torch.Tensor:
     flat = torch.nn.functional.pad(circle(64), (0, 1))
-    rotation = turns.matrix(motion.quaternion[:, slot])
+    rotation = rotations.matrix(motion.quaternion[:, slot])
     around = TABLE.farthest(torch.tensor([NUMBERS[kind]]), rotation, flat)[..., :2]
     return around + motion.centre[:, None, slot, :2]
 

@@ -103,10 +103,10 @@ def test_corners_lie_where_the_box_ends(teacher):
 def test_proposals_follow_the_network(teacher):
     hull = teacher.snapshot()
     uniform(teacher.osf, 1e-6)
-    teacher._bake()
+    teacher.update_proposal()
     assert teacher.snapshot() is hull, "where nothing is found, everything is still looked at"
     uniform(teacher.osf, 2 / hull.voxel)
-    teacher._bake()
+    teacher.update_proposal()
     dense = KiloQuery(teacher.snapshot()).sigma(torch.from_numpy(teacher.snapshot().density)) * hull.voxel
     inside = hull.density > FLOOR_G
     np.testing.assert_allclose(dense.numpy()[inside], 2, rtol=1e-2)
