@@ -20,13 +20,7 @@ settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 CACHE = Path(__file__).parents[1] / ".cache"
-TEST_OBJECTS = (
-    "003_cracker_box",
-    "005_tomato_soup_can",
-    "006_mustard_bottle",
-    "009_gelatin_box",
-    "035_power_drill",
-)
+TEST_OBJECTS = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box", "035_power_drill")
 
 
 def _objects_key() -> str:

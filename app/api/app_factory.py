@@ -20,9 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from app.api import problems, relay
 from app.api.dependencies import Services, Shelf
 from app.api.http_metrics import Metrics, MetricsMiddleware
-from app.api.routes import (
-    comparisons as neural,
-)
+from app.api.routes import comparisons as neural
 from app.api.routes import (
     driver,
     episodes,

@@ -72,10 +72,7 @@ class ProblemResponse(JSONResponse):
 
 
 def problem(
-    status: int,
-    detail: str,
-    pointers: list[ProblemPointer] | None = None,
-    headers: dict[str, str] | None = None,
+    status: int, detail: str, pointers: list[ProblemPointer] | None = None, headers: dict[str, str] | None = None
 ) -> ProblemResponse:
     """A problem response."""
     # Lone surrogates come in through JSON escapes, but no UTF-8 goes out with them.

@@ -246,12 +246,7 @@ class Runner:
         return self._change(ResetScene(scene))
 
     def edit_scene(
-        self,
-        scene: str,
-        light: Light | None = None,
-        poses: tuple[tuple[str, Pose], ...] = (),
-        *,
-        settle: bool = False,
+        self, scene: str, light: Light | None = None, poses: tuple[tuple[str, Pose], ...] = (), *, settle: bool = False
     ) -> SceneRecord:
         """Move light and objects by hand, all or nothing.
 

@@ -34,8 +34,7 @@ class PropagationNetwork(nn.Module):
         self.edge_propagators = nn.ModuleList(_two_layers(3 * hidden, hidden) for _ in range(steps))
         self.node_propagators = nn.ModuleList(_two_layers(3 * hidden, hidden) for _ in range(steps))
         self.decoder = nn.Sequential(
-            *(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU()),
-            nn.Linear(hidden, MOTION),
+            *(nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU()), nn.Linear(hidden, MOTION)
         )
 
     def forward(

@@ -37,10 +37,7 @@ class PushModel:
     """
 
     def __init__(
-        self,
-        network: PropagationNetwork,
-        shapes: Mapping[str, ObjectShape],
-        device: torch.device | str = "cpu",
+        self, network: PropagationNetwork, shapes: Mapping[str, ObjectShape], device: torch.device | str = "cpu"
     ) -> None:
         if not shapes:
             raise InvalidInput("number of objects", 0, "at least 1")

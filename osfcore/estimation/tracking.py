@@ -211,11 +211,7 @@ class _Tracker:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Gauss-Newton from coarse to fine images."""
         e = self._config
-        for views, sweeps in (
-            (self._rough, e.rough_sweeps),
-            (self._coarse, e.sweeps),
-            (self._middle, e.fine_sweeps),
-        ):
+        for views, sweeps in ((self._rough, e.rough_sweeps), (self._coarse, e.sweeps), (self._middle, e.fine_sweeps)):
             at = replace(
                 at, dampings=GaussNewtonState.at(at.guess).dampings
             )  # old ones tell nothing of where it is now

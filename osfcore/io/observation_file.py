@@ -23,15 +23,7 @@ from PIL import Image
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName, finite_vector, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import MAX_OBJECTS, Observation
-from osfcore.io.files import (
-    as_mapping,
-    entry_of,
-    is_text,
-    list_of,
-    read_json,
-    reading_png,
-    write_json,
-)
+from osfcore.io.files import as_mapping, entry_of, is_text, list_of, read_json, reading_png, write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.scene_file import camera_from_json, camera_to_json
 

@@ -127,12 +127,7 @@ class Planner:
             self._last = np.concatenate([self._last[count:], np.zeros((min(count, len(self._last)), 3))])
 
     def plan(
-        self,
-        state: SceneState,
-        goal: PoseGoal,
-        cost: Cost,
-        rng: np.random.Generator,
-        before: SceneState | None = None,
+        self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None = None
     ) -> Iterator[PlanRound]:
         """Two rounds; the actions of the last one are the plan.
 

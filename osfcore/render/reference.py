@@ -207,11 +207,7 @@ def _intersect_table(table: TableField | None, rays_o: Tensor, rays_d: Float[Ten
 
 
 def _march(
-    placed: _Placed,
-    rays_o: Float[Tensor, "R 3"],
-    rays_d: Float[Tensor, "R 3"],
-    far: Float[Tensor, "R"],
-    step: float,
+    placed: _Placed, rays_o: Float[Tensor, "R 3"], rays_d: Float[Tensor, "R 3"], far: Float[Tensor, "R"], step: float
 ) -> Iterator[tuple[Float[Tensor, "R"], Float[Tensor, "R"]]]:
     """Ray marching within an object's extent: yields distances of the next samples, and which rays have one there."""
     safe = torch.where(rays_d.abs() < 1e-9, 1e-9, rays_d)

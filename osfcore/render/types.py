@@ -90,11 +90,7 @@ class SceneBatch:
         """One scene as a batch."""
         pusher = None if state.pusher is None else state.pusher[None]
         return SceneBatch(
-            state.names,
-            state.poses.position[None],
-            state.poses.quaternion[None],
-            state.light.direction[None],
-            pusher,
+            state.names, state.poses.position[None], state.poses.quaternion[None], state.light.direction[None], pusher
         )
 
 

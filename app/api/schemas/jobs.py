@@ -105,8 +105,7 @@ class TrainFieldJob(Input):
 
 
 JobIn = Annotated[
-    CollectPushesJob | CollectObjectJob | CollectTableJob | FetchAssetsJob | TrainFieldJob,
-    Field(discriminator="kind"),
+    CollectPushesJob | CollectObjectJob | CollectTableJob | FetchAssetsJob | TrainFieldJob, Field(discriminator="kind")
 ]
 
 

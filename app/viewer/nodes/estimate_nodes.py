@@ -151,14 +151,7 @@ class EstimateNodes:
             return name
 
     def _copies(
-        self,
-        path: str,
-        mesh: Mesh,
-        count: int,
-        *,
-        colour: Colour = _TRIED,
-        opacity: float = 0.2,
-        is_wire: bool = False,
+        self, path: str, mesh: Mesh, count: int, *, colour: Colour = _TRIED, opacity: float = 0.2, is_wire: bool = False
     ) -> viser.BatchedMeshHandle:
         return add_ghosts(
             self._scene,

@@ -99,10 +99,7 @@ def octahedral_directions(side: int) -> Float[np.ndarray, "D 3"]:
     u = (np.arange(side) + 0.5) / side * 2 - 1
     x, y = np.meshgrid(u, u, indexing="ij")
     z = 1 - np.abs(x) - np.abs(y)
-    x, y = (
-        np.where(z < 0, (1 - np.abs(y)) * np.sign(x), x),
-        np.where(z < 0, (1 - np.abs(x)) * np.sign(y), y),
-    )
+    x, y = (np.where(z < 0, (1 - np.abs(y)) * np.sign(x), x), np.where(z < 0, (1 - np.abs(x)) * np.sign(y), y))
     d = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 

@@ -134,10 +134,7 @@ def _ranges(first: Int[Tensor, "B"], count: Int[Tensor, "B"]) -> Int[Tensor, "R"
 
 
 def samples(
-    recording: Recording,
-    table: ShapeTable,
-    device: torch.device | str = "cpu",
-    others: Iterable[Substeps] = (),
+    recording: Recording, table: ShapeTable, device: torch.device | str = "cpu", others: Iterable[Substeps] = ()
 ) -> Samples:
     """Every substep of a recording of windows of one action, and others."""
     pieces = itertools.chain(_recorded(recording), others)

@@ -26,14 +26,7 @@ from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
-from osfcore.experiments.estimation.scores import (
-    FrameScore,
-    TrackScore,
-    flags,
-    pose_errors,
-    refused_frame,
-    score_frame,
-)
+from osfcore.experiments.estimation.scores import FrameScore, TrackScore, flags, pose_errors, refused_frame, score_frame
 from osfcore.experiments.estimation.scores import is_right as is_right_pose
 from osfcore.experiments.estimation.spoiled_inputs import FIRST_SCENE, BadCase, BadScore, bad_case
 from osfcore.experiments.estimation.tasks import STEPS, Frame, episode, first_frame, goals

@@ -71,13 +71,7 @@ def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tup
 
 
 def _shove(
-    motion: Motion,
-    outline: Tensor,
-    arm: Tensor,
-    pair: tuple[int, int],
-    before: Tensor,
-    pushed: Tensor,
-    radius: Tensor,
+    motion: Motion, outline: Tensor, arm: Tensor, pair: tuple[int, int], before: Tensor, pushed: Tensor, radius: Tensor
 ) -> tuple[Motion, Tensor]:
     """Object j out of the way of a pushed object i; marks it as pushed."""
     i, j = pair

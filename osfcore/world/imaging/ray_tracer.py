@@ -88,12 +88,7 @@ class RayTracer:
         self._executor = executor
 
     def render(
-        self,
-        state: SceneState,
-        cameras: tuple[Camera, ...],
-        *,
-        samples: int | None = None,
-        sharp: bool = False,
+        self, state: SceneState, cameras: tuple[Camera, ...], *, samples: int | None = None, sharp: bool = False
     ) -> tuple[Picture, ...]:
         """Trace the state from each camera.
 

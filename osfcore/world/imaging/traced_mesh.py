@@ -71,10 +71,7 @@ class TracedMesh:
         return self._scene.run(origins, directions, query="OCCLUDED") >= 0
 
     def surface(
-        self,
-        faces: Int[np.ndarray, "S"],
-        barycentric: Float[np.ndarray, "S 2"],
-        directions: Float[np.ndarray, "S 3"],
+        self, faces: Int[np.ndarray, "S"], barycentric: Float[np.ndarray, "S 2"], directions: Float[np.ndarray, "S 3"]
     ) -> Surface:
         """Interpolated normals and texture coordinates at hits of rays with these directions."""
         u, v = barycentric[:, :1], barycentric[:, 1:]

@@ -239,12 +239,7 @@ def is_as_it_was(director, record):
 
 @pytest.mark.parametrize(
     ("asked", "moved"),
-    [
-        ({}, 0),
-        ({"poses": (BOX,)}, 1),
-        ({"seed": 3, "moved": 2}, 2),
-        ({"light": Light(np.array([1.0, 0, 1]))}, 0),
-    ],
+    [({}, 0), ({"poses": (BOX,)}, 1), ({"seed": 3, "moved": 2}, 2), ({"light": Light(np.array([1.0, 0, 1]))}, 0)],
 )
 def test_a_goal_is_composed_and_the_scene_and_its_time_stay(director, used, asked, moved):
     start = used.state

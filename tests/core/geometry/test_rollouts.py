@@ -47,8 +47,7 @@ def test_one_sequence_alone_is_a_future_by_itself(count, objects, data):
     k = data.draw(st.integers(0, count - 1))
     rng = np.random.default_rng(0)
     told = Rollouts(
-        tuple("abc"[:objects]),
-        *(rng.normal(size=(count, 5, *rest)) for rest in ((objects, 3), (objects, 4), (3,))),
+        tuple("abc"[:objects]), *(rng.normal(size=(count, 5, *rest)) for rest in ((objects, 3), (objects, 4), (3,)))
     )
     alone = told[k]
     assert alone.names == told.names

@@ -13,13 +13,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.io.scene_file import Scene, read_scene, scene_to_json
-from osfcore.io.state_file import (
-    estimated_from_json,
-    estimated_to_json,
-    is_estimated,
-    read_estimated,
-    write_estimated,
-)
+from osfcore.io.state_file import estimated_from_json, estimated_to_json, is_estimated, read_estimated, write_estimated
 
 numbers = st.floats(-10, 10)
 deviations = st.floats(0, 10) | st.just(float("inf"))

@@ -31,11 +31,7 @@ def test_light_and_pusher_may_be_missing():
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"quaternion": [1, 1, 0, 0]}, "quaternion"),
-        ({"quaternion": [0, 0, 0, 0]}, "quaternion"),
-    ],
+    ("changed", "words"), [({"quaternion": [1, 1, 0, 0]}, "quaternion"), ({"quaternion": [0, 0, 0, 0]}, "quaternion")]
 )
 def test_quaternions_are_unit(changed, words):
     with pytest.raises(InvalidInput, match=words):

@@ -146,11 +146,7 @@ def test_a_bad_state_is_told_in_one_sentence(files, data_dir, capsys, change, wo
 
 @pytest.mark.parametrize(
     ("more", "words"),
-    [
-        (["--camera", "nowhere"], "goal"),
-        (["--sequence", "2"], "between 0 and 1"),
-        (["--device", "cuda"], "cuda"),
-    ],
+    [(["--camera", "nowhere"], "goal"), (["--sequence", "2"], "between 0 and 1"), (["--device", "cuda"], "cuda")],
 )
 def test_bad_options_are_told_before_anything_is_written(files, data_dir, capsys, more, words):
     folder, _ = files
