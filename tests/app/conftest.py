@@ -18,7 +18,7 @@ from app.services.service_settings import Settings
 from app.storage.database import Store
 
 LOCALHOST = "http://localhost"
-LONG = {"kind": "collect_table", "params": {"images": 5000, "size": 16, "seed": 0}}
+LONG = {"kind": "collect_pushes", "params": {"episodes": 100_000, "steps": 2, "objects": 1}}
 
 
 def until(condition, timeout_s=20.0):

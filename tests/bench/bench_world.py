@@ -21,7 +21,8 @@ from osfcore.geometry.cameras import default_cameras
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
 from osfcore.world.imaging.tiny_renderer import TinyScene
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 from tests.bench.machine import machine
 
 

@@ -19,7 +19,8 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import to_uint8
 from osfcore.planning.pose_cost import PoseGoal
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 CAN, BOX = NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 SIDE = 32

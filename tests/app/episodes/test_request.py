@@ -9,12 +9,13 @@ from PIL import Image
 
 from app.episodes import request as orders
 from app.episodes.request import EpisodeOrder, read_goal
-from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, NoRoom, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, NoRoom, OsfError, UnknownName
 from osfcore.experiments.estimation.tasks import SHIFT_M
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, goal_camera
 from osfcore.world import goal_layouts
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box", "006_mustard_bottle")
 
@@ -162,4 +163,6 @@ def test_a_refusal_leaves_no_simulation_behind(order, tmp_path, monkeypatch, cha
         changes = {"goal": tmp_path / changes["goal"]}
     with pytest.raises((InvalidInput, CorruptFile)):
         orders.given(replace(order, **changes))
-    assert_closed(worlds)
+    (world,) = worlds
+    with pytest.raises(OsfError, match="table is empty"):
+        world.truth()

@@ -11,7 +11,8 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotation_angle
 from osfcore.objects.catalogue import DEFAULT_NAMES
 from osfcore.world.goal_layouts import random_goal
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 from tests.app.storage.test_database import record
 
 STAYS_M, STAYS_RAD = 0.003, 0.05  # putting everything back to rest may shift it this much

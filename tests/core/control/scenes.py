@@ -10,7 +10,8 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset import Symmetry
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 GELATIN, CAN = NAMES = ("009_gelatin_box", "005_tomato_soup_can")
 LIGHT = Light.from_angles(0.8, 0.7)

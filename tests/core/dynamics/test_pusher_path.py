@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.world.collection.collect_pushes import SUBSTATES
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 speeds = st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), min_size=1, max_size=20)
 starts = st.tuples(st.floats(-PUSHER_REACH_M, PUSHER_REACH_M), st.floats(-PUSHER_REACH_M, PUSHER_REACH_M))

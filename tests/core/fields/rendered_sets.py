@@ -9,7 +9,7 @@ from PIL import Image
 
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table_field import TableField
-from osfcore.fields.training.kiloosf_training import Recipe
+from osfcore.fields.training.recipes import Recipe
 from osfcore.geometry.cameras import Camera
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch

@@ -8,7 +8,8 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.world import goal_layouts
 from osfcore.world.goal_layouts import arranged_goal, random_goal
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 CAN, BOX, BOTTLE = NAMES = ("005_tomato_soup_can", "009_gelatin_box", "006_mustard_bottle")
 

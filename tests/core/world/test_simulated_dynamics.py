@@ -4,8 +4,9 @@ import pytest
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import rotation_angle
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
+from osfcore.world.scene_request import SceneRequest
 from osfcore.world.simulated_dynamics import SimulatedPushes
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.tabletop import Tabletop
 
 BOX, CAN, GELATIN = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box")
 

@@ -7,7 +7,8 @@ from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 ACTIONS = np.column_stack([np.random.default_rng(0).uniform(-0.3, 0.3, (15, 2)), np.zeros(15)])
 
@@ -178,10 +179,6 @@ def test_hand_moves_are_checked(world):
     for place in ([0.61, 0, 0.1], [0, 100, 0.1], [0, 0, -50], [0, 0, -0.75], [0, 0, 1.1]):
         with pytest.raises(InvalidInput, match="over the table"):
             world.move_object(world.names[0], Pose(np.array(place), np.array([1.0, 0, 0, 0])))
-    with pytest.raises(InvalidInput):
-        world.move_pusher(np.array([0.5, 0, 0]))
-    with pytest.raises(OverlappingObjects):
-        world.move_pusher(world.truth().poses.position[0])
 
 
 def test_gaps_are_to_the_nearest_object_and_end_at_five_centimetres(library):
@@ -213,7 +210,7 @@ def test_light_changes_the_picture_and_nothing_else(world):
 
 
 def test_goal_view_can_leave_the_pusher_out(world):
-    world.move_pusher(np.array([0.0, 0.3, 0]))
+    world.load(replace(world.truth(), pusher=np.array([0.0, 0.3, PUSHER_CENTRE_Z_M])))
     view = (goal_camera(64),)
     with_it, without = world.render(view), world.render(view, with_pusher=False)
     assert without.pusher is None

@@ -16,9 +16,9 @@ from osfcore.io.files import write_json
 from osfcore.io.observation_file import read_observation, write_observation
 from osfcore.io.state_file import estimated_from_json, read_estimated
 from osfcore.objects.asset_library import AssetLibrary
-from tests.app.api.routes.test_jobs import LONG, finished
+from tests.app.api.routes.test_jobs import finished
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import running, until
+from tests.app.conftest import LONG, running, until
 from tests.app.services.test_image_sets import zipped
 
 MUSTARD = "006_mustard_bottle"

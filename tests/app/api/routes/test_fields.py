@@ -7,9 +7,9 @@ import shutil
 import pytest
 from PIL import Image
 
-from tests.app.api.routes.test_jobs import LONG, finished
+from tests.app.api.routes.test_jobs import finished
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import running, until
+from tests.app.conftest import LONG, running, until
 from tests.app.services.test_image_sets import zipped
 from tests.core.fields.sets import write_set
 

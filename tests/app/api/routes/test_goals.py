@@ -12,9 +12,8 @@ from app.api.app_factory import create_app
 from app.services.service_settings import Settings
 from osfcore.geometry.cameras import goal_camera
 from osfcore.io.scene_file import camera_to_json
-from tests.app.api.routes.test_jobs import LONG
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import until
+from tests.app.conftest import LONG, until
 from tests.app.services.test_goals import photo
 
 BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"

@@ -6,10 +6,9 @@ import h5py
 import pytest
 
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import until
+from tests.app.conftest import LONG, until
 
 TABLE = {"kind": "collect_table", "params": {"images": 60, "size": 16}}
-LONG = {"kind": "collect_pushes", "params": {"episodes": 100_000, "steps": 2, "objects": 1}}
 
 
 def finished(service, address, timeout_s=60):

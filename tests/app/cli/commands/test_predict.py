@@ -14,7 +14,8 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import Scene, scene_to_json
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 

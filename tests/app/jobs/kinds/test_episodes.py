@@ -115,7 +115,7 @@ def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     told = []
     steps = [EpisodeProgress(1, 2, "Pushing", stage="act", steps=1)]
-    monkeypatch.setitem(KINDS, "episode", lambda _params, _place: iter(steps))
+    monkeypatch.setitem(KINDS, "episode", lambda _params, _place: (step for step in steps))
     run_job(RunJob("episode", {}, place.data_dir, place.folder), JobControl(told.append), told.append)
     assert told[0].result == {"stage": "act", "steps": 1, "outcome": None, "text": None}
 

@@ -9,7 +9,8 @@ from app.processes.scene_messages import Act, ObserveScene, SceneRecord, TakeVie
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.io.observation_file import write_observation
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 SIDE = 32

@@ -9,7 +9,8 @@ from safetensors.torch import load
 from osfcore.dynamics.network_weights import read_network
 from osfcore.dynamics.training import network_training as training
 from osfcore.dynamics.training.holdout import is_held_out_pair
-from osfcore.dynamics.training.network_training import TrainDynamics, distance, train_dynamics, validate
+from osfcore.dynamics.training.network_training import TrainDynamics, train_dynamics
+from osfcore.dynamics.training.validation import distance, validate
 from osfcore.dynamics.training.windows import batch, record
 from osfcore.dynamics.unroll import unroll
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput

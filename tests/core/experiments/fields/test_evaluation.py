@@ -7,14 +7,8 @@ import pytest
 
 import osfcore.experiments.fields.evaluation as module
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.fields.evaluation import (
-    EvaluateFields,
-    EvaluateSet,
-    FieldFigures,
-    FieldsReport,
-    evaluate_fields,
-    evaluate_set,
-)
+from osfcore.experiments.fields.evaluation import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
+from osfcore.experiments.fields.report import FieldFigures, FieldsReport
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.field_weights import read_field, write_field
 from osfcore.objects.asset_library import AssetLibrary
@@ -183,7 +177,7 @@ def test_weights_may_come_without_metrics(solids, tmp_path):
     for metrics in (None, "[]", '{"minutes": "many"}', "{", f'{{"minutes": {10**400}}}', "[" * 100_000):
         if metrics is not None:
             bare.with_suffix(".json").write_text(metrics)
-        figures = field_figures(module.TaskResult({**_figures(), "images": 1}, ()), bare)
+        figures = module.field_figures(module.TaskResult({**_figures(), "images": 1}, ()), bare)
         assert figures.minutes is None
 
 

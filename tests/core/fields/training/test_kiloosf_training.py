@@ -13,7 +13,8 @@ import pytest
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.fields.field_weights import read_field
 from osfcore.fields.training import kiloosf_training as training
-from osfcore.fields.training.kiloosf_training import TrainField, train_field
+from osfcore.fields.training.kiloosf_training import train_field
+from osfcore.fields.training.recipes import TrainField
 from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set, write_table_set
 from tests.core.render.scenes import plain_table
 

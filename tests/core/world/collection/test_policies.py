@@ -3,7 +3,8 @@ import pytest
 
 from osfcore.geometry.workspace import MAX_SPEED_M_S, check_action
 from osfcore.world.collection.policies import DirectedPolicy, PaperPolicy
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 
 def run(library, policy_name: str, seeds: range) -> float:
