@@ -81,6 +81,7 @@ def test_the_same_seed_gives_the_same_estimate(models, truth):
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
+@pytest.mark.slow
 def test_one_view_and_the_pusher_in_it(models):
     state = scene({BOX: lying(models, BOX, 30, 0.0, -0.03)}, (-0.4, 0.2, 0.8), np.array([0.0, 0.12, 0.062]))
     last = steps_of(models, observe(models, state, default_cameras(96)[:1]))[-1]
@@ -91,6 +92,7 @@ def test_one_view_and_the_pusher_in_it(models):
     np.testing.assert_array_equal(last.estimate.state.pusher, state.pusher)
 
 
+@pytest.mark.slow
 def test_a_light_held_overhead_stays_there(models):
     state = scene({BOX: lying(models, BOX, 30, 0.0, -0.03)}, (0, 0, 1.0))
     steps = steps_of(models, observe(models, state, default_cameras(64)[:2]), replace(QUICK, light="overhead"))
@@ -104,6 +106,7 @@ def test_a_light_held_overhead_stays_there(models):
     assert done[-1] == steps[-1].progress.total
 
 
+@pytest.mark.slow
 def test_cma_alone_moves_the_light(models, small, truth):
     steps = steps_of(models, small, replace(LEAST, light="cma", joint_generations=4))
     assert "light" not in [step.stage for step in steps]
@@ -136,6 +139,7 @@ def test_masks_that_are_empty_in_every_view_are_refused(models, seen):
         next(estimate_first(models, replace(seen, masks=masks), np.random.default_rng(0)))
 
 
+@pytest.mark.slow
 def test_a_mask_of_one_pixel_is_an_estimate_not_to_be_trusted(models, small):
     masks = small.masks.copy()
     row, column = np.argwhere(masks[0, 1])[0]

@@ -37,6 +37,7 @@ def steps(models, seen, truth):
     return steps_of(models, seen, truth)
 
 
+@pytest.mark.slow
 def test_a_pushed_object_is_found_from_one_view(steps, pushed):
     estimate = steps[-1].estimate
     shift, turn, light = apart(estimate.state, pushed)
@@ -56,6 +57,7 @@ def check_progress(steps):
     assert steps[-1].stage == "done"
 
 
+@pytest.mark.slow
 def test_progress_goes_on_to_its_end(steps):
     check_progress(steps)
 

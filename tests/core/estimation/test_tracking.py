@@ -58,6 +58,7 @@ def test_what_a_push_moved_far_is_followed(models, truth):
     assert estimate.trusted
 
 
+@pytest.mark.slow
 def test_what_fell_over_is_found_lying_in_another_way(models, truth):
     fallen = lying(models, truth.names[0], 0, 0.05, -0.08)
     position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
@@ -69,6 +70,7 @@ def test_what_fell_over_is_found_lying_in_another_way(models, truth):
     assert np.rad2deg(turn).max() < 4
 
 
+@pytest.mark.slow
 def test_what_was_taken_the_wrong_way_round_is_turned(models, truth):
     wrong = pushed(truth, (0.0, 0.0), np.pi)
     estimate = followed(models, truth, wrong)[-1].estimate

@@ -46,6 +46,7 @@ def test_symmetries_map_the_mesh_onto_itself(name, ycb_folder):
         assert np.percentile(distance, 95) < 0.004, rotation  # vertices lie 2 mm apart, the brick is skewed by 2 mm
 
 
+@pytest.mark.slow
 def test_a_turn_that_is_no_symmetry_shows(ycb_folder):
     from scipy.spatial import KDTree
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
@@ -217,7 +220,7 @@ def test_goal_view_can_leave_the_pusher_out(world):
     assert np.abs(with_it.images - without.images).max() > 0.1
 
 
-@pytest.mark.parametrize("size", [16, 333, 1024])
+@pytest.mark.parametrize("size", [16, 333, pytest.param(1024, marks=pytest.mark.slow)])
 def test_any_size_up_to_1024(world, size):
     assert world.render((goal_camera(size),)).images.shape == (1, size, size, 3)
 

@@ -36,6 +36,7 @@ def ran(library, tmp_path_factory):
     return Ran(tmp_path_factory.mktemp("episode"), library)
 
 
+@pytest.mark.slow
 def test_the_last_line_is_the_report_without_its_steps(ran):
     assert ran.code == 0
     told = json.loads(ran.lines[-1])
@@ -45,10 +46,12 @@ def test_the_last_line_is_the_report_without_its_steps(ran):
     assert "Traceback" not in ran.told
 
 
+@pytest.mark.slow
 def test_nothing_else_is_on_stdout(ran):
     assert len(ran.lines) == 1
 
 
+@pytest.mark.slow
 def test_the_report_tells_what_was_asked_and_done(ran):
     report, settings = ran.report, ran.report["settings"]
     assert (report["seed"], report["objects"], report["moved"]) == (0, [BOX], [BOX])
@@ -61,6 +64,7 @@ def test_the_report_tells_what_was_asked_and_done(ran):
     assert report["seconds"] > 0
 
 
+@pytest.mark.slow
 def test_every_step_has_its_times_offsets_and_truth(ran):
     steps = ran.report["steps"]
     assert [step["step"] for step in steps] == [0, 1, 2]
@@ -75,6 +79,7 @@ def test_every_step_has_its_times_offsets_and_truth(ran):
     assert steps[-1]["truly_to_goal_mm"][BOX] == pytest.approx(ran.report["score"]["moved_mm"], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_every_step_has_a_row_and_a_frame(ran):
     count = len(ran.report["steps"])
     with (ran.out / "steps.csv").open(newline="") as file:
@@ -87,6 +92,7 @@ def test_every_step_has_a_row_and_a_frame(ran):
     video.release()
 
 
+@pytest.mark.slow
 def test_everything_lies_in_the_folder_and_nothing_else(ran):
     names = {"report.json", "steps.csv", "goal.png", "frames", "video.mp4", "episode.viser"}
     assert {path.name for path in ran.out.iterdir()} == names

@@ -20,6 +20,7 @@ def image_set(tmp_path_factory):
     return write_set(tmp_path_factory.mktemp("set") / "egg", train=24, size=48)
 
 
+@pytest.mark.slow
 def test_a_field_is_written_with_what_it_reaches(image_set, tmp_path, capsys):
     out = tmp_path / "egg.safetensors"
     result = TrainFieldCommand(image_set, out, minutes=0.05, device="cpu").run()

@@ -58,6 +58,7 @@ def test_losses_fall_within_each_part_and_the_count_is_known(models, truth, view
     assert np.all(np.diff(rough) <= 0)
 
 
+@pytest.mark.slow
 def test_what_nobody_sighted_stays_away(models, truth, views, empty):
     matches = [sightings_at(truth, (0, 0, 0))[0], TemplateMatches(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
     guess, _ = list(assemble_scene(models, *views, empty, matches))[-1]

@@ -35,6 +35,7 @@ def test_every_kind_of_estimate_is_timed(solids, library, oracle):
     assert result["next_s_p90"] >= result["next_s"]
 
 
+@pytest.mark.slow
 def test_the_scenes_are_the_same_every_time(solids, library, oracle):
     for _ in range(2):
         list(bench_estimate(replace(CONFIG, scenes=1), solids, library))

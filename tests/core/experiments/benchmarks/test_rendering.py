@@ -22,6 +22,7 @@ def steps(solids, library):
         return list(bench_render(TINY, solids, library))
 
 
+@pytest.mark.slow
 def test_every_figure_is_there_and_tables_have_a_row_for_each_size(steps):
     assert [step.done for step in steps] == [0, 0, 1, 2, 3, 4, 5, 6]
     result = json.loads(json.dumps(steps[-1].report.to_json()))
@@ -37,6 +38,7 @@ def test_every_figure_is_there_and_tables_have_a_row_for_each_size(steps):
     assert set(result["growth"]) == {"objects", "pixels", "batch"}
 
 
+@pytest.mark.slow
 def test_both_renderers_draw_the_same_scene(steps):
     shown = steps[-1].report.shown
     # TinyRenderer has shadows of its own kind and no smooth edges, but what sets each of its images apart from the

@@ -39,6 +39,7 @@ def evaluated(solids, library, tmp_path_factory):
     return config, steps
 
 
+@pytest.mark.slow
 def test_everything_is_measured_and_reported(evaluated):
     config, steps = evaluated
     result = json.loads(json.dumps(steps[-1].report.to_json(), allow_nan=False))
@@ -58,6 +59,7 @@ def test_everything_is_measured_and_reported(evaluated):
     assert json.loads((config.folder / REPORT_FILE).read_text()) == result
 
 
+@pytest.mark.slow
 def test_pictures_lie_beside_the_results(evaluated):
     config, _ = evaluated
     assert config.folder == config.out / "estimate" / "2-objects-seed-0"
@@ -65,6 +67,7 @@ def test_pictures_lie_beside_the_results(evaluated):
     assert pictures == {"errors.png", "calibration.png", "track.png", "views.png", "failures_bad.png"}
 
 
+@pytest.mark.slow
 def test_progress_grows_and_only_the_last_step_reports(evaluated):
     _, steps = evaluated
     assert [step.done for step in steps] == list(range(23))
@@ -73,6 +76,7 @@ def test_progress_grows_and_only_the_last_step_reports(evaluated):
     assert steps[3].note == "Tracks (2 of 2)"
 
 
+@pytest.mark.slow
 def test_what_was_measured_is_taken_over(evaluated, solids, library, oracle):
     config, steps = evaluated
     again = last(evaluate_estimate(config, solids, library))

@@ -22,6 +22,7 @@ def cases(library):
     return found
 
 
+@pytest.mark.slow
 def test_masks_of_two_objects_change_places(cases):
     case, sound = cases["swapped masks"]
     np.testing.assert_array_equal(case.observation.masks, sound.observation.masks[:, ::-1])
@@ -29,6 +30,7 @@ def test_masks_of_two_objects_change_places(cases):
     assert case.start is None
 
 
+@pytest.mark.slow
 def test_a_mask_remains_in_one_view_only(cases):
     case, sound = cases["mask in one view"]
     areas = case.observation.masks.sum(axis=(2, 3))
@@ -40,12 +42,14 @@ def test_a_mask_remains_in_one_view_only(cases):
     assert changed.sum() == before[:, n].max() - areas[:, n].max()
 
 
+@pytest.mark.slow
 def test_a_name_is_wrong(cases):
     case, sound = cases["wrong name"]
     assert len(set(case.observation.names) & set(sound.truth.names)) == 1
     assert case.truth.names == sound.truth.names
 
 
+@pytest.mark.slow
 def test_images_are_black_or_saturated(cases):
     assert cases["black images"][0].observation.images.max() == 0
     case, sound = cases["saturated images"]
@@ -54,6 +58,7 @@ def test_images_are_black_or_saturated(cases):
 
 
 @pytest.mark.parametrize("kind", ["moved camera", "image of another scene"])
+@pytest.mark.slow
 def test_one_view_does_not_fit_the_others(cases, kind):
     case, sound = cases[kind]
     differ = [
@@ -64,12 +69,14 @@ def test_one_view_does_not_fit_the_others(cases, kind):
         np.testing.assert_array_equal(mine.T_world_camera.position, claimed.T_world_camera.position)
 
 
+@pytest.mark.slow
 def test_one_view_under_a_grazing_light(cases):
     case, _ = cases["one view, low light"]
     assert len(case.observation.cameras) == 1
     assert 10 <= np.rad2deg(np.arcsin(case.truth.light.direction[2])) <= 13
 
 
+@pytest.mark.slow
 def test_goals_show_other_objects_or_come_from_another_camera(cases):
     other, sound = cases["goal of other objects"]
     assert not set(other.truth.names) & set(other.observation.names)
@@ -81,6 +88,7 @@ def test_goals_show_other_objects_or_come_from_another_camera(cases):
         assert case.start.masks is not None
 
 
+@pytest.mark.slow
 def test_the_same_number_is_the_same_case(cases, library):
     again = bad_case(SOLIDS, 2, 4, 5, library, 48)
     np.testing.assert_array_equal(again.observation.images, cases[KINDS[5]][0].observation.images)

@@ -71,6 +71,7 @@ def evaluated(library, tmp_path_factory):
     return asked, list(evaluate_mpc(asked, FieldLibrary(None), library))
 
 
+@pytest.mark.slow
 def test_a_real_task_is_measured_and_reported(evaluated):
     asked, steps = evaluated
     report = steps[-1].report
@@ -86,6 +87,7 @@ def test_a_real_task_is_measured_and_reported(evaluated):
         assert (asked.folder / name).exists()
 
 
+@pytest.mark.slow
 def test_progress_grows_and_only_the_last_step_reports(evaluated):
     _, steps = evaluated
     done = [step.done for step in steps]
@@ -107,6 +109,7 @@ def test_progress_grows_and_only_the_last_step_reports(evaluated):
     ]
 
 
+@pytest.mark.slow
 def test_what_was_measured_is_taken_over(evaluated, library, monkeypatch):
     asked, steps = evaluated
     for what in ("run_from_images", "run_told_the_truth"):

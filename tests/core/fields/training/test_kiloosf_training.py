@@ -75,6 +75,7 @@ def test_the_same_seed_gives_the_same_field(block_set, tmp_path):
     assert not np.array_equal(outs[0][1].networks, outs[2][1].networks)
 
 
+@pytest.mark.slow
 def test_longer_training_does_not_hurt(block_set, tmp_path):
     short, long = (run(TrainField(block_set, tmp_path / f"{n}.safetensors", iterations=n))[-1] for n in (15, 100))
     assert long.psnr_full > short.psnr_full + 1

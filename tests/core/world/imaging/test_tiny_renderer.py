@@ -1,10 +1,12 @@
 import numpy as np
+import pytest
 
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.world.imaging.ray_tracer import masks_of
 from osfcore.world.tabletop import Tabletop
 
 
+@pytest.mark.slow
 def test_tiny_renderer_sees_the_same_scene_as_ray_tracing(library):
     cameras = (goal_camera(128), default_cameras(128)[1])
     exact, tiny = Tabletop(library), Tabletop(library, renderer="tiny")
