@@ -8,7 +8,7 @@ import numpy as np
 from osfcore import AssetLibrary, Episode, FieldLibrary, GoalImage, Tabletop, goal_camera, knowledge_of
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.world.goal_layouts import random_goal
-from osfcore.world.tabletop import SceneRequest
+from osfcore.world.scene_request import SceneRequest
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 

@@ -18,7 +18,8 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import reading_png
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.goal_layouts import random_goal
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 _MODES = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's, of 8 bits a channel: others would be clipped silently
 

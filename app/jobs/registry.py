@@ -7,18 +7,17 @@ the next start.
 from __future__ import annotations
 
 import contextlib
-import logging
 import shutil
 import threading
-import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended, job_fields, job_from_fields
+from app.jobs.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended
 from app.jobs.job_process import JobProcess
+from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, Outcome, after
 from app.processes.job_messages import (
     ChangeJob,
@@ -38,8 +37,6 @@ from osfcore.errors import OsfError, UnknownName
 
 _TEMPORARY_PREFIX = ".new-"
 _ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
-_EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
-_log = logging.getLogger(__name__)
 
 
 class QueueFull(OsfError):
@@ -72,7 +69,6 @@ class Jobs:
         serve: Callable[[Command], Any] | None = None,
         start_process: Callable[[Job, Path, Path, Callable[[object], None]], JobProcess] = JobProcess,
     ) -> None:
-        self._store = store
         self._data_dir = data_dir
         self._root = data_dir / "collections"
         self._publish = publish
@@ -81,24 +77,19 @@ class Jobs:
         self._serve = serve
         self._start_process = start_process
         self._changed = threading.Condition(threading.RLock())
-        self._jobs: dict[str, Job] = {}
-        self._numbers: dict[str, int] = {}
+        self._table = JobTable(store, publish)
         self._run: JobProcess | None = None
         self._is_stopping = False
-        self._last_event = 0.0
-        self._untold: Job | None = None  # the latest progress, if it came too soon after the one before
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Take over what the store holds, remove what was left half done, and begin to work."""
         for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
             shutil.rmtree(folder, ignore_errors=True)
-        for number, fields in self._store.jobs():
-            job = job_from_fields(fields)
-            self._jobs[job.id], self._numbers[job.id] = job, number
-        for job in list(self._jobs.values()):
+        self._table.load()
+        for job in self._table.all():
             if job.state in ("running", "paused"):
-                self._set(after(job, JobStopped(), self.folder(job.id)))
+                self._table.set(after(job, JobStopped(), self.folder(job.id)))
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
@@ -116,7 +107,7 @@ class Jobs:
     def all(self) -> tuple[Job, ...]:
         """All jobs, newest first."""
         with self._changed:
-            return tuple(self._with_position(job) for job in reversed(self._jobs.values()))
+            return tuple(reversed(self._table.all()))
 
     def get(self, job: str) -> Job:
         """One job.
@@ -125,9 +116,7 @@ class Jobs:
             UnknownName: if there is none of this name.
         """
         with self._changed:
-            if job not in self._jobs:
-                raise UnknownName("job", job, list(self._jobs)[-5:])
-            return self._with_position(self._jobs[job])
+            return self._table.get(job)
 
     def live(self, kind: str) -> tuple[Job, ...]:
         """Jobs of a kind that wait, run or pause."""
@@ -140,7 +129,7 @@ class Jobs:
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
         with self._changed:
-            job = self._jobs[self._run.id] if self._run else None
+            job = self._table[self._run.id] if self._run else None
             return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
 
     def inputs(self, job: str) -> Path:
@@ -169,13 +158,12 @@ class Jobs:
             CannotStore: if the inputs cannot be put in place.
         """
         with self._changed:
-            if len(self._queue()) >= self._max_queued:
+            if len(self._table.queue()) >= self._max_queued:
                 raise QueueFull(self._max_queued)
             job = Job(uuid.uuid4().hex[:12], kind, params)
             if inputs is not None:
                 self._take(job, inputs)
-            self._numbers[job.id] = 1 + max(self._numbers.values(), default=0)
-            self._set(job)
+            self._table.add(job)
             self._changed.notify_all()
             return self.get(job.id)
 
@@ -193,12 +181,12 @@ class Jobs:
             if found.state == "queued":
                 shutil.rmtree(self.folder(job), ignore_errors=True)
                 self._forget_workshop(found)
-                self._set(ended(self._jobs[job], "cancelled", note="Cancelled"))
-                self._tell_queue()
+                self._table.set(ended(self._table[job], "cancelled", note="Cancelled"))
+                self._table.publish_queue()
                 return self.get(job)
             if self._run is not None:
                 self._run.cancel(0.0 if found.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
-            self._changed.wait_for(lambda: self._jobs[job].is_finished, wait_s)
+            self._changed.wait_for(lambda: self._table[job].is_finished, wait_s)
             return self.get(job)
 
     def pause(self, job: str) -> Job:
@@ -240,7 +228,7 @@ class Jobs:
             if found.state not in ("running", "paused") or self._run is None or self._run.is_cancelled:
                 raise WrongJobState(found, "changed")
             self._run.order(ChangeJob(params))
-            self._set(replace(self._jobs[job], params={**found.params, **params}))
+            self._table.set(replace(self._table[job], params={**found.params, **params}))
             return self.get(job)
 
     def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
@@ -250,7 +238,7 @@ class Jobs:
                 raise WrongJobState(found, "paused" if after == "paused" else "resumed")
             self._run.order(order)
             self._run.clock.switch(is_running=after == "running")
-            self._set(replace(self._jobs[job], state=after, eta_s=None))
+            self._table.set(replace(self._table[job], state=after, eta_s=None))
             return self.get(job)
 
     # The working thread
@@ -258,14 +246,14 @@ class Jobs:
     def _work(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._is_stopping or bool(self._queue()))
+                self._changed.wait_for(lambda: self._is_stopping or bool(self._table.queue()))
                 if self._is_stopping:
                     return
-                job = self._queue()[0]
+                job = self._table.queue()[0]
                 try:
                     self._begin(job)
                 except OSError as error:
-                    self._set(ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
+                    self._table.set(ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
                     continue
             self._attend()
 
@@ -274,8 +262,8 @@ class Jobs:
         if job.kind != "fetch_assets":
             folder.mkdir(parents=True, exist_ok=True)
         self._run = self._start_process(job, self._data_dir, folder, self._on_event)
-        self._set(replace(job, state="running", started_at=now_utc(), note="Starting"))
-        self._tell_queue()
+        self._table.set(replace(job, state="running", started_at=now_utc(), note="Starting"))
+        self._table.publish_queue()
 
     def _attend(self) -> None:
         """Follow the running job until its process has ended."""
@@ -285,15 +273,15 @@ class Jobs:
         while outcome is None:
             outcome = run.wait()
             with self._changed:
-                if outcome is None and self._untold is not None:
-                    self._set(self._untold, is_progress=True)
+                if outcome is None:
+                    self._table.flush_progress()
                 if outcome is None and self._is_stopping:
                     outcome = JobStopped()
         run.end()
         self._finish(run, outcome)
 
     def _finish(self, run: JobProcess, outcome: Outcome) -> None:
-        job = self._jobs[run.id]
+        job = self._table[run.id]
         if run.is_cancelled and not isinstance(outcome, dict):
             outcome = JobCancelled()  # whatever ended it first, it was asked to
         then = after(job, outcome, self.folder(job.id))
@@ -301,7 +289,7 @@ class Jobs:
             self._forget_workshop(job)
         with self._changed:
             self._run = None
-            self._set(then)
+            self._table.set(then)
             self._changed.notify_all()
 
     def _on_event(self, event: object) -> None:
@@ -320,16 +308,16 @@ class Jobs:
     def _progress(self, run: JobProcess, step: JobStep) -> None:
         with self._changed:
             eta_s = run.clock.left_s(step.done, step.total)
-            job = self._jobs[run.id]
+            job = self._table[run.id]
             result = step.result or None
             job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
-            self._set(job, is_progress=True)
+            self._table.set_progress(job)
         if step.seen is not None:
             self._publish(JobSeen(job, step.seen))
 
     def _answer(self, run: JobProcess, asked: SceneCommand) -> None:
         """Carry out what a job asks for, with the scene that it drives and no other."""
-        scene = self._jobs[run.id].params.get("scene")
+        scene = self._table[run.id].params.get("scene")
         try:
             if self._serve is None or asked.command.id != scene:
                 raise UnknownName("scene of this job", asked.command.id, [str(scene)])
@@ -342,45 +330,9 @@ class Jobs:
         """The job has come to the end of a round, and waits."""
         with self._changed:
             run.clock.switch(is_running=False)
-            self._set(replace(self._jobs[run.id], state="paused", eta_s=None))
+            self._table.set(replace(self._table[run.id], state="paused", eta_s=None))
 
-    # State
-
-    def _queue(self) -> list[Job]:
-        return [job for job in self._jobs.values() if job.state == "queued"]
-
-    def _with_position(self, job: Job) -> Job:
-        if job.state != "queued":
-            return job
-        return replace(job, position=1 + [other.id for other in self._queue()].index(job.id))
-
-    def _set(self, job: Job, *, is_progress: bool = False) -> None:
-        """Keep and tell a job's new state; progress is thinned out."""
-        with self._changed:
-            self._jobs[job.id] = job
-            now = time.monotonic()
-            if is_progress and now - self._last_event < _EVENT_INTERVAL_S:
-                self._untold = job
-                return
-            if self._untold is not None and self._untold.id == job.id:
-                self._untold = None
-            self._last_event = now if is_progress else self._last_event
-            self._keep_and_tell(job)
-
-    def _keep_and_tell(self, job: Job) -> None:
-        told = self._with_position(job)
-        number = 0
-        try:
-            self._store.save_job(job.id, self._numbers[job.id], job_fields(job))
-            number = self._store.add_event(job_fields(told))
-        except OsfError as error:  # a full disk must not stop the jobs
-            _log.error("job %s: %s", job.id, error)
-        self._publish(JobChanged(number, told))
-
-    def _tell_queue(self) -> None:
-        """Positions have moved up."""
-        for job in self._queue():
-            self._keep_and_tell(job)
+    # Folders
 
     def _take(self, job: Job, inputs: Path) -> None:
         place = self.inputs(job.id)

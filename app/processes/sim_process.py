@@ -45,6 +45,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S, check_action
+from osfcore.inspection.mask_tint import tint_masks
 from osfcore.io.image_file import encode_jpeg, encode_png, to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -172,7 +173,8 @@ class Simulation:
     # Worlds
 
     def _create(self, command: CreateScene) -> SceneRecord:
-        from osfcore.world.tabletop import SceneRequest, Tabletop
+        from osfcore.world.scene_request import SceneRequest
+        from osfcore.world.tabletop import Tabletop
 
         request = SceneRequest(command.names, command.count, command.light)
         world = Tabletop(self._library, request=request, executor=self._executor)
@@ -195,7 +197,8 @@ class Simulation:
 
     def _world(self, scene: str) -> Tabletop:
         """The scene's simulation, loaded from its record if it is not in memory."""
-        from osfcore.world.tabletop import SceneRequest, Tabletop
+        from osfcore.world.scene_request import SceneRequest
+        from osfcore.world.tabletop import Tabletop
 
         record = self._record(scene)
         if scene in self._worlds:
@@ -296,7 +299,7 @@ class Simulation:
         seen = world.render((camera,), masks=command.masks, with_pusher=command.pusher)
         pixels = to_uint8(seen.images[0])
         if command.masks and seen.masks is not None:
-            pixels = draw_masks(pixels, seen.masks[0])
+            pixels = tint_masks(pixels, seen.masks[0])
         return encode_png(pixels)
 
     def _mask(self, command: TakeMask) -> bytes:
@@ -354,27 +357,3 @@ class Simulation:
         self._send(FramesTaken(record.id, record.revision, names, images, jpegs))
         self._last_frames = time.monotonic()
         self._last_lag_s = self._last_frames - start
-
-
-MASK_COLOURS = np.array(
-    [
-        [230, 85, 60],
-        [60, 140, 230],
-        [70, 180, 90],
-        [235, 180, 50],
-        [160, 95, 210],
-        [40, 190, 190],
-        [235, 110, 170],
-        [140, 120, 90],
-    ],
-    np.uint8,
-)
-
-
-def draw_masks(pixels: np.ndarray, masks: np.ndarray) -> np.ndarray:
-    """An 8-bit image (h, w, 3) with masks (N, h, w) laid over it, half transparent, one colour each."""
-    drawn = pixels.copy()
-    for number, mask in enumerate(masks):
-        colour = MASK_COLOURS[number % len(MASK_COLOURS)]
-        drawn[mask] = (pixels[mask].astype(np.uint16) + colour) // 2
-    return drawn

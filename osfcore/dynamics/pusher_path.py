@@ -11,7 +11,7 @@ SUBSTEPS = 4  # of one action: the pusher travels 6 cm in one, too far to see co
 
 
 def pusher_path(
-    start: Float[np.ndarray, "*batch 2"], velocity: Float[np.ndarray, "*batch T 2"]
+    start: Float[np.ndarray, "*#batch 2"], velocity: Float[np.ndarray, "*batch T 2"]
 ) -> Float[np.ndarray, "*batch S1 2"]:
     """Where the pusher's centre is before the first and after each substep [m]; it stops where its reach ends."""
     place = np.broadcast_to(np.asarray(start, float), (*velocity.shape[:-2], 2))

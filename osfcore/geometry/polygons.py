@@ -34,7 +34,7 @@ def circle(count: int, device: torch.device | None = None) -> Float[Tensor, "K 2
     return torch.stack([angles.cos(), angles.sin()], dim=-1)
 
 
-def dot(a: Float[Tensor, "*batch 2"], b: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+def dot(a: Float[Tensor, "*#batch 2"], b: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*out"]:
     """Scalar products; written out, for sums over a short last axis are slow."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 

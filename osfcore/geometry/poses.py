@@ -18,7 +18,7 @@ QUATERNION_NORM_TOLERANCE = 1e-3
 
 
 def quaternion_multiply(
-    a: Float[np.ndarray, "*batch 4"], b: Float[np.ndarray, "*batch 4"]
+    a: Float[np.ndarray, "*#batch 4"], b: Float[np.ndarray, "*#batch 4"]
 ) -> Float[np.ndarray, "*out 4"]:
     """Hamilton product a b: the rotation b followed by the rotation a. Batches broadcast."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
@@ -39,7 +39,7 @@ def quaternion_conjugate(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, 
     return np.asarray(q) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def rotate(q: Float[np.ndarray, "*batch 4"], v: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*out 3"]:
+def rotate(q: Float[np.ndarray, "*#batch 4"], v: Float[np.ndarray, "*#batch 3"]) -> Float[np.ndarray, "*out 3"]:
     """Rotate vectors by unit quaternions. Batches broadcast."""
     q, v = np.asarray(q), np.asarray(v)
     u = q[..., 1:]
@@ -80,7 +80,9 @@ def quaternion_log(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batc
     return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_rotvec().reshape(*q.shape[:-1], 3)
 
 
-def rotation_angle(a: Float[np.ndarray, "*batch 4"], b: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+def rotation_angle(
+    a: Float[np.ndarray, "*#batch 4"], b: Float[np.ndarray, "*#batch 4"]
+) -> Float[np.ndarray | np.float64, "*out"]:
     """Angle of the rotation between two orientations [rad], in [0, pi]; q and -q are the same orientation."""
     difference = quaternion_multiply(quaternion_conjugate(a), b)
     return 2.0 * np.arctan2(np.linalg.norm(difference[..., 1:], axis=-1), np.abs(difference[..., 0]))

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -105,7 +105,7 @@ class EpisodeFolder:
             self._lock.close()
             raise
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> EpisodeFolder:
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName
 from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
@@ -35,6 +35,7 @@ class MeshFiles:
     texture: Path | None = None
 
 
+@runtime_checkable
 class Source(Protocol):
     """A place that meshes can be fetched from."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,7 @@ _WALK_M = 0.06  # noise of random walks
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
 
 
+@runtime_checkable
 class PushSource(Protocol):
     """Pushes worth trying. What it takes to find them stays out of here: plans are looked at where no torch is."""
 

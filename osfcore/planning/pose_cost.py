@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ ARM_M = 0.03  # a rotation by an angle counts as the angle times this
 _END = 2.0  # what the last state counts, against the mean over all
 
 
+@runtime_checkable
 class Cost(Protocol):
     """What futures cost."""
 

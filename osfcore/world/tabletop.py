@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, MissingAssets, OsfError, OverlappingObjects, UnknownName, finite_vector
+from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName, finite_vector
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
-from osfcore.geometry.states import MAX_OBJECTS, Observation, SceneState
-from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M, TABLE_SIDE_M, check_action
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M, check_action
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer, masks_of
@@ -27,28 +26,11 @@ from osfcore.world.imaging.tiny_renderer import TinyScene
 from osfcore.world.imaging.traced_mesh import TracedMesh
 from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, body_model
 from osfcore.world.placing import is_calm, place_randomly
+from osfcore.world.scene_request import SceneRequest, check_object, check_place, check_request
 
 Renderer = Literal["embree", "tiny"]
 OVERLAP_TOLERANCE_M = 0.002
-MAX_HEIGHT_M = 1.0  # of an object's centre when it is put somewhere by hand
 _SETTLE_LIMIT_S = 3.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class SceneRequest:
-    """What a random scene shall contain.
-
-    Attributes:
-        names: the objects, or None for a random choice.
-        count: how many objects, where `names` is None.
-        light: the light, or None for a random one at least 10 deg above the table.
-        among: what to choose from, where `names` is None; all objects of the library if None.
-    """
-
-    names: tuple[str, ...] | None = None
-    count: int = 3
-    light: Light | None = None
-    among: tuple[str, ...] | None = None
 
 
 class Tabletop:
@@ -79,7 +61,7 @@ class Tabletop:
         self.cameras = default_cameras() if cameras is None else cameras
         self._library = library
         self._request = SceneRequest() if request is None else request
-        _check_request(library, self._request)
+        check_request(library, self._request)
         self._renderer: Renderer = renderer
         self._executor = executor
         self._assets: dict[str, ObjectAsset] = {}
@@ -186,8 +168,8 @@ class Tabletop:
             OverlappingObjects: if bodies penetrate by more than 2 mm; then the table is as before.
         """
         for name in state.names:
-            _check_object(self._library, name)
-            _check_place(name, state.pose(name).position)
+            check_object(self._library, name)
+            check_place(name, state.pose(name).position)
         before = (self._names, self.truth() if self._physics is not None else None)
         self._place_all(state)
         try:
@@ -209,7 +191,7 @@ class Tabletop:
             UnknownName, MissingAssets: if an object is not in the library.
         """
         for name in state.names:
-            _check_object(self._library, name)
+            check_object(self._library, name)
         self._place_all(state)
         self._steps = 0
 
@@ -267,7 +249,7 @@ class Tabletop:
         if name not in self._names:
             raise UnknownName("object on the table", name, self._names)
         position = finite_vector(pose.position, 3, f"position of {name} [m]")
-        _check_place(name, position)
+        check_place(name, position)
         quaternion = unit_quaternion(pose.quaternion, f"quaternion of {name}")
         bodies = self._bodies
         before = bodies.pose(name)
@@ -276,25 +258,6 @@ class Tabletop:
             self._refuse_overlaps(name)
         except OverlappingObjects:
             bodies.place(name, before)
-            raise
-
-    def move_pusher(self, position: Float[np.ndarray, "3"]) -> None:
-        """Put the pusher somewhere within its reach [m]; its height stays.
-
-        Raises:
-            InvalidInput: if the position is out of reach or not finite.
-            OverlappingObjects: if it would penetrate an object; then it did not move.
-        """
-        x, y, _ = finite_vector(position, 3, "pusher position [m]")
-        if max(abs(x), abs(y)) > PUSHER_REACH_M:
-            raise InvalidInput("pusher position [m]", [x, y], f"within |x|, |y| <= {PUSHER_REACH_M}")
-        bodies = self._bodies
-        before = bodies.pusher
-        bodies.place_pusher(np.array([x, y, PUSHER_CENTRE_Z_M]))
-        try:
-            self._refuse_overlaps()
-        except OverlappingObjects:
-            bodies.place_pusher(before)
             raise
 
     def gap_m(self, name: str) -> float:
@@ -370,41 +333,3 @@ class Tabletop:
             for second, gap in gaps.items():
                 if gap < -OVERLAP_TOLERANCE_M and moved in (None, first, second):
                     raise OverlappingObjects(first, second, -gap)
-
-
-def _check_object(library: AssetLibrary, name: str) -> None:
-    if not library.has(name):
-        library.info(name)  # raises UnknownName for what no catalogue knows
-        raise MissingAssets([name])
-
-
-def _check_place(name: str, position: Float[np.ndarray, "3"]) -> None:
-    half = TABLE_SIDE_M / 2
-    if np.abs(position[:2]).max() > half or not 0 <= position[2] <= MAX_HEIGHT_M:
-        allowed = f"over the table: |x|, |y| at most {half:g} and z between 0 and {MAX_HEIGHT_M:g}"
-        raise InvalidInput(f"position of {name} [m]", np.round(position, 4).tolist(), allowed)
-
-
-def _check_request(library: AssetLibrary, request: SceneRequest) -> None:
-    if request.names is not None:
-        if not 1 <= len(request.names) <= MAX_OBJECTS:
-            raise InvalidInput("number of objects", len(request.names), f"between 1 and {MAX_OBJECTS}")
-        if len(set(request.names)) != len(request.names):
-            raise InvalidInput("list of objects", ", ".join(request.names), "without repetition")
-        for name in request.names:
-            _check_object(library, name)
-        return
-    if not 1 <= request.count <= MAX_OBJECTS:
-        raise InvalidInput("number of objects", request.count, f"between 1 and {MAX_OBJECTS}")
-    choice = library.names() if request.among is None else request.among
-    for name in request.among or ():
-        _check_object(library, name)
-    if len(set(choice)) != len(choice):
-        raise InvalidInput("list of objects", ", ".join(choice), "without repetition")
-    available = len(choice)
-    if request.among is None and available == 0:
-        raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
-    if request.count > available:
-        raise InvalidInput(
-            "number of objects", request.count, f"at most {available}, as many as there are to choose from"
-        )

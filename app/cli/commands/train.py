@@ -47,7 +47,8 @@ class TrainFieldCommand:
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
-        from osfcore.fields.training.kiloosf_training import TrainField, train_field
+        from osfcore.fields.training.kiloosf_training import train_field
+        from osfcore.fields.training.recipes import TrainField
 
         config = TrainField(
             self.data,

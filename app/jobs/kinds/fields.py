@@ -100,7 +100,8 @@ def _collect(
 
 
 def _train(params: dict[str, Any], data: Path, out: Path, preview: Path, begin: TrainingStep) -> Iterator[TrainingStep]:
-    from osfcore.fields.training.kiloosf_training import TrainField, train_field
+    from osfcore.fields.training.kiloosf_training import train_field
+    from osfcore.fields.training.recipes import TrainField
 
     config = TrainField(data, out, minutes=params["minutes"], seed=params["seed"], hollow=params["hollow"])
     previews = 0

@@ -29,27 +29,23 @@ from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.training.holdout import has_held_out_pair, is_for_validation
 from osfcore.dynamics.training.optimizers import Optimizers
 from osfcore.dynamics.training.samples import Sample, off_track, samples
+from osfcore.dynamics.training.validation import _ARM_M, MEASURED_WINDOW, Validation, distance, validate
 from osfcore.dynamics.training.windows import Batch, Recording, batch, record
 from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
-from osfcore.geometry import torch_rotations as rotations
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
 from osfcore.io.push_file import PushEpisode, read_sound_pushes
 from osfcore.progress import Progress
 
 LONG_WINDOW = 3  # actions (paper: up to three future steps)
-MEASURED_WINDOW = 4
-MOVED_M, MOVED_RAD = 0.01, math.radians(5)  # what counts as truly moved within a window
-_ARM_M = 0.05  # a rotation by an angle counts as the angle times this
 _BUSY_SHARE = 0.85  # of the windows of a batch: in the others nothing happens
 _COARSE_SHARE = 0.5  # of the windows, which start with velocities as little known as in use
 _WARM_UP = 100
 _LAST_RATE = 0.01  # of the first one
 _REPORT_EVERY, _MEASURE_EVERY, _MEASURE_LONG_EVERY = 20, 1000, 100
 _LONG_RATE = 0.1
-_MEASURED = 2000  # windows
 _OWN_METRICS = ("validation_mm_4", "validation_windows")
 
 
@@ -139,27 +135,6 @@ def _check(config: TrainDynamics) -> None:
     ):
         if not low <= value <= high:
             raise InvalidInput(what, value, f"between {low} and {high}")
-
-
-@dataclass(frozen=True, slots=True)
-class Validation:
-    """Errors on held-out windows of four actions, of objects that truly moved.
-
-    Attributes:
-        windows: how many objects in windows truly moved.
-        mm_4: median error of position after four actions [mm].
-        deg_4: median error of orientation [deg].
-        mean_mm_4: mean error of position [mm].
-        loss: mean distance over all substeps [mm]; training keeps the weights with the least.
-        constant_mm_4: median way of these objects [mm].
-    """
-
-    windows: int
-    mm_4: float
-    deg_4: float
-    mean_mm_4: float
-    loss: float
-    constant_mm_4: float
 
 
 class _Run:
@@ -326,38 +301,3 @@ def _draw(recording: Recording, rng: np.random.Generator, count: int) -> np.ndar
     quiet = rng.integers(len(recording.starts), size=count - round(count * _BUSY_SHARE))
     chosen = busy if len(busy) else np.arange(len(recording.starts))
     return np.concatenate([rng.choice(chosen, count - len(quiet)), quiet])
-
-
-def distance(motion: Motion, pieces: Batch, step: int) -> Tensor:
-    """How far every object is from the truth after a substep (B, N) [m], its orientation included."""
-    shift = motion.centre - pieces.targets.centre[step]
-    turn = 2 * _sine(motion.quaternion, pieces.targets.quaternion[step])
-    return (shift.square().sum(dim=-1) + (_ARM_M * turn).square() + 1e-8).sqrt()
-
-
-def _sine(a: Tensor, b: Tensor) -> Tensor:
-    """Sine of half the angle between orientations."""
-    between = rotations.multiply(b * b.new_tensor([1.0, -1.0, -1.0, -1.0]), a)
-    return (between[..., 1:].square().sum(dim=-1) + 1e-12).sqrt()
-
-
-@torch.inference_mode()
-def validate(
-    network: PropagationNetwork, table: ShapeTable, recording: Recording, device: torch.device | str = "cpu"
-) -> Validation:
-    """Errors on windows of four actions in which something happens."""
-    busy = np.flatnonzero(recording.is_busy)
-    chosen = np.random.default_rng(0).permutation(busy)[:_MEASURED]
-    pieces = batch(recording, table, chosen, device)
-    loss, motion = 0.0, pieces.motion
-    for step, motion in enumerate(unroll(network, table, pieces.number, pieces.motion, pieces.velocity)):
-        loss += float(distance(motion, pieces, step).sum()) * 1e3 / len(chosen) / len(pieces.targets.centre)
-    way = (pieces.motion.centre - pieces.targets.centre[-1]).norm(dim=-1)
-    turned = 2 * torch.asin(_sine(pieces.motion.quaternion, pieces.targets.quaternion[-1]).clamp(max=1))
-    moved = (way > MOVED_M) | (turned > MOVED_RAD)
-    error = 1e3 * (motion.centre - pieces.targets.centre[-1]).norm(dim=-1)[moved]
-    angle = torch.rad2deg(2 * torch.asin(_sine(motion.quaternion, pieces.targets.quaternion[-1]).clamp(max=1)))[moved]
-    if not len(error):
-        return Validation(0, 0.0, 0.0, 0.0, loss, 0.0)
-    medians = [float(values.median()) for values in (error, angle, 1e3 * way[moved])]
-    return Validation(len(error), medians[0], medians[1], float(error.mean()), loss, medians[2])

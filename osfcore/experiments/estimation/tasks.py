@@ -23,7 +23,8 @@ from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.collection.policies import DirectedPolicy
 from osfcore.world.goal_layouts import SHIFT_M
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 STEPS = 20  # of an episode
 PUSHED_M = 0.05  # an episode in which no object comes so far is drawn again

@@ -19,7 +19,8 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import EXACT, Quality, SceneBatch
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 SCENE_QUALITY: Quality = replace(EXACT, samples_per_side=2)  # the truth is anti-aliased too
 HARSH_ELEVATION_DEG = 10.0

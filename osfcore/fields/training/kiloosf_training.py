@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,9 @@ from osfcore.fields.osf import OSFSize
 from osfcore.fields.ray_sampling import RaySource
 from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from osfcore.fields.training.distillation import Distillation, first_student
-from osfcore.fields.training.optimization import Rates, Stage
+from osfcore.fields.training.optimization import Stage
 from osfcore.fields.training.osf_training import Teacher, TeacherHoldout, TeacherRecipe
+from osfcore.fields.training.recipes import Recipe, TrainField
 from osfcore.fields.training.validation import Holdout
 from osfcore.fields.training.visual_hull import silhouette_box
 from osfcore.fields.voxel_shell import first_shell, refine, trim
@@ -39,77 +40,12 @@ from osfcore.progress import Progress
 _REPORT_S = 1.0
 _AIMED_BYTES = 2_000_000
 _NEEDED_WEIGHTS = (0.02, 0.05, 0.1, 0.2)  # of samples that a view must show, tried until the file is small enough
-_COARSE_RATES, _FINE_RATES = Rates(2e-2, 1e-2), Rates(2e-2, 1e-3)
 _OWN_METRICS = ("psnr_full", "psnr_mask")  # by which a file of metrics is known
 _CHECKPOINT_S = 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MIN_LOOK_S = 5.0
 _TRANSITIONS = {"distil": "Baking the teacher into a shell", "fine": "Refining the shell"}
 _Learner = Stage | Teacher  # a phase between its steps: step, snapshot, state
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """How a field is trained; docs/fields.md has the measurements behind the numbers.
-
-    Attributes:
-        coarse_across: voxels along the longest side in the first phase.
-        fine_across: the same in the second.
-        coarse_share: of the time budget.
-        cells: tiny networks along the longest side.
-        hidden: their width.
-        rays: pixels per step of descent.
-        solid_g: density feature inside the visual hull at first.
-        hollow_g: the same for hollow objects: fog so thin that light reaches what silhouettes cannot carve.
-        hollow_share: instead of coarse_share for hollow objects: opening a hollow takes time.
-        coarse_rates: learning rates of the first phase.
-        fine_rates: of the second.
-        teacher_share: of the time budget, in recipe "distil".
-        distil_share: likewise.
-    """
-
-    coarse_across: int = 48
-    fine_across: int = 96
-    coarse_share: float = 0.15
-    cells: int = 8
-    hidden: int = 16
-    rays: int = 4096
-    solid_g: float = 6.0
-    hollow_g: float = -3.0
-    hollow_share: float = 0.3
-    coarse_rates: Rates = _COARSE_RATES
-    fine_rates: Rates = _FINE_RATES
-    teacher_share: float = 0.45
-    distil_share: float = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class TrainField:
-    """A training run.
-
-    Attributes:
-        data: image set in the OSF format; `train` is learned from, `test` measured on.
-        out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
-        minutes: time budget of the descent [min].
-        device: "auto", "cpu" or "cuda".
-        seed: of everything random.
-        iterations: instead of the time budget, that many steps: repeatable on one machine.
-        hollow: the object has hollows that no silhouette shows, such as a bowl's; "direct" only.
-        recipe: "direct", or "distil" for the paper's way over a teacher.
-        teacher_width: units of each layer of the teacher.
-        teacher_depth: its layers.
-    """
-
-    data: Path
-    out: Path
-    minutes: float = 30.0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    seed: int = 0
-    iterations: int | None = None
-    hollow: bool = False
-    recipe: Literal["direct", "distil"] = "direct"
-    teacher_width: int = 64
-    teacher_depth: int = 4
 
 
 @dataclass(frozen=True, eq=False, slots=True)

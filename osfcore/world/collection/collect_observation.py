@@ -15,7 +15,8 @@ from osfcore.io.files import folder_at_once, write_json
 from osfcore.io.observation_file import write_observation
 from osfcore.io.scene_file import Scene, scene_to_json
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.tabletop import SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 TRUTH_FILE = "truth.json"
 

@@ -21,7 +21,8 @@ from osfcore.io.push_file import EpisodeFolder, PushEpisode, load_episode, save_
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.collection.disturbed_states import disturbed
 from osfcore.world.collection.policies import DirectedPolicy, PaperPolicy, PolicyName
-from osfcore.world.tabletop import Renderer, SceneRequest, Tabletop
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Renderer, Tabletop
 
 MOVED_M = 1e-3
 MOVED_RAD = np.deg2rad(0.5)

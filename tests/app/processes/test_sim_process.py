@@ -28,12 +28,13 @@ from app.processes.scene_messages import (
     TakeView,
     WatchFrames,
 )
-from app.processes.sim_process import MASK_COLOURS, Simulation, draw_masks
+from app.processes.sim_process import Simulation
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.workspace import STEP_S
+from osfcore.inspection.mask_tint import MASK_COLOURS, tint_masks
 from osfcore.io.observation_file import read_observation
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
@@ -185,7 +186,7 @@ def test_masks_are_drawn_over_where_they_are():
     image = np.full((4, 4, 3), 100, np.uint8)
     masks = np.zeros((10, 4, 4), bool)
     masks[9, 1, 2] = True
-    drawn = draw_masks(image, masks)
+    drawn = tint_masks(image, masks)
     assert np.array_equal(drawn[1, 2], (100 + MASK_COLOURS[1].astype(int)) // 2)
     assert np.array_equal(image, np.full((4, 4, 3), 100))
     assert (drawn != image).any(axis=-1).sum() == 1
