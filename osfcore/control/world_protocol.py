@@ -1,6 +1,6 @@
 """What a tabletop with a pusher must offer, so that a real robot can stand in for the simulator."""
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +8,6 @@ from jaxtyping import Float
 from osfcore.geometry.states import Observation
 
 
-@runtime_checkable
 class World(Protocol):
     """A table with objects, cameras and one pusher that follows velocities.
 

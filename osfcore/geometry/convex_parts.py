@@ -16,7 +16,7 @@ _SAMPLES = 20_000
 
 def convex_parts(
     vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], concavity: float = CONCAVITY
-) -> tuple[Float[np.ndarray, "M 3"], ...]:
+) -> tuple[Float[np.ndarray, "_ 3"], ...]:
     """Vertices of convex parts, at most 16 of at most 64 vertices; the same for the same mesh.
 
     Bodies with shallow dents only, such as cans, are one part: coacd would spend many on the rim of a lid.

@@ -95,7 +95,7 @@ class ObjectAsset:
 
     info: ObjectInfo
     mesh: TexturedMesh
-    parts: tuple[Float[np.ndarray, "M 3"], ...]
+    parts: tuple[Float[np.ndarray, "_ 3"], ...]
     resting: RestingPoses
 
     @property

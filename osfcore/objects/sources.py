@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName
 from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
@@ -35,7 +35,6 @@ class MeshFiles:
     texture: Path | None = None
 
 
-@runtime_checkable
 class Source(Protocol):
     """A place that meshes can be fetched from."""
 

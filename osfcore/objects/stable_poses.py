@@ -12,7 +12,7 @@ MAX_POSES = 12
 _SAME_DOWN_RAD = 0.35  # the facets of a rolling can lie closer together than this
 
 
-def resting_poses(parts: tuple[Float[np.ndarray, "M 3"], ...]) -> RestingPoses:
+def resting_poses(parts: tuple[Float[np.ndarray, "_ 3"], ...]) -> RestingPoses:
     """Orientations at rest on a plane, for a body of uniform density made of convex parts.
 
     Poses that differ by a turn about the vertical, or by less than 20 degrees in what points down, count as one; those

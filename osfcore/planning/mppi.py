@@ -1,17 +1,24 @@
-"""MPPI over predicted futures (paper, section 4.4).
+"""MPPI (Williams et al., 2015) over rollouts of the dynamics model: lines 9 to 18 of the paper's Algorithm 1.
 
-Deviations: sequences are not drawn around the last plan alone but from three sources (the last plan, pushes worth
-trying, random walks), and the softmax average is taken over a second round, drawn around the best of the first: the
-average of a way around the left and one around the right leads into the object. That round looks less far ahead: what
-comes later will be planned again before it is done. Noise is added to the pusher's path,
-not to its velocity, so that what comes late in a sequence is disturbed no more than what comes early.
+K sequences of T actions, a_k, are sampled, rolled out and scored, S_k = cost(rollout(a_k)). The plan is their average
+
+    a = sum_k w_k a_k,        w_k = exp(-(S_k - min S) / lambda) / sum_j exp(-(S_j - min S) / lambda),
+
+and the next plan is warm-started from it, shifted by the actions that were executed.
+
+Deviations: samples are not drawn around the nominal sequence alone but from three sources (the nominal sequence, push
+proposals, random walks), and the average is taken in a second round of samples around the best of the first: the mean
+of a path around the left and one around the right of an object leads into it. The second round has a shorter horizon,
+since later actions are planned again before they are executed. lambda is relative to the spread of the costs,
+temperature * (median S - min S). Noise is added to the pusher's path at knots, not to its velocity, so that its
+variance does not grow along the horizon.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -22,14 +29,13 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
 from osfcore.planning.pose_cost import Cost, PoseGoal
 
-_WALK_M = 0.06  # noise of random walks
+_RANDOM_WALK_M = 0.06  # standard deviation of random walks at their knots
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
 
 
-@runtime_checkable
 class PushSource(Protocol):
-    """Pushes worth trying. What it takes to find them stays out of here: plans are looked at where no torch is."""
+    """Proposes push sequences. A protocol, because the page draws plans where torch is not loaded."""
 
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
@@ -99,81 +105,86 @@ class PlanRound:
         return self.rollouts[int(self.costs.argmin())]
 
 
-class Planner:
-    """Plans pushes toward goals, again and again from the last plan.
+class MPPIPlanner:
+    """Receding-horizon planner: each plan is warm-started from the last one.
 
     Args:
         rollout: predicts futures: state, actions, and the state one action ago if known.
-        proposals: of pushes worth trying.
+        proposals: samples pushes that are likely to be useful.
         settings: of the plan.
     """
 
     def __init__(self, rollout: Rollout, proposals: PushSource, settings: PlanSettings | None = None) -> None:
         self._rollout, self._proposals = rollout, proposals
         self.settings = settings or PlanSettings()
-        self._last: Float[np.ndarray, "T 3"] | None = None
+        self._nominal: Float[np.ndarray, "T 3"] | None = None
 
-    def forget(self) -> None:
-        """Begin anew: the goal or the scene is another one."""
-        self._last = None
+    def reset(self) -> None:
+        """Drop the nominal sequence: the goal or the scene is another one."""
+        self._nominal = None
 
-    def upcoming(self, count: int) -> Float[np.ndarray, "count 3"]:
-        """The next actions of the last plan; at rest after its end, and where there is no plan [m/s]."""
-        plan = np.zeros((0, 3)) if self._last is None else self._last[:count]
+    def nominal(self, count: int) -> Float[np.ndarray, "count 3"]:
+        """The next actions of the nominal sequence; zero after its end, and without a plan [m/s]."""
+        plan = np.zeros((0, 3)) if self._nominal is None else self._nominal[:count]
         return np.concatenate([plan, np.zeros((count - len(plan), 3))])
 
-    def executed(self, count: int) -> None:
-        """The first actions of the last plan have been taken."""
-        if self._last is not None:
-            self._last = np.concatenate([self._last[count:], np.zeros((min(count, len(self._last)), 3))])
+    def shift(self, count: int) -> None:
+        """Shift the nominal sequence by actions that have been executed, to warm-start the next plan."""
+        if self._nominal is not None:
+            self._nominal = np.concatenate([self._nominal[count:], np.zeros((min(count, len(self._nominal)), 3))])
 
     def plan(
         self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None = None
     ) -> Iterator[PlanRound]:
-        """Two rounds; the actions of the last one are the plan.
+        """Plan in two rounds; the actions of the last one are the plan.
 
         Args:
             state: of the scene, with its pusher.
-            goal: what proposals aim at.
-            cost: what futures cost.
-            rng: draws everything.
-            before: the same objects one action ago.
+            goal: of the push proposals.
+            cost: of rollouts.
+            rng: draws all samples.
+            before: the same objects one action ago, for their velocities.
+
+        Yields:
+            The two rounds.
         """
-        first = self._first_round(state, goal, rng)
-        round_ = self._scored(0, state, first, cost, before)
+        samples = self._sample_first_round(state, goal, rng)
+        round_ = self._evaluate(0, state, samples, cost, before)
         yield round_
         begin, rest = np.split(round_.actions, [self.settings.refined])
         keep_end = self.settings.knot_every < len(begin) and len(rest) > 0
-        second = self._around(begin, self.settings.samples, rng, self.settings.noise_m, keep_end=keep_end)
-        round_ = self._scored(1, state, second, cost, before)
-        mean = np.einsum("k,kta->ta", _softmax(round_.costs, self.settings.temperature), second)
-        self._last = np.concatenate([mean, rest])
-        yield replace(round_, actions=self._last)
+        second = self._perturbed(begin, self.settings.samples, rng, self.settings.noise_m, keep_end=keep_end)
+        round_ = self._evaluate(1, state, second, cost, before)
+        mean = np.einsum("k,kta->ta", _mppi_weights(round_.costs, self.settings.temperature), second)
+        self._nominal = np.concatenate([mean, rest])
+        yield replace(round_, actions=self._nominal)
 
-    def _scored(
+    def _evaluate(
         self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
     ) -> PlanRound:
         rollouts = self._rollout(state, actions, before)
         costs = cost(rollouts)
         return PlanRound(number, actions[int(costs.argmin())], rollouts, costs)
 
-    def _first_round(self, state: SceneState, goal: PoseGoal, rng: np.random.Generator) -> Float[np.ndarray, "K T 3"]:
-        """The last plan and some around it, pushes worth trying, and random walks."""
+    def _sample_first_round(
+        self, state: SceneState, goal: PoseGoal, rng: np.random.Generator
+    ) -> Float[np.ndarray, "K T 3"]:
+        """The nominal sequence and perturbations of it, random walks, and push proposals."""
         settings = self.settings
-        still = np.zeros((settings.horizon, 3))
-        last = still if self._last is None else self._resized(self._last)
+        zero = np.zeros((settings.horizon, 3))
+        nominal = zero if self._nominal is None else self._resized(self._nominal)
         share = settings.samples // 8
-        walks = self._around(still, share, rng, _WALK_M)
-        kept = self._around(last, share, rng, settings.noise_m)
+        walks = self._perturbed(zero, share, rng, _RANDOM_WALK_M)
+        around = self._perturbed(nominal, share, rng, settings.noise_m)
         pushes = self._proposals.draw(state, goal, settings.samples - 2 * share, settings.horizon, rng)
-        return np.concatenate([kept, walks, pushes])
+        return np.concatenate([around, walks, pushes])
 
-    def _resized(self, plan: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:
+    def _resized(self, plan: Float[np.ndarray, "before 3"]) -> Float[np.ndarray, "T 3"]:
         """The plan at today's horizon, which may have been changed since."""
         horizon = self.settings.horizon
         return np.concatenate([plan[:horizon], np.zeros((max(horizon - len(plan), 0), 3))])
 
-    def _around(
+    def _perturbed(
         self,
         plan: Float[np.ndarray, "T 3"],
         count: int,
@@ -182,14 +193,17 @@ class Planner:
         *,
         keep_end: bool = False,
     ) -> Float[np.ndarray, "K T 3"]:
-        """The plan itself, and sequences whose paths lie around its own.
+        """A sequence, and perturbations of its path by noise that is linear between knots.
 
         Args:
-            plan: what they lie around.
-            count: how many.
+            plan: the sequence.
+            count: of all sequences.
             rng: draws the noise.
-            noise_m: its sigma [m].
-            keep_end: all end where the plan ends.
+            noise_m: its standard deviation at the knots [m].
+            keep_end: no noise at the end of the path.
+
+        Returns:
+            `count` sequences; the first is the plan itself.
         """
         horizon, every = len(plan), self.settings.knot_every
         times = np.minimum(np.arange(-(-horizon // every) + 1) * every, horizon)
@@ -206,7 +220,8 @@ class Planner:
         return (plan + velocity).clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
 
 
-def _softmax(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:
+def _mppi_weights(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:
+    """The softmax weights w_k, with lambda = temperature * (median S - min S)."""
     spread = max(float(np.median(costs) - costs.min()), 1e-9)
     weights = np.exp(-(costs - costs.min()) / (temperature * spread))
     return weights / weights.sum()

@@ -1,10 +1,10 @@
-"""Where objects should be, and what it costs that they are not there yet: costs by poses."""
+"""Pose goals, and the running and terminal cost of rollouts by distances of poses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -15,10 +15,9 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 
 ARM_M = 0.03  # a rotation by an angle counts as the angle times this
-_END = 2.0  # what the last state counts, against the mean over all
+_TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
 
 
-@runtime_checkable
 class Cost(Protocol):
     """What futures cost."""
 
@@ -69,7 +68,7 @@ class PoseGoal:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseCost:
-    """Distances of all objects from where they should be, on the way and at the end [m].
+    """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*), horizontally [m].
 
     Attributes:
         goal: where that is.
@@ -80,12 +79,12 @@ class PoseCost:
     arm_m: float = ARM_M
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
-        """Sums over objects, means over time, the last moment counted more."""
+        """Running cost averaged over the horizon, plus the weighted terminal cost."""
         order = [self.goal.names.index(name) for name in rollouts.names]
         shift = rollouts.positions[:, 1:, :, :2] - self.goal.poses.position[order, :2]
         cost = np.linalg.norm(shift, axis=-1)
         if self.arm_m > 0:
             target = np.broadcast_to(self.goal.poses.quaternion[order], rollouts.quaternions[:, 1:].shape)
             cost = cost + self.arm_m * rotation_angle(rollouts.quaternions[:, 1:], target)
-        each = cost.sum(axis=2)
-        return each.mean(axis=1) + _END * each[:, -1]
+        running_cost = cost.sum(axis=2)
+        return running_cost.mean(axis=1) + _TERMINAL_WEIGHT * running_cost[:, -1]

@@ -234,7 +234,7 @@ class Physics:
         return min((point[8] for point in points), default=reach_m)
 
 
-def mass_properties(parts: tuple[Float[np.ndarray, "M 3"], ...], mass_kg: float) -> tuple[Pose, Float[np.ndarray, "3"]]:
+def mass_properties(parts: tuple[Float[np.ndarray, "_ 3"], ...], mass_kg: float) -> tuple[Pose, Float[np.ndarray, "3"]]:
     """Centre of mass with principal axes, and principal moments [kg m^2], of hulls of one uniform density.
 
     Parts are summed as if they did not overlap.

@@ -26,7 +26,7 @@ _INSIDE_G = 5.0  # deep inside, where no training says how dense it is
 _SPECK = 0.02  # of the largest body: smaller ones are noise
 _EDGE_G = 0.01  # by which corners are on their side of the surface at least
 
-Parts = tuple[Float32[np.ndarray, "M 3"], ...]
+Parts = tuple[Float32[np.ndarray, "_ 3"], ...]
 
 
 def field_parts(field: KiloOSF) -> Parts:

@@ -42,7 +42,7 @@ class ObjectShape:
     centre: Float[np.ndarray, "3"]
     radius: float
     support: Float32[np.ndarray, "D 3"]
-    parts: tuple[Float32[np.ndarray, "D 3"], ...] = ()
+    parts: tuple[Float32[np.ndarray, "_ 3"], ...] = ()
 
 
 def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "M 3"]] = ()) -> ObjectShape:
@@ -138,7 +138,9 @@ class ShapeTable:
         extents = np.array([s.half_extents.max() for s in shapes])
         self.half_extent = torch.as_tensor(extents, dtype=torch.float32, device=device)
 
-    def farthest(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
+    def farthest(
+        self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "... D 3"]
+    ) -> Tensor:
         """Farthest points of A bodies in D directions of the world, relative to their centres of mass (A, D, 3) [m].
 
         The points are those of the nearest direction on the map, 3.6 deg away at most: they reach 0.03 to 0.25 mm less
@@ -147,7 +149,7 @@ class ShapeTable:
         local = directions @ rotation  # R^T d for every d
         return self._support(number, local) @ rotation.transpose(1, 2)
 
-    def extents(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "D 3"]) -> Tensor:
+    def extents(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "... D 3"]) -> Tensor:
         """How far A bodies reach in D directions of the world from their centres of mass (A, D) [m]."""
         local = directions @ rotation
         reach = self._support(number, local) * local

@@ -19,7 +19,7 @@ def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> 
     return rendered.rgb - views.images
 
 
-def photometric_loss(errors: Float32[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B"]:
+def photometric_loss(errors: Float[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B"]:
     """Mean Huber loss over all pixels and colours of each scene.
 
     rho(r) = r^2 / 2 for |r| < h, h (|r| - h / 2) otherwise, with h = HUBER.
