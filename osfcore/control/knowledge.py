@@ -1,4 +1,4 @@
-"""What an episode knows of its objects before the first image: fields, push model, shapes, symmetries."""
+"""Models of an episode's objects: fields, dynamics, shapes, symmetries."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from osfcore.objects.asset_library import AssetLibrary
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """What is known before anything is seen.
+    """Models of the objects, loaded before the first image.
 
     Attributes:
         models: how objects and table look.
@@ -35,7 +35,14 @@ class Knowledge:
 def knowledge_of(
     names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary, data_dir: Path | None, device: str = "cpu"
 ) -> Knowledge:
-    """What is known of some objects.
+    """Load the models of some objects.
+
+    Args:
+        names: of the objects.
+        fields: library of their fields.
+        assets: library of their symmetries.
+        data_dir: whose weights and convex parts come before the installed ones.
+        device: that computes.
 
     Raises:
         UnknownName: if one has no field.

@@ -1,4 +1,4 @@
-"""The way of the pusher, which nothing can change: known before anything is predicted."""
+"""The path of the pusher: position-controlled, so it follows from the actions alone."""
 
 from __future__ import annotations
 

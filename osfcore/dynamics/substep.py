@@ -1,4 +1,4 @@
-"""One substep of many scenes: graph, features, network, and what physics allows of its answer."""
+"""One substep of many scenes: contact graph, features, network, then sleeping and contact with the floor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def advance(
         number: which of them each object is.
         motion: the scenes.
         sweep: what the pusher does.
-        mirror: scenes to be seen in a mirror along the heading, in training.
+        mirror: scenes to reflect along the heading, in training.
     """
     pusher = motion.pusher + sweep.shift
     graph = build_graph(table, number, motion, sweep)

@@ -32,7 +32,7 @@ def unroll(
         number: which of them each object is.
         motion: the scenes before the first action.
         velocity: of the pusher in each action [m/s].
-        mirror: scenes to be seen in a mirror along the heading, in training.
+        mirror: scenes to reflect along the heading, in training.
     """
     path = pusher_path(motion.pusher.double().cpu().numpy(), velocity.transpose(0, 1).double().cpu().numpy())
     shifts = torch.as_tensor(np.diff(path, axis=1), dtype=torch.float32, device=number.device)

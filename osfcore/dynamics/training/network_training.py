@@ -2,7 +2,7 @@
 
 Deviations from the paper (section 4.3), measured in docs/dynamics.md: an action is predicted in four substeps; the loss
 is a distance rather than its square, of the centre of mass and the orientation together, so that a few objects that
-topple do not outweigh all that slide; half of all is seen in a mirror. As in the paper, the loss runs over three
+topple do not outweigh all that slide; half of all is reflected. As in the paper, the loss runs over three
 actions, with gradients through all of them, but only at the end: most of the training is on single substeps from true
 states, which cost a fraction.
 """
@@ -178,16 +178,16 @@ class _Run:
         return f"loss {float(loss.detach()):.2f} mm {what}; {self.note}"
 
     def _loss_of_samples(self) -> Tensor:
-        """How far single substeps end from the truth [mm]."""
+        """Mean error of single substeps [mm]."""
         graphs = torch.as_tensor(self._rng.integers(len(self._samples), size=self._config.batch))
         flipped = torch.as_tensor(self._rng.random(len(graphs)) < 0.5)
         sample = Sample(*(part.to(self._device) for part in self._samples.draw(graphs, flipped)))
-        answer = self._descent.network(sample.nodes, sample.edges, sample.receiver, sample.sender)
-        scale = answer.new_tensor([SHIFT_M] * 3 + [_ARM_M * TURN_RAD] * 3)
-        return 1e3 * (((answer - sample.target) * scale).square().sum(dim=1) + 1e-9).sqrt().mean()
+        residual = self._descent.network(sample.nodes, sample.edges, sample.receiver, sample.sender)
+        scale = residual.new_tensor([SHIFT_M] * 3 + [_ARM_M * TURN_RAD] * 3)
+        return 1e3 * (((residual - sample.target) * scale).square().sum(dim=1) + 1e-9).sqrt().mean()
 
     def _loss_of_windows(self) -> Tensor:
-        """How far windows of three actions are from the truth, on average over their substeps [mm]."""
+        """Mean error over the substeps of windows of three actions [mm]."""
         windows = _draw(self._long, self._rng, self._config.long_batch)
         pieces = batch(self._long, self._table, windows, self._device, self._rng.random(len(windows)) < _COARSE_SHARE)
         mirror = torch.as_tensor(self._rng.random(len(windows)) < 0.5, device=self._device)
@@ -211,9 +211,9 @@ class _Run:
 
     def measure(self) -> None:
         """Keep the averaged weights if they are the best so far."""
-        found = validate(self._descent.average, self._table, self._validation, self._device)
-        if self.best is None or found.loss < self.best.loss:
-            self.best, self.fruitless = found, 0
+        result = validate(self._descent.average, self._table, self._validation, self._device)
+        if self.best is None or result.loss < self.best.loss:
+            self.best, self.fruitless = result, 0
             kept = self._descent.average.state_dict()
             self._best = {name: value.detach().cpu().clone() for name, value in kept.items()}
         else:

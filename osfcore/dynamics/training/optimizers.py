@@ -1,4 +1,4 @@
-"""How training descends: Muon for the weight matrices, AdamW for biases, norms and the last layer.
+"""Optimizers of training: Muon for the weight matrices, AdamW for biases, norms and the last layer.
 
 Muon makes every update of a matrix about as large in all its directions. On pushes, 3,000 steps with it come within 2 %
 of what takes AdamW 16,000, for a fifth more time a step (docs/dynamics.md).
@@ -21,11 +21,11 @@ _AVERAGING = 0.998  # of the weights that are kept, from step to step
 
 
 class Optimizers:
-    """A network on its way down, and the average of where it came by.
+    """A network in training, and the exponential moving average of its weights.
 
     Attributes:
-        network: as it is.
-        average: of its last few hundred states, which is better than any of them.
+        network: with its current weights.
+        average: with weights averaged over a few hundred steps, which validates better.
     """
 
     def __init__(self, network: PropagationNetwork, rate: float) -> None:
@@ -49,10 +49,10 @@ class Optimizers:
         self._rates = (rate, other_rate)
 
     def step(self, loss: Tensor, share: float, done: int) -> None:
-        """One step down.
+        """One optimization step.
 
         Args:
-            loss: to lessen.
+            loss: to minimise.
             share: of the highest rate.
             done: steps before this one; at the beginning the average forgets faster.
         """

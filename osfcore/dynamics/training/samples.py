@@ -25,8 +25,8 @@ from osfcore.dynamics.training.windows import Recording, turn_between
 from osfcore.geometry.poses import rotate
 from osfcore.io.push_file import Disturbed, PushEpisode
 
-_CHUNK = 4096  # scenes looked at together
-_TOGETHER = 24  # episodes of disturbed states looked at together
+_CHUNK = 4096  # scenes per batch
+_TOGETHER = 24  # episodes of disturbed states per batch
 
 
 class Sample(NamedTuple):
@@ -37,7 +37,7 @@ class Sample(NamedTuple):
         edges: features of the edges, those from the pusher first.
         receiver: object at the end of each edge.
         sender: object at the beginning of each edge between objects.
-        target: what the network should answer for each object.
+        target: residual motion that the network should predict for each object.
     """
 
     nodes: Float[Tensor, "A F"]
@@ -109,7 +109,7 @@ class Samples:
         return len(self.nodes.count)
 
     def draw(self, graphs: Int[Tensor, "B"], flipped: Bool[Tensor, "B"]) -> Sample:
-        """Some graphs, those with a flag seen in a mirror."""
+        """Some graphs, those with a flag reflected."""
         count = self.nodes.count[graphs]
         first = count.cumsum(0) - count
         nodes, pushed, paired = (rows.take(graphs) for rows in (self.nodes, self.pushed, self.paired))
@@ -136,28 +136,36 @@ def _ranges(first: Int[Tensor, "B"], count: Int[Tensor, "B"]) -> Int[Tensor, "R"
 def samples(
     recording: Recording, table: ShapeTable, device: torch.device | str = "cpu", others: Iterable[Substeps] = ()
 ) -> Samples:
-    """Every substep of a recording of windows of one action, and others."""
+    """Every substep in which something can move.
+
+    Args:
+        recording: in windows of one action.
+        table: shapes of the objects.
+        device: that computes.
+        others: further substeps, such as disturbed states.
+    """
     pieces = itertools.chain(_recorded(recording), others)
-    parts = [_sample(*found) for piece in pieces if (found := _looked_at(piece, table, device)) is not None]
+    graphs = (_graph_and_target(piece, table, device) for piece in pieces)
+    parts = [_sample(*graph) for graph in graphs if graph is not None]
     columns = list(zip(*parts, strict=True))
     return Samples(*(_Rows.of(torch.cat(columns[k]), torch.cat(columns[k + 1])) for k in (0, 2, 4)))
 
 
-def _looked_at(
+def _graph_and_target(
     piece: Substeps, table: ShapeTable, device: torch.device | str
 ) -> tuple[Graph, Inputs, Float[Tensor, "A 6"]] | None:
-    """Graphs of many scenes together, what the network sees of them, and what it should answer; None if all rests."""
+    """Graphs of many scenes together, features and residual targets; None if everything rests."""
     sweep = Sweep(headings(piece.velocity, piece.motion), piece.shift)
     motion, sweep = Motion(*(p.to(device) for p in piece.motion)), Sweep(*(p.to(device) for p in sweep))
     graph = build_graph(table, piece.number.to(device), motion, sweep)
     if not len(graph.scene):
         return None
-    seen = inputs(table, graph)
+    features = inputs(table, graph)
     place = (graph.scene.cpu(), graph.slot.cpu())
     shift = piece.centre[place] - piece.motion.centre[place]
     turn = turn_between(piece.motion.quaternion[place], piece.quaternion[place])
     truth = torch.stack([shift / SHIFT_M, turn / TURN_RAD], dim=1).to(device)
-    return graph, seen, (truth @ seen.frame.transpose(1, 2)).flatten(1) - corrections(seen)
+    return graph, features, (truth @ features.frame.transpose(1, 2)).flatten(1) - corrections(features)
 
 
 def _recorded(recording: Recording) -> Iterator[Substeps]:
@@ -178,10 +186,10 @@ def _recorded(recording: Recording) -> Iterator[Substeps]:
 def off_track(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape]) -> Iterator[Substeps]:
     """What is recorded of disturbed states of episodes with the same number of objects."""
     order = {name: number for number, name in enumerate(sorted(shapes))}
-    found = [(e, e.disturbed) for e in episodes if e.disturbed is not None and len(e.disturbed.step)]
-    for first in range(0, len(found), _TOGETHER):
+    disturbed = [(e, e.disturbed) for e in episodes if e.disturbed is not None and len(e.disturbed.step)]
+    for first in range(0, len(disturbed), _TOGETHER):
         columns = zip(
-            *(_disturbed(e, rows, shapes, order) for e, rows in found[first : first + _TOGETHER]), strict=True
+            *(_disturbed(e, rows, shapes, order) for e, rows in disturbed[first : first + _TOGETHER]), strict=True
         )
         number, *start, velocity, shift, centre, quaternion = (torch.cat(column) for column in columns)
         yield _substeps(number, tuple(start), velocity, shift, centre, quaternion)
@@ -210,18 +218,18 @@ def _substeps(
     return Substeps(number, sleeping(motion), velocity, shift, centre, quaternion)
 
 
-def _sample(graph: Graph, seen: Inputs, target: Float[Tensor, "A 6"]) -> tuple[Tensor, ...]:
+def _sample(graph: Graph, features: Inputs, target: Float[Tensor, "A 6"]) -> tuple[Tensor, ...]:
     """Rows of objects, of edges from the pusher and of edges between objects, each with its counts by graph."""
     _, which, count = torch.unique_consecutive(graph.scene, return_inverse=True, return_counts=True)
     first = count.cumsum(0) - count
-    from_pusher = len(seen.receiver) - len(seen.sender)
-    owner = which[seen.receiver]
-    local = (seen.receiver - first[owner])[:, None]
-    pushed = torch.cat([seen.edges, local], dim=1)[:from_pusher]
-    sender = (seen.sender - first[owner[from_pusher:]])[:, None]
-    paired = torch.cat([seen.edges, local], dim=1)[from_pusher:]
+    from_pusher = len(features.receiver) - len(features.sender)
+    owner = which[features.receiver]
+    local = (features.receiver - first[owner])[:, None]
+    pushed = torch.cat([features.edges, local], dim=1)[:from_pusher]
+    sender = (features.sender - first[owner[from_pusher:]])[:, None]
+    paired = torch.cat([features.edges, local], dim=1)[from_pusher:]
     paired = torch.cat([paired, sender], dim=1)
-    rows = [torch.cat([seen.nodes, target], dim=1).cpu(), count.cpu()]
+    rows = [torch.cat([features.nodes, target], dim=1).cpu(), count.cpu()]
     for edges, owners in ((pushed, owner[:from_pusher]), (paired, owner[from_pusher:])):
         order = owners.argsort(stable=True)
         rows += [edges[order].cpu(), torch.bincount(owners, minlength=len(count)).cpu()]

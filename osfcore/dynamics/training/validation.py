@@ -17,17 +17,9 @@ from osfcore.dynamics.unroll import unroll
 from osfcore.geometry import torch_rotations as rotations
 
 MEASURED_WINDOW = 4
-
-
 MOVED_M = 0.01
-
-
 MOVED_RAD = math.radians(5)  # what counts as truly moved within a window
-
-
 _ARM_M = 0.05  # a rotation by an angle counts as the angle times this
-
-
 _MEASURED = 2000  # windows
 
 
@@ -41,7 +33,7 @@ class Validation:
         deg_4: median error of orientation [deg].
         mean_mm_4: mean error of position [mm].
         loss: mean distance over all substeps [mm]; training keeps the weights with the least.
-        constant_mm_4: median way of these objects [mm].
+        constant_mm_4: median distance these objects travel, the error of predicting no motion [mm].
     """
 
     windows: int
@@ -76,12 +68,12 @@ def validate(
     loss, motion = 0.0, pieces.motion
     for step, motion in enumerate(unroll(network, table, pieces.number, pieces.motion, pieces.velocity)):
         loss += float(distance(motion, pieces, step).sum()) * 1e3 / len(chosen) / len(pieces.targets.centre)
-    way = (pieces.motion.centre - pieces.targets.centre[-1]).norm(dim=-1)
+    travel = (pieces.motion.centre - pieces.targets.centre[-1]).norm(dim=-1)
     turned = 2 * torch.asin(_sine(pieces.motion.quaternion, pieces.targets.quaternion[-1]).clamp(max=1))
-    moved = (way > MOVED_M) | (turned > MOVED_RAD)
+    moved = (travel > MOVED_M) | (turned > MOVED_RAD)
     error = 1e3 * (motion.centre - pieces.targets.centre[-1]).norm(dim=-1)[moved]
     angle = torch.rad2deg(2 * torch.asin(_sine(motion.quaternion, pieces.targets.quaternion[-1]).clamp(max=1)))[moved]
     if not len(error):
         return Validation(0, 0.0, 0.0, 0.0, loss, 0.0)
-    medians = [float(values.median()) for values in (error, angle, 1e3 * way[moved])]
+    medians = [float(values.median()) for values in (error, angle, 1e3 * travel[moved])]
     return Validation(len(error), medians[0], medians[1], float(error.mean()), loss, medians[2])
