@@ -1,5 +1,5 @@
 # make demo   build everything and open the page      make test   the quick tests (minutes)
-# make test-all   every test, browser included
+# make test-all   every test, browser included      make coverage   lines that the quick tests reach
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 DATA := $(if $(DATA_DIR),--data-dir $(DATA_DIR),)
 OFFLINE := echo "make: the packages could not be installed; see the lines above (is there a network connection?)" >&2
 
-.PHONY: demo install dev test test-all lint soak bench clean
+.PHONY: demo install dev test test-all test-types coverage lint soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch $(DATA)
@@ -40,8 +40,17 @@ $(VENV)/.dev-installed: $(VENV)/.installed
 test: dev
 	$(BIN)/pytest
 
-test-all: dev
+test-all: dev test-types
 	$(BIN)/pytest -m 'not soak'
+
+# Shapes and types of arrays are checked while the tests run.
+TYPED := geometry metrics planning
+test-types: dev
+	$(BIN)/python -m pytest -p tests.typecheck $(TYPED:%=tests/core/%) \
+	  --jaxtyping-packages=osfcore.geometry,osfcore.metrics,osfcore.planning,tests.typecheck.checked
+
+coverage: dev
+	$(BIN)/pytest --cov=osfcore --cov=app --cov-report=term:skip-covered
 
 lint: dev
 	$(BIN)/ruff check
