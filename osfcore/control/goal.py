@@ -1,4 +1,4 @@
-"""What the table should become: from an image or from poses, the way it counts for these objects here."""
+"""Goals from an image or poses: occluded objects stay, symmetric orientations are equal."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class GoalImage:
         return Observation((self.camera,), self.image[None], names, None, None, 0.0)
 
 
-def unmoved(models: ObjectModels, goal: GoalImage, found: EstimatedState, now: SceneState) -> EstimatedState:
+def unmoved(models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now: SceneState) -> EstimatedState:
     """The estimate of a goal image, with objects where they are now if the image shows nothing against it.
 
     What hides behind something, or lies beyond the image's border, would else be taken to wherever it hid best.
@@ -62,19 +62,19 @@ def unmoved(models: ObjectModels, goal: GoalImage, found: EstimatedState, now: S
     Args:
         models: fields of the objects and the table.
         goal: the image.
-        found: what it was taken for.
+        estimate: of the goal image.
         now: the scene.
     """
-    views = views_of(goal.observed(found.state.names), FINE_SIDE, samples=2)
-    guess = SceneParameters.of(found.state, None)
-    least, doubts = loss_of(models, views, guess), list(found.doubts)
-    for n, name in enumerate(found.state.names):
+    views = views_of(goal.observed(estimate.state.names), FINE_SIDE, samples=2)
+    guess = SceneParameters.of(estimate.state, None)
+    least, doubts = loss_of(models, views, guess), list(estimate.doubts)
+    for n, name in enumerate(estimate.state.names):
         here = with_pose(guess, n, now.pose(name))
         loss = loss_of(models, views, here)
         if loss <= _NO_WORSE * least:
             guess, least, doubts[n] = here, min(loss, least), ""
     reasons = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
-    return replace(found, state=guess.state(), doubts=tuple(doubts), reason="; ".join(reasons))
+    return replace(estimate, state=guess.state(), doubts=tuple(doubts), reason="; ".join(reasons))
 
 
 def settled(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
@@ -90,24 +90,26 @@ def settled(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry
 
 
 def alike(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """The goal with each orientation the one that looks the same and is nearest to the object's own."""
+    """The goal with each orientation replaced by its nearest symmetric one (`Symmetry`) to the object's own."""
     turned = {}
     for name, symmetry in symmetries.items():
         if name in goal.names and symmetry.kind != "none":
             pose = goal.pose(name)
-            turned[name] = Pose(pose.position, _nearest(symmetry, pose.quaternion, state.pose(name).quaternion))
+            turned[name] = Pose(
+                pose.position, _nearest_symmetric(symmetry, pose.quaternion, state.pose(name).quaternion)
+            )
     return goal.replaced(turned)
 
 
-def _nearest(
-    symmetry: Symmetry, wanted: Float[np.ndarray, "4"], here: Float[np.ndarray, "4"]
+def _nearest_symmetric(
+    symmetry: Symmetry, goal: Float[np.ndarray, "4"], current: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "4"]:
     turns = [np.array([1.0, 0, 0, 0]), *map(np.asarray, symmetry.rotations)]
     if symmetry.kind == "continuous":
         # q turned by t about the axis, times the other's conjugate, has scalar part a cos(t/2) + b sin(t/2).
-        quarter = quaternion_multiply(wanted, np.array([0.0, *np.asarray(symmetry.axis)]))
-        angle = 2 * np.arctan2(quarter @ here, wanted @ here)
+        quarter = quaternion_multiply(goal, np.array([0.0, *np.asarray(symmetry.axis)]))
+        angle = 2 * np.arctan2(quarter @ current, goal @ current)
         turns = [quaternion_exp(angle * np.asarray(symmetry.axis))]
     return min(
-        (quaternion_multiply(wanted, turn) for turn in turns), key=lambda other: float(rotation_angle(other, here))
+        (quaternion_multiply(goal, turn) for turn in turns), key=lambda other: float(rotation_angle(other, current))
     )

@@ -76,7 +76,14 @@ class PairContact(NamedTuple):
 def outlines(
     table: ShapeTable, body: Int[Tensor, "A"], rotation: Float[Tensor, "A 3 3"], centre: Float[Tensor, "A 3"]
 ) -> Float[Tensor, "A K 2"]:
-    """Outlines of bodies seen from above [m]."""
+    """Outlines of bodies seen from above [m], in the frame of `centre`.
+
+    Args:
+        table: shapes.
+        body: rows of the table: whole objects or convex parts.
+        rotation: of each body.
+        centre: of mass of each body's object [m].
+    """
     flat = torch.nn.functional.pad(circle(OUTLINE, centre.device), (0, 1))
     return table.farthest(body, rotation, flat)[..., :2] + centre[:, None, :2]
 
@@ -96,7 +103,15 @@ def solids(
     centre: Float[Tensor, "A 3"],
     outline: Float[Tensor, "A K 2"],
 ) -> Solids:
-    """All convex parts of some objects, whose whole outlines are known already."""
+    """All convex parts of some objects.
+
+    Args:
+        table: shapes.
+        number: shape of each object.
+        rotation: of each object.
+        centre: of mass [m].
+        outline: of the whole objects, which serves those of one part [m].
+    """
     count = table.part_count[number]
     first = count.cumsum(0) - count
     owner = torch.arange(len(number), device=number.device).repeat_interleave(count)
@@ -140,7 +155,14 @@ def _gap_where(chosen: Tensor, outline: Tensor, centre: Float[Tensor, "A 2"], ot
 def pair_contact(
     parts: Solids, outline: Float[Tensor, "A K 2"], first: Int[Tensor, "E"], second: Int[Tensor, "E"]
 ) -> PairContact:
-    """The nearest parts of pairs of objects, whose whole outlines are known already."""
+    """The nearest parts of pairs of objects.
+
+    Args:
+        parts: of all objects.
+        outline: of the whole objects [m].
+        first: object of each pair.
+        second: the other one.
+    """
     gap = gap_between(*(outline[place, ::_PAIR_STRIDE] for place in (first, second)))
     a, b = parts.first[first], parts.first[second]
     many = ((parts.many[first] * parts.many[second] > 1) & (gap.distance < PAIR_REACH_M)).nonzero()[:, 0]

@@ -1,10 +1,12 @@
-"""Who can touch whom: paper eq. 8, refined by outlines.
+"""The contact graph: paper eq. 8, refined by outlines.
+
+    A_ij = 1 if ||p_i - p_j|| < kappa, i != j
 
 Deviation: eq. 8 compares a squared distance with a length; we compare the distance of two objects with
 kappa = the longest half-extents of both + one step of pusher travel. Among the pairs that pass, and between pusher and
-objects, outlines seen from above (`contact.py`) then tell which can touch within one substep. Only objects that the
-pusher can touch, or that move, or that can be touched by one of these, take part; all others stay exactly where they
-are.
+objects, outlines seen from above (`contact_geometry`) then decide which can touch within one substep. Only objects
+that the pusher can touch, or that move, or that can be touched by one of these, take part; all others stay exactly
+where they are.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from osfcore.geometry.polygons import Gap, dot
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 
 TRAVEL_M = MAX_SPEED_M_S * STEP_S  # of the pusher in one step, per axis
-_LOOKUP_M = 0.005  # by which a look at a single direction may fall short
+_LOOKUP_M = 0.005  # error of an extent looked up in a single direction
 
 
 class Graph(NamedTuple):
@@ -77,21 +79,34 @@ class Graph(NamedTuple):
 def adjacency(
     position: Float[Tensor, "B N 3"], half_extent: Float[Tensor, "B N"], travel_m: float = TRAVEL_M
 ) -> Bool[Tensor, "B N N"]:
-    """Which objects could collide during a step (paper eq. 8, see the module for the deviation)."""
+    """Which objects could collide during a step (paper eq. 8, see the module for the deviation).
+
+    Args:
+        position: of the centres [m].
+        half_extent: longest half-extent of each object [m].
+        travel_m: of the pusher in one step [m].
+    """
     distance = (position[:, :, None] - position[:, None]).norm(dim=-1)
     kappa = half_extent[:, :, None] + half_extent[:, None] + travel_m
     return (distance < kappa) & ~torch.eye(position.shape[1], dtype=torch.bool, device=position.device)
 
 
 def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Graph:
-    """The objects that may move in this substep, and the pairs of them that may touch."""
+    """The objects that may move in this substep, and the pairs of them that may touch.
+
+    Args:
+        table: shapes of the objects.
+        number: which of them each object is.
+        motion: B scenes of N objects each.
+        sweep: motion of the pusher.
+    """
     moving = (motion.linear.abs().amax(dim=2) > 0) | (motion.angular.abs().amax(dim=2) > 0)
-    seeds = _near(table, number, motion, sweep) | moving
+    seeds = _near_pusher(table, number, motion, sweep) | moving
     busy = seeds.any(dim=1).nonzero()[:, 0]  # in all other scenes nothing happens
     number, seeds, moving = number[busy], seeds[busy], moving[busy]
     motion, sweep = Motion(*(part[busy] for part in motion)), Sweep(*(part[busy] for part in sweep))
-    couples = _couples(table, number, motion)
-    possible = _spread(seeds, couples)
+    couples = _candidate_pairs(table, number, motion)
+    possible = _connected(seeds, couples)
     graph, parts = _gather(table, number, motion, sweep, possible)
     index = possible.new_full(possible.shape, 0, dtype=torch.long)
     index[graph.scene, graph.slot] = torch.arange(len(graph.scene), device=index.device)
@@ -99,18 +114,18 @@ def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, s
     first, second = index[scene, i], index[scene, j]
     contact = pair_contact(parts, graph.outline, first, second)
     close = contact.gap.distance < PAIR_REACH_M
-    first, second, contact = first[close], second[close], _picked(contact, close)
+    first, second, contact = first[close], second[close], _select_rows(contact, close)
     touching = torch.zeros_like(couples)
     touching[graph.scene[first], graph.slot[first], graph.slot[second]] = True
     awake = torch.zeros_like(possible)
     awake[graph.scene, graph.slot] = graph.touched | moving[graph.scene, graph.slot]
-    awake = _spread(awake, touching | touching.transpose(1, 2))
+    awake = _connected(awake, touching | touching.transpose(1, 2))
     kept = _keep(graph, first, second, contact, awake[graph.scene, graph.slot])
     return kept._replace(scene=busy[kept.scene])
 
 
-def _near(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Bool[Tensor, "B N"]:
-    """Objects that are not clear of the pusher's way along the line to its nearest point; a quick look."""
+def _near_pusher(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Bool[Tensor, "B N"]:
+    """Objects that their extent toward the pusher's path does not rule out as touched: a cheap upper bound."""
     away = motion.pusher[:, None] - motion.centre[..., :2]
     shift = sweep.shift[:, None]
     along = (-dot(away, shift) / (dot(shift, shift) + 1e-12)).clamp(0, 1)
@@ -122,7 +137,7 @@ def _near(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: 
     return near.index_put(rows, distance[rows] < reach)
 
 
-def _couples(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion) -> Bool[Tensor, "B N N"]:
+def _candidate_pairs(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion) -> Bool[Tensor, "B N N"]:
     """Pairs that could collide (eq. 8) and are not clear of each other along the line between their centres."""
     radius = table.radius[number]
     couples = adjacency(motion.centre, table.half_extent[number])
@@ -146,8 +161,8 @@ def _extent(
     return table.extents(number[tuple(rows)], rotations.matrix(motion.quaternion[tuple(rows)]), directions)[:, 0]
 
 
-def _spread(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N"]:
-    """Everything that is linked to a seed over any number of links."""
+def _connected(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N"]:
+    """Everything connected to a seed by any number of links."""
     for _ in range(seed.shape[1] - 1):
         seed = seed | (links & seed[:, None]).any(dim=2)
     return seed
@@ -187,12 +202,12 @@ def _gather(
 _Tensors = TypeVar("_Tensors")
 
 
-def _picked(values: _Tensors, rows: Tensor) -> _Tensors:
+def _select_rows(values: _Tensors, rows: Tensor) -> _Tensors:
     """Some rows of a tensor, or of every tensor in a named tuple."""
     if isinstance(values, Tensor):
         return values[rows]  # pyright: ignore[reportReturnType]
     assert isinstance(values, tuple)
-    return type(values)(*(_picked(part, rows) for part in values))
+    return type(values)(*(_select_rows(part, rows) for part in values))
 
 
 def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kept: Bool[Tensor, "A"]) -> Graph:
@@ -200,7 +215,7 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kep
     renumbered = kept.long().cumsum(0) - 1
     both = kept[first] & kept[second]
     first, second = renumbered[first[both]], renumbered[second[both]]
-    gap, first_face, second_face = _picked(contact, both)
+    gap, first_face, second_face = _select_rows(contact, both)
     opposite = gap.point + gap.distance[:, None] * gap.normal
     pair = PairContact(
         Gap(
@@ -211,5 +226,5 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kep
         torch.cat([first_face, second_face]),
         torch.cat([second_face, first_face]),
     )
-    objects = [_picked(part, kept) for part in graph[:-3]]
+    objects = [_select_rows(part, kept) for part in graph[:-3]]
     return Graph._make([*objects, torch.cat([first, second]), torch.cat([second, first]), pair])

@@ -1,4 +1,4 @@
-"""Predicting what sequences of actions do to a scene (paper eq. 7, open loop)."""
+"""Open-loop rollouts of action sequences by the dynamics model (paper eq. 7)."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _CHUNK = 4096  # sequences rolled out at once: more would not be faster
 
 
 class PushModel:
-    """A trained network with the shapes of the objects it is asked about.
+    """The dynamics model: a trained network with the shapes of its objects.
 
     Args:
         network: predicts the motion of one substep.
-        shapes: of all objects that may be asked about, by name.
+        shapes: of all objects that may occur, by name.
         device: that computes.
 
     Raises:
@@ -54,7 +54,7 @@ class PushModel:
     def rollout(
         self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
     ) -> Rollouts:
-        """Where K sequences of T actions would lead.
+        """Predicted poses under K sequences of T actions.
 
         Objects are put into the order of their names inside, so that the order in which they come never matters. What
         nothing can touch keeps its pose bit by bit.
@@ -74,11 +74,11 @@ class PushModel:
         order = sorted(range(len(state.names)), key=state.names.__getitem__)
         names = tuple(state.names[i] for i in order)
         with torch.inference_mode():
-            start = self._start(state, order, names, before)
+            start = self._initial_motion(state, order, names, before)
             number = self._number(names)
             parts = [self._unroll(number, start, actions[k : k + _CHUNK]) for k in range(0, len(actions), _CHUNK)]
         centre, turned, moved = (np.concatenate([part[i] for part in parts]) for i in range(3))
-        return self._told(state, order, centre, turned, moved, actions)
+        return self._rollouts(state, order, centre, turned, moved, actions)
 
     def _check(self, state: SceneState) -> None:
         if not state.names:
@@ -92,7 +92,7 @@ class PushModel:
     def _number(self, names: tuple[str, ...]) -> Tensor:
         return torch.tensor([self._names.index(name) for name in names], device=self.device)[None]
 
-    def _at_rest(self, state: SceneState, order: list[int], number: Tensor) -> Motion:
+    def _motion_at_rest(self, state: SceneState, order: list[int], number: Tensor) -> Motion:
         """One scene in which nothing moves."""
         assert state.pusher is not None  # checked
         quaternion = self._tensor(state.poses.quaternion[order])
@@ -105,16 +105,18 @@ class PushModel:
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array, float), device=self.device)
 
-    def _start(self, state: SceneState, order: list[int], names: tuple[str, ...], before: SceneState | None) -> Motion:
-        """The state as it is, going on as it moved during the action before."""
+    def _initial_motion(
+        self, state: SceneState, order: list[int], names: tuple[str, ...], before: SceneState | None
+    ) -> Motion:
+        """The state with the velocities of the action before; at rest if that is not given."""
         number = self._number(names)
-        start = self._at_rest(state, order, number)
+        start = self._motion_at_rest(state, order, number)
         if before is None:
             return start
         if sorted(before.names) != list(names):
             raise InvalidInput("objects one action ago", ", ".join(before.names), "those of the state")
         earlier = sorted(range(len(names)), key=before.names.__getitem__)
-        former = self._at_rest(replace(before, pusher=state.pusher), earlier, number)
+        former = self._motion_at_rest(replace(before, pusher=state.pusher), earlier, number)
         return going_on(former, start)
 
     def _unroll(self, number: Tensor, start: Motion, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -133,7 +135,7 @@ class PushModel:
                 moved.append(has_moved)
         return tuple(torch.stack(part, dim=1).cpu().numpy() for part in (centres, turned, moved))  # pyright: ignore[reportReturnType]
 
-    def _told(
+    def _rollouts(
         self,
         state: SceneState,
         order: list[int],
