@@ -100,6 +100,7 @@ def test_everything_lies_in_the_folder_and_nothing_else(ran):
     assert (ran.out / "episode.viser").stat().st_size > 100_000
 
 
+@pytest.mark.slow
 def test_people_are_told_in_sentences(ran, tmp_path, data_dir, monkeypatch, capsys):
     noticed = [{"step": 1, "matter": "lamp", "text": "The lamp was moved."}]
     last = EpisodeStep(2, 2, "Done", report={**ran.report, "noticed": noticed})
