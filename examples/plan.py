@@ -3,7 +3,7 @@
 import numpy as np
 from scene import table
 
-from osfcore import FieldLibrary, Planner, Pose, SceneState, load_push_model
+from osfcore import FieldLibrary, MPPIPlanner, Pose, SceneState, load_push_model
 from osfcore.dynamics.push_models import load_shapes
 from osfcore.geometry.workspace import STEP_S
 from osfcore.planning.pose_cost import PoseCost, PoseGoal
@@ -16,16 +16,16 @@ def main() -> None:
     """Replan after every two actions."""
     state, library, rng = table(), FieldLibrary(None), np.random.default_rng(0)
     model = load_push_model(None, library, state.names)
-    planner = Planner(model.rollout, PushProposals(load_shapes(None, library, state.names)))
+    planner = MPPIPlanner(model.rollout, PushProposals(load_shapes(None, library, state.names)))
     can = state.names[0]
     target = Pose(state.pose(can).position + np.array([0.0, 0.12, 0.0]), state.pose(can).quaternion)
     goal = PoseGoal.of(state, {can: target})
     for step in range(0, STEPS, 2):
         for _ in planner.plan(state, goal, PoseCost(goal), rng):
             pass
-        actions = planner.upcoming(2)
+        actions = planner.nominal(2)
         future = model.rollout(state, actions[None])
-        planner.executed(2)
+        planner.shift(2)
         poses = Pose(future.positions[0, -1], future.quaternions[0, -1])
         pusher = state.pusher + STEP_S * actions.sum(axis=0)
         state = SceneState(state.names, poses, state.light, pusher)

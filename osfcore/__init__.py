@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from osfcore.geometry.poses import Pose
     from osfcore.geometry.states import Observation, SceneState
     from osfcore.objects.asset_library import AssetLibrary
-    from osfcore.planning.mppi import Planner
+    from osfcore.planning.mppi import MPPIPlanner
     from osfcore.render.scene_renderer import SceneRenderer
     from osfcore.render.types import SceneBatch
     from osfcore.world.tabletop import Tabletop
@@ -65,7 +65,7 @@ _HOMES = {
     "ObjectModels": "estimation.objective.object_models",
     "Observation": "geometry.states",
     "OsfError": "errors",
-    "Planner": "planning.mppi",
+    "MPPIPlanner": "planning.mppi",
     "Pose": "geometry.poses",
     "PushModel": "dynamics.rollout",
     "SceneBatch": "render.types",
@@ -89,10 +89,10 @@ __all__ = [
     "KiloOSF",
     "Knowledge",
     "Light",
+    "MPPIPlanner",
     "ObjectModels",
     "Observation",
     "OsfError",
-    "Planner",
     "Pose",
     "PushModel",
     "SceneBatch",

@@ -33,8 +33,8 @@ from osfcore.control.events import (
 )
 from osfcore.control.goal import GoalImage, alike, settled, unmoved
 from osfcore.control.knowledge import Knowledge
-from osfcore.control.monitor import Patience, carried, lamp_moved, offsets
-from osfcore.control.relocalization import search_lost
+from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, offsets
+from osfcore.control.relocalization import relocalize
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
 from osfcore.estimation.first_frame import estimate_first
@@ -48,7 +48,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.planning.image_cost import ImageCost
-from osfcore.planning.mppi import Planner
+from osfcore.planning.mppi import MPPIPlanner
 from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.render.types import Quality, SceneBatch
@@ -87,10 +87,10 @@ class Episode:
     ) -> None:
         self.settings = settings
         self._world, self._knowledge, self._wanted, self._rng = world, knowledge, goal, rng
-        self._planner = Planner(knowledge.dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
+        self._planner = MPPIPlanner(knowledge.dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
         self._start = start
         self._number = 0
-        self._patience = Patience()
+        self._progress = ProgressMonitor()
         self._doubted: dict[str, int] = {}
         self._searches = 0
         self._seconds: dict[str, float] = {}
@@ -122,8 +122,8 @@ class Episode:
             yield from self._look_again()
             stepped = self._stepped()
             yield stepped
-            if self._patience.is_out(float(stepped.offsets_m.sum())):
-                self._planner.forget()
+            if self._progress.is_stalled(float(stepped.offsets_m.sum())):
+                self._planner.reset()
                 yield self._noticed("stalled", "Nothing has come nearer for some time; drawing new plans.")
 
     # Looking
@@ -172,9 +172,9 @@ class Episode:
         angle = lamp_moved(before.state.light, now.light)
         if angle is not None:
             yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f} deg; its new place is known.")
-        names = carried(expected, now)
+        names = moved_by_hand(expected, now)
         if names:
-            self._planner.forget()
+            self._planner.reset()
             self._before = None
             yield self._noticed("object", f"Somebody moved {', '.join(names)}; found again.", names)
 
@@ -192,9 +192,9 @@ class Episode:
             yield from self._retreat()
         observation = self._world.observe()
         yield Observed(self._number, observation)
-        steps = search_lost(self._knowledge.models, observation, self._estimate, self._rng)
+        steps = relocalize(self._knowledge.models, observation, self._estimate, self._rng)
         self._estimate = _with_pusher((yield from self._looked("search", steps)), observation.pusher)
-        self._planner.forget()
+        self._planner.reset()
         self._before = None
         if self._estimate.trusted:
             yield self._noticed("found", f"Found {', '.join(lost)} again.", lost)
@@ -249,12 +249,12 @@ class Episode:
         return ImageCost(self._knowledge.models.together, self._camera, self._image, self._light)
 
     def _act(self) -> Iterator[Event]:
-        actions = self._planner.upcoming(min(self.settings.replan_every, self.settings.steps - self._number))
+        actions = self._planner.nominal(min(self.settings.replan_every, self.settings.steps - self._number))
         state = self._estimate.state
         futures = self._knowledge.dynamics.rollout(state, actions[None], self._before)
         for action in actions:
             yield self._execute(action)
-        self._planner.executed(len(actions))
+        self._planner.shift(len(actions))
         self._before = state if len(actions) == 1 else _future(futures, len(actions) - 1, state)
         self._expected = _future(futures, len(actions), state)
 

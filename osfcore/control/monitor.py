@@ -1,4 +1,4 @@
-"""What a loop must notice: that everything arrived, that nothing gets better, that somebody moved something."""
+"""Monitoring of a closed loop: distance to the goal, stalled progress, changes that no push explains."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from osfcore.planning.pose_cost import PoseGoal
 
-_PATIENCE = 8  # actions without progress
+_MAX_STALLED = 8  # actions without progress
 _PROGRESS_M = 0.003
 _LAMP_RAD = np.deg2rad(4.0)
-_CARRIED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
+_MOVED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
 _REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perhaps by way of another object
 
 
@@ -25,19 +25,19 @@ def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], 
     return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
 
 
-class Patience:
-    """Whether the distance to the goal still shrinks."""
+class ProgressMonitor:
+    """Detects that the distance to the goal no longer shrinks."""
 
     def __init__(self) -> None:
         self._least, self._since = np.inf, 0
 
-    def is_out(self, distance_m: float) -> bool:
-        """Tell the distance after each action; true when it has not shrunk for long, and then it begins anew."""
+    def is_stalled(self, distance_m: float) -> bool:
+        """Take the distance after each action; true once it has not shrunk for 8 actions, and counting restarts."""
         if distance_m < self._least - _PROGRESS_M:
             self._least, self._since = distance_m, 0
             return False
         self._since += 1
-        if self._since < _PATIENCE:
+        if self._since < _MAX_STALLED:
             return False
         self._least, self._since = distance_m, 0
         return True
@@ -49,13 +49,13 @@ def lamp_moved(before: Light, now: Light) -> float | None:
     return angle if angle > _LAMP_RAD else None
 
 
-def carried(expected: SceneState, now: SceneState) -> tuple[str, ...]:
-    """Objects that no push can have brought where they are."""
+def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:
+    """Objects that are not where they were expected, too far from the pusher for a push to be the cause."""
     assert now.pusher is not None
     shift = np.linalg.norm(now.poses.position - expected.poses.position, axis=1)
     ends = [now.pusher] if expected.pusher is None else [now.pusher, expected.pusher]
     away = np.min(
         [np.linalg.norm(expected.poses.position[:, :2] - end[:2], axis=1) for end in ends], axis=0
     )  # fmt: skip
-    is_carried = (shift > _CARRIED_M) & (away > _REACH_M + PUSHER_RADIUS_M)
-    return tuple(name for name, flag in zip(now.names, is_carried, strict=True) if flag)
+    is_moved = (shift > _MOVED_M) & (away > _REACH_M + PUSHER_RADIUS_M)
+    return tuple(name for name, flag in zip(now.names, is_moved, strict=True) if flag)

@@ -1,4 +1,4 @@
-"""Finding again what a tracker lost, without masks: looked for all over one camera's image, then in all images."""
+"""Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation, SceneState
 
 
-def search_lost(
+def relocalize(
     models: ObjectModels, observation: Observation, last: EstimatedState, rng: np.random.Generator
 ) -> Iterator[EstimateStep]:
     """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
@@ -39,14 +39,14 @@ def search_lost(
         seen = step.estimate
         yield replace(step, estimate=None)
     assert seen is not None, "the last step brings the estimate"
-    expected = replace(_with(state, seen.state, lost), pusher=observation.pusher)
+    expected = replace(_with_poses_of(state, seen.state, lost), pusher=observation.pusher)
     for step in estimate_next(models, observation, expected, rng):
         found = step.estimate
         is_worse = found is not None and sum(map(bool, found.doubts)) > len(lost)
         yield replace(step, estimate=last) if is_worse else step
 
 
-def _with(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:
+def _with_poses_of(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:
     """The state with some of its objects where another one has them."""
     positions, quaternions = state.poses.position.copy(), state.poses.quaternion.copy()
     for n in numbers:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from osfcore.dynamics.contact_graph import Graph
-from osfcore.dynamics.limit_surface import lever, slide
+from osfcore.dynamics.limit_surface import friction_arm, push_motion
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
 from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import Gap, dot
@@ -89,7 +89,9 @@ def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Ten
     """Sliding at a contact, so far that the pusher's last position is free."""
     centre = graph.centre[:, :2]
     depth = (-graph.pusher.after.distance).clamp(min=0)
-    way = slide(gap.point - centre, -gap.normal, depth, graph.shift, lever(graph.outline - centre[:, None]))
+    way = push_motion(
+        gap.point - centre, -gap.normal, depth, graph.shift, friction_arm(graph.outline - centre[:, None])
+    )
     along = (turn[:, :2, :2] @ way[:, :2, None])[..., 0]
     return torch.cat([along / SHIFT_M, way[:, 2:] / TURN_RAD], dim=1)
 

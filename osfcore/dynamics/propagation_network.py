@@ -1,7 +1,11 @@
-"""The propagation network: one edge encoder and one propagator for whatever objects there are (paper eq. 7).
+"""The propagation network: message passing with shared encoders and propagators (paper eq. 7).
 
-After Li et al. 2019, "Propagation networks for model-based control under partial observation": edges and nodes are
-encoded once, effects travel along the edges several times, and each node's effect is decoded into its motion.
+After Li et al. 2019, "Propagation networks for model-based control under partial observation". With node features x_i
+and edge features r_ij, receiver i and sender j, and h^0_i = E_node(x_i), e^0_ij = E_edge(r_ij):
+
+    e^{l+1}_ij = e^l_ij + P_edge^l(e^l_ij, h^l_i, h^l_j)
+    h^{l+1}_i  = h^l_i + P_node^l(h^0_i, h^l_i, sum_j e^{l+1}_ij)
+    motion_i   = D(h^0_i, h^L_i)
 """
 
 from __future__ import annotations
@@ -18,12 +22,12 @@ MOTION = 6  # displacement of the centre of mass, rotation vector
 class PropagationNetwork(nn.Module):
     """From the features of a graph to the motion of its nodes, in units of the features' scales.
 
-    Deviation from Li et al.: every step has a propagator of its own, and edges keep what travelled along them; for the
-    same time, both are more exact.
+    Deviation from Li et al.: every step has propagators of its own, and edges have a state; for the same time, both
+    are more accurate.
 
     Args:
         hidden: width of all layers.
-        steps: how often effects travel along the edges.
+        steps: L, propagation steps.
     """
 
     def __init__(self, hidden: int = 128, steps: int = 3) -> None:

@@ -1,4 +1,4 @@
-"""What it costs that a future does not look like the goal image (paper, section 4.4)."""
+"""Image cost of rollouts: squared difference from the goal image (line 15 of the paper's Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME = 5  # decimals of metres and quaternions up to which states count as one
 
 
 class ImageCost:
-    """Squared differences between rendered futures and the goal image, summed over the horizon.
+    """S = sum over t of |I(t) - I_goal|^2 with I(t) rendered from the goal camera, as a mean over pixels.
 
     Deviations: futures are rendered in 64 pixels a side, at every third state and the last; states that are the same in
     several sequences, as the beginnings mostly are, once. The pusher is left out, for the goal image shows none.

@@ -1,8 +1,8 @@
-"""Ways of the pusher over the table that touch nothing.
+"""Path planning of the pusher: shortest collision-free paths on a grid, shortcut by line of sight.
 
-The far side of an object is behind it: a pusher that can only go straight would push it the wrong way first. Ways are
-shortest paths on a grid around the objects' outlines (minimum cost paths of scikit-image), straightened where the sight
-is free. Where there is no free way, the one through the fewest cells too close to something is taken.
+The configuration space is the distance transform of the objects' outlines; paths are minimum-cost paths over its cells
+(scikit-image's MCP_Geometric, a Dijkstra search). Cells too close to an object cost 200 times as much, so that a start
+in contact is possible and, where no path is free, the one with the fewest such cells is found.
 """
 
 from __future__ import annotations
@@ -52,22 +52,22 @@ class FreeSpace:
         rows = cells.clip(0, _SIDE - 1)
         return within & self._free[rows[:, 0], rows[:, 1]]
 
-    def ways_from(self, start: Float[np.ndarray, "2"]) -> ShortestPaths:
-        """All shortest ways from a place within reach [m]."""
+    def paths_from(self, start: Float[np.ndarray, "2"]) -> ShortestPaths:
+        """All shortest paths from a place within reach [m]."""
         return ShortestPaths(self, start)
 
     def cost(self) -> Float[np.ndarray, "S S"]:
-        """Of each cell of a way."""
+        """Cost of each cell of a path."""
         return np.where(self._free, 1.0, _BLOCKED)
 
-    def sees(self, a: Int[np.ndarray, "2"], b: Int[np.ndarray, "2"]) -> bool:
-        """Whether the straight way between two cells is free, but for its ends."""
+    def has_line_of_sight(self, a: Int[np.ndarray, "2"], b: Int[np.ndarray, "2"]) -> bool:
+        """Whether the straight line between two cells is free, but for its ends."""
         rows, columns = line(*a, *b)
         return bool(self._free[rows[1:-1], columns[1:-1]].all())
 
 
 class ShortestPaths:
-    """Shortest ways from one place.
+    """Shortest paths from one place.
 
     Args:
         space: that they lead through.
@@ -82,17 +82,17 @@ class ShortestPaths:
         self._search.find_costs(_cells(start[None]).clip(0, _SIDE - 1).tolist())
 
     def to(self, end: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
-        """The way to a place within reach, corner by corner [m]."""
+        """The path to a place within reach, as its corners [m]."""
         cells = np.array(self._search.traceback(_cells(end[None]).clip(0, _SIDE - 1)[0].tolist()))
         corners = cells[self._corners(cells)] * CELL_M - PUSHER_REACH_M
         return np.concatenate([self._start[None], corners[1:-1], end[None]])
 
     def _corners(self, cells: Int[np.ndarray, "n 2"]) -> list[int]:
-        """Fewer corners: each leads to the farthest one in free sight."""
+        """Shortcut smoothing: each corner is followed by the farthest one in line of sight."""
         kept, at = [0], 0
         while at < len(cells) - 1:
             later = len(cells) - 1
-            while later > at + 1 and not self._space.sees(cells[at], cells[later]):
+            while later > at + 1 and not self._space.has_line_of_sight(cells[at], cells[later]):
                 later = at + max((later - at) * 3 // 4, 1)
             at = later
             kept.append(at)
@@ -104,27 +104,27 @@ def _cells(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
 
 
 def actions_along(
-    way: Float[np.ndarray, "n 2"], horizon: int, speeds: Float[np.ndarray, "n-1"] | None = None
+    path: Float[np.ndarray, "n 2"], horizon: int, speeds: Float[np.ndarray, "n-1"] | None = None
 ) -> Float[np.ndarray, "T 3"]:
-    """Velocities that lead along a way, each leg at its share of the highest speed; at rest after its end [m/s].
+    """Velocities that follow a path, each leg at its share of the highest speed; zero after its end [m/s].
 
     Args:
-        way: corners, the first where the pusher is [m].
+        path: corners, the first where the pusher is [m].
         horizon: number of actions.
         speeds: share of the highest speed on each leg, above 0; all 1 by default.
     """
-    times = np.concatenate([[0.0], np.cumsum(_legs_s(way, speeds))])
+    times = np.concatenate([[0.0], np.cumsum(_legs_s(path, speeds))])
     moments = STEP_S * np.arange(horizon + 1)
-    places = np.stack([np.interp(moments, times, way[:, axis]) for axis in range(2)], axis=1)
+    places = np.stack([np.interp(moments, times, path[:, axis]) for axis in range(2)], axis=1)
     velocity = np.diff(places, axis=0) / STEP_S
     return np.pad(velocity, ((0, 0), (0, 1)))
 
 
-def duration_s(way: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:
-    """How long a way takes [s], each leg at its share of the highest speed."""
-    return float(_legs_s(way, speeds).sum())
+def duration_s(path: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:
+    """Duration of a path [s], each leg at its share of the highest speed."""
+    return float(_legs_s(path, speeds).sum())
 
 
-def _legs_s(way: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None) -> Float[np.ndarray, "n-1"]:
-    legs = np.abs(np.diff(way, axis=0)).max(axis=1)  # speeds are limited along each axis
+def _legs_s(path: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None) -> Float[np.ndarray, "n-1"]:
+    legs = np.abs(np.diff(path, axis=0)).max(axis=1)  # speeds are limited along each axis
     return legs / (MAX_SPEED_M_S * (np.ones(len(legs)) if speeds is None else speeds))

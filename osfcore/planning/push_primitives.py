@@ -32,7 +32,7 @@ class Pushes:
     ends: Float[np.ndarray, "P 2"]
 
 
-def sides(outlines: Sequence[Float[np.ndarray, "K 2"]]) -> Float[np.ndarray, "n 2"]:
+def outline_points(outlines: Sequence[Float[np.ndarray, "K 2"]]) -> Float[np.ndarray, "n 2"]:
     """Points at most 5 mm apart all along the outlines of an object's convex parts [m]."""
     found = []
     for outline in outlines:
@@ -50,13 +50,13 @@ def straight_pushes(
     """Pushes that bring an object about as far as it has to go.
 
     Args:
-        outline: of the object from above, points all along it, see `sides` [m].
+        outline: of the object from above, points all along it, see `outline_points` [m].
         offset: how far it has to go [m], not zero.
         count: how many to draw.
         rng: draws directions, places beside the middle and lengths; None for pushes straight through the middle.
     """
     direction_to, distance = np.arctan2(offset[1], offset[0]), np.linalg.norm(offset)
-    turn, aside_by, share = _chances(count, rng)
+    turn, aside_by, share = _sample_directions(count, rng)
     angle = direction_to + turn
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     side = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
@@ -71,7 +71,7 @@ def straight_pushes(
     return Pushes(starts, (touching + distance * share)[:, None] * direction + lateral)
 
 
-def _chances(count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sample_directions(count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if rng is None:
         return np.zeros(count), np.zeros(count), np.ones(count)
     turn = rng.normal(0, _ANGLE_RAD, count)

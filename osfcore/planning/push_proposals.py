@@ -1,10 +1,9 @@
-"""Pushes worth trying: one object after another, each from its far side.
+"""Push proposals: samples for MPPI that push one object after another toward its goal.
 
-Random velocities touch an object in one step of eight, so sampling alone rarely finds that the pusher has to walk
-around an object first, let alone that three objects have to be pushed one after another. Each proposal is a whole
-sequence of actions: a way that touches nothing to a place behind an object, a straight push toward its goal at some
-angle, off its middle by some amount, about as far as it has to go; then the same with the next object, as if the first
-had arrived. All orders of the objects are tried. MPPI takes it from there.
+Random velocities touch an object in one of eight sequences, so sampling alone rarely finds a path around an object, let
+alone pushes of three objects one after another. A proposal is a whole sequence of actions: a collision-free path
+(`path_planning`) to the far side of an object, a straight push toward its goal (`push_primitives`) with random angle,
+offset and length, then the same for the next object, as if the first had arrived. All orders of objects are sampled.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.planning.path_planning import FreeSpace, ShortestPaths, actions_along, duration_s
 from osfcore.planning.pose_cost import PoseGoal
-from osfcore.planning.push_primitives import Pushes, sides, straight_pushes
+from osfcore.planning.push_primitives import Pushes, outline_points, straight_pushes
 
-_DONE_M = 0.004  # an object this close to its goal is not pushed on purpose
+_REACHED_M = 0.004  # an object this close to its goal is not pushed on purpose
 _SPEEDS = (0.6, 1.0)  # of the highest
 _ORDERS = 6  # all of three objects
 _SPARE = 3  # times as many pushes are drawn as needed: some begin where there is no room
@@ -55,13 +54,13 @@ class PushProposals:
             rng: draws orders, angles, offsets, lengths and speeds.
         """
         offsets = goal.offsets_m(state)
-        off = [n for n, offset in enumerate(offsets) if np.linalg.norm(offset) > _DONE_M]
+        off = [n for n, offset in enumerate(offsets) if np.linalg.norm(offset) > _REACHED_M]
         if not off:
             return np.zeros((0, horizon, 3))
         here = [self._outlines(name, state.pose(name)) for name in state.names]
         there = [self._outlines(name, goal.pose(name)) for name in state.names]
         orders = _orders(off, rng)
-        chains = _Chains(state, here, there, offsets, horizon, rng)
+        chains = _PushSequences(state, here, there, offsets, horizon, rng)
         each = -(-count // len(orders))
         found = [actions for order in orders for actions in chains.draw(order, each)]
         return np.array(found[:count]).reshape(-1, horizon, 3)
@@ -76,8 +75,8 @@ def _orders(off: list[int], rng: np.random.Generator) -> list[tuple[int, ...]]:
     return [tuple(rng.permutation(off).tolist()) for _ in range(_ORDERS)]
 
 
-class _Chains:
-    """Draws sequences of pushes; what several of them need is found once."""
+class _PushSequences:
+    """Samples sequences of pushes; free space and paths that several of them need are computed once."""
 
     def __init__(
         self, state: SceneState, here: list[Outlines], there: list[Outlines], offsets: Float[np.ndarray, "N 2"],
@@ -85,10 +84,10 @@ class _Chains:
     ) -> None:  # fmt: skip
         assert state.pusher is not None
         self._pusher, self._here, self._there, self._offsets = state.pusher[:2], here, there, offsets
-        self._sides = [sides(outlines) for outlines in here]
+        self._sides = [outline_points(outlines) for outlines in here]
         self._horizon, self._rng = horizon, rng
         self._spaces: dict[frozenset[int], FreeSpace] = {}
-        self._ways: dict[tuple[frozenset[int], int], ShortestPaths] = {}
+        self._paths: dict[tuple[frozenset[int], int], ShortestPaths] = {}
 
     def draw(self, order: tuple[int, ...], count: int) -> list[Float[np.ndarray, "T 3"]]:
         """Sequences that push objects in this order, as far as time and room allow."""
@@ -96,17 +95,17 @@ class _Chains:
         speeds: list[list[float]] = [[] for _ in range(count)]
         limit_s = self._horizon * STEP_S
         for stage, number in enumerate(order):
-            space, ways = self._after(order[:stage])
+            space, paths = self._after(order[:stage])
             pushes = self._clear_pushes(number, space, count)
             if pushes is None:
                 break
             for k in range(count):
                 if speeds[k] and duration_s(np.array(corners[k]), np.array(speeds[k])) >= limit_s:
                     continue
-                way = ways.to(pushes.starts[k])
+                path = paths.to(pushes.starts[k])
                 speed = float(self._rng.uniform(*_SPEEDS))
-                corners[k] += [*way[1:], pushes.ends[k]]
-                speeds[k] += [1.0] * (len(way) - 1) + [speed]
+                corners[k] += [*path[1:], pushes.ends[k]]
+                speeds[k] += [1.0] * (len(path) - 1) + [speed]
         if not speeds[0]:
             return []
         return [actions_along(np.array(c), self._horizon, np.array(s)) for c, s in zip(corners, speeds, strict=True)]
@@ -119,9 +118,9 @@ class _Chains:
             self._spaces[key] = FreeSpace([outline for parts in outlines for outline in parts])
         space = self._spaces[key]
         last = pushed[-1] if pushed else -1
-        if (key, last) not in self._ways:
-            self._ways[key, last] = space.ways_from(self._pusher if last < 0 else self._end(last))
-        return space, self._ways[key, last]
+        if (key, last) not in self._paths:
+            self._paths[key, last] = space.paths_from(self._pusher if last < 0 else self._end(last))
+        return space, self._paths[key, last]
 
     def _end(self, number: int) -> Float[np.ndarray, "2"]:
         """Where the pusher is after it has brought an object to its goal."""

@@ -167,7 +167,7 @@ def _moved(start: SceneState, wanted: SceneState | None) -> tuple[str, ...]:
     if wanted is None:
         return ()
     shift_m = np.linalg.norm(wanted.poses.position - start.poses.position, axis=1)
-    turn_rad = rotation_angle(wanted.poses.quaternion, start.poses.quaternion)
+    turn_rad = np.asarray(rotation_angle(wanted.poses.quaternion, start.poses.quaternion))
     return tuple(
         n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > _STAYS_M or rad > _STAYS_RAD
     )

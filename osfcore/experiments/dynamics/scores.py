@@ -213,7 +213,7 @@ def _angles(
     windows: Windows, symmetries: Mapping[str, Symmetry], a: Float[np.ndarray, "H W N 4"], b: np.ndarray
 ) -> Float[np.ndarray, "H W N"]:
     """Symmetry-aware angles between orientations [deg]."""
-    angles = rotation_angle(a, b)
+    angles = np.asarray(rotation_angle(a, b))
     for window, names in enumerate(windows.names):
         for slot, name in enumerate(names):
             if symmetries[name].kind != "none":

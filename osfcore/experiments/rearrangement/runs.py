@@ -18,7 +18,7 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.states import SceneState
 from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.planning.mppi import Planner
+from osfcore.planning.mppi import MPPIPlanner
 from osfcore.planning.pose_cost import PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.world.simulated_dynamics import SimulatedPushes
@@ -85,7 +85,7 @@ def _push_there(
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> None:
-    planner = Planner(dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
+    planner = MPPIPlanner(dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
     goal, number = _moved_goal(task), 0
     while number < settings.steps:
         state = world.truth()
@@ -97,10 +97,10 @@ def _push_there(
         planner.settings = replace(settings.plan, horizon=min(settings.plan.horizon, left))
         for _ in planner.plan(state, goal, PoseCost(goal), rng):
             pass
-        actions = planner.upcoming(min(settings.replan_every, left))
+        actions = planner.nominal(min(settings.replan_every, left))
         for action in actions:
             world.act(action)
-        planner.executed(len(actions))
+        planner.shift(len(actions))
         number += len(actions)
 
 

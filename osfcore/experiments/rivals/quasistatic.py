@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from osfcore.dynamics.contact_geometry import outlines
-from osfcore.dynamics.limit_surface import lever, slide
+from osfcore.dynamics.limit_surface import friction_arm, push_motion
 from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
 from osfcore.geometry import torch_rotations as rotations
@@ -33,7 +33,7 @@ def push(
 ) -> Iterator[Motion]:
     """The scenes after each of the pusher's displacements [m]."""
     outline = _outlines(table, number, motion)
-    arm = lever(outline)
+    arm = friction_arm(outline)
     for shift in shifts:
         parts = max(int(torch.ceil(shift.norm(dim=1).max() / _STRETCH_M)), 1)
         for _ in range(parts):
@@ -61,7 +61,7 @@ def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tup
         gap = gap_to_point(outline[rows, i], away[rows])
         depth = PUSHER_RADIUS_M - gap.distance
         pushed[rows, i] = depth > 0
-        way = slide(gap.point, -gap.normal, depth.clamp(min=0), shift[rows], arm[rows, i])
+        way = push_motion(gap.point, -gap.normal, depth.clamp(min=0), shift[rows], arm[rows, i])
         motion, outline = _moved(motion, outline, (rows, i), way)
     for _ in range(count - 1):
         before = pushed.clone()
@@ -85,7 +85,7 @@ def _shove(
     depth = (-gap.distance).clamp(min=0)
     pushed[rows, j] |= depth > 0
     point = _meeting(outline[rows, j], other, gap.normal)
-    way = slide(point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[rows, j])
+    way = push_motion(point, -gap.normal, depth, torch.zeros_like(gap.normal), arm[rows, j])
     return _moved(motion, outline, (rows, j), way)
 
 

@@ -40,7 +40,7 @@ def told(world, monkeypatch):
 
     monkeypatch.setattr(module, "estimate_first", lambda *_: steps("first", world.truth()))
     monkeypatch.setattr(module, "estimate_next", lambda *_, usual: steps("next", world.truth()))
-    monkeypatch.setattr(module, "search_lost", lambda *_: steps("search", world.truth()))
+    monkeypatch.setattr(module, "relocalize", lambda *_: steps("search", world.truth()))
     monkeypatch.setattr(module, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
     return doubts
 

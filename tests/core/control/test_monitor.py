@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.monitor import Patience, carried, lamp_moved, offsets
+from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, offsets
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
@@ -32,13 +32,13 @@ def test_offsets_are_on_the_table_and_turns_about_any_axis():
 
 
 def test_patience_lasts_while_there_is_progress():
-    patience = Patience()
-    assert not any(patience.is_out(0.5 - 0.005 * step) for step in range(60))
+    patience = ProgressMonitor()
+    assert not any(patience.is_stalled(0.5 - 0.005 * step) for step in range(60))
 
 
 def test_patience_ends_after_a_while_without_and_begins_anew():
-    patience = Patience()
-    told = [patience.is_out(0.2) for _ in range(20)]
+    patience = ProgressMonitor()
+    told = [patience.is_stalled(0.2) for _ in range(20)]
     assert told.index(True) == 8
     assert sum(told) == 2
 
@@ -50,9 +50,9 @@ def test_a_lamp_counts_as_moved_from_a_few_degrees_on(angle, is_told):
 
 
 def test_an_object_far_from_the_pusher_was_carried():
-    assert carried(STATE, shifted(STATE, 1, [0.0, 0.06, 0.0])) == ("b",)
-    assert carried(STATE, shifted(STATE, 1, [0.0, 0.01, 0.0])) == ()
+    assert moved_by_hand(STATE, shifted(STATE, 1, [0.0, 0.06, 0.0])) == ("b",)
+    assert moved_by_hand(STATE, shifted(STATE, 1, [0.0, 0.01, 0.0])) == ()
 
 
 def test_what_the_pusher_can_reach_may_have_been_pushed():
-    assert carried(STATE, shifted(STATE, 0, [0.0, 0.06, 0.0])) == ()
+    assert moved_by_hand(STATE, shifted(STATE, 0, [0.0, 0.06, 0.0])) == ()

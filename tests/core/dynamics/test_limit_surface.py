@@ -5,7 +5,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.limit_surface import FRICTION, lever, slide
+from osfcore.dynamics.limit_surface import FRICTION, friction_arm, push_motion
 from osfcore.geometry.polygons import circle
 
 angles = st.floats(-3.1, 3.1)
@@ -17,7 +17,7 @@ drags = st.floats(-0.01, 0.01)
 
 def push(point, inward, depth, shift, arm) -> torch.Tensor:
     rows = [torch.tensor([v], dtype=torch.float64) for v in (point, inward, depth, shift, arm)]
-    return slide(*rows)[0]
+    return push_motion(*rows)[0]
 
 
 def contact_motion(way, point) -> torch.Tensor:
@@ -100,5 +100,5 @@ def test_a_push_beside_the_centre_turns_away_from_it():
 @given(radius=st.floats(0.01, 0.1), scale=st.floats(0.1, 10))
 def test_the_lever_grows_with_the_outline(radius, scale):
     disc = radius * circle(64)[None]
-    assert float(lever(disc)) == pytest.approx(1.2 * radius, rel=1e-5)
-    torch.testing.assert_close(lever(scale * disc), scale * lever(disc))
+    assert float(friction_arm(disc)) == pytest.approx(1.2 * radius, rel=1e-5)
+    torch.testing.assert_close(friction_arm(scale * disc), scale * friction_arm(disc))

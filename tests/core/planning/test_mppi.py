@@ -8,7 +8,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
-from osfcore.planning.mppi import Planner, PlanSettings
+from osfcore.planning.mppi import MPPIPlanner, PlanSettings
 from osfcore.planning.pose_cost import PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from tests.core.dynamics.scenes import APPLE, CAN, scene
@@ -48,7 +48,7 @@ def planned(planner, state, goal, seed: int = 0):
 
 def test_a_plan_leads_toward_the_goal(shapes, start):
     goal = goal_of(start, (0.12, -0.08))
-    rounds = planned(Planner(carried, PushProposals(shapes), SMALL), start, goal)
+    rounds = planned(MPPIPlanner(carried, PushProposals(shapes), SMALL), start, goal)
     assert [r.number for r in rounds] == [0, 1]
     actions = rounds[-1].actions
     assert actions.shape == (12, 3)
@@ -62,16 +62,16 @@ def test_a_plan_leads_toward_the_goal(shapes, start):
 
 def test_planning_on_comes_closer(shapes, start):
     goal = goal_of(start, (0.12, -0.08))
-    planner = Planner(carried, PushProposals(shapes), SMALL)
+    planner = MPPIPlanner(carried, PushProposals(shapes), SMALL)
     costs = [planned(planner, start, goal, seed)[-1].costs.min() for seed in range(6)]
     assert costs[-1] < 0.8 * costs[0]
-    planner.forget()
+    planner.reset()
     assert planned(planner, start, goal, 0)[-1].costs.min() == costs[0]
 
 
 def test_the_second_round_looks_less_far_and_leaves_the_rest_alone(shapes, start):
     goal = goal_of(start, (0.12, -0.08))
-    first, second = planned(Planner(carried, PushProposals(shapes), SHORT), start, goal)
+    first, second = planned(MPPIPlanner(carried, PushProposals(shapes), SHORT), start, goal)
     assert first.rollouts.positions.shape[1] == 12 + 1
     assert second.rollouts.positions.shape[1] == 6 + 1
     assert first.actions.shape == second.actions.shape == (12, 3)
@@ -84,7 +84,7 @@ def test_noise_vanishes_where_the_refined_part_begins_and_ends(shapes, start, re
     """The goal is met, so that the best plan is to rest and paths are nothing but noise."""
     settings = PlanSettings(samples=64, horizon=12, knot_every=every, refined=refined)
     goal = PoseGoal.of(start, {})
-    first, second = planned(Planner(carried, PushProposals(shapes), settings), start, goal)
+    first, second = planned(MPPIPlanner(carried, PushProposals(shapes), settings), start, goal)
     np.testing.assert_array_equal(first.actions, 0)
     noise = second.rollouts.pusher[..., :2] - start.pusher[:2]
     np.testing.assert_array_equal(noise[0], 0)  # one sample is the plan itself
@@ -95,20 +95,20 @@ def test_noise_vanishes_where_the_refined_part_begins_and_ends(shapes, start, re
 
 
 def test_what_comes_next_is_the_plan_and_then_rest(shapes, start):
-    planner = Planner(carried, PushProposals(shapes), SHORT)
-    np.testing.assert_array_equal(planner.upcoming(3), np.zeros((3, 3)))
+    planner = MPPIPlanner(carried, PushProposals(shapes), SHORT)
+    np.testing.assert_array_equal(planner.nominal(3), np.zeros((3, 3)))
     plan = planned(planner, start, goal_of(start, (0.12, -0.08)))[-1].actions
-    np.testing.assert_array_equal(planner.upcoming(4), plan[:4])
-    np.testing.assert_array_equal(planner.upcoming(15), np.pad(plan, ((0, 3), (0, 0))))
-    planner.executed(4)
-    np.testing.assert_array_equal(planner.upcoming(12), np.pad(plan[4:], ((0, 4), (0, 0))))
-    planner.forget()
-    np.testing.assert_array_equal(planner.upcoming(2), np.zeros((2, 3)))
+    np.testing.assert_array_equal(planner.nominal(4), plan[:4])
+    np.testing.assert_array_equal(planner.nominal(15), np.pad(plan, ((0, 3), (0, 0))))
+    planner.shift(4)
+    np.testing.assert_array_equal(planner.nominal(12), np.pad(plan[4:], ((0, 4), (0, 0))))
+    planner.reset()
+    np.testing.assert_array_equal(planner.nominal(2), np.zeros((2, 3)))
 
 
 def test_the_same_seed_gives_the_same_plan(shapes, start):
     goal = goal_of(start, (0.1, 0.0))
-    a, b = (planned(Planner(carried, PushProposals(shapes), SMALL), start, goal, 5)[-1] for _ in range(2))
+    a, b = (planned(MPPIPlanner(carried, PushProposals(shapes), SMALL), start, goal, 5)[-1] for _ in range(2))
     np.testing.assert_array_equal(a.actions, b.actions)
 
 
@@ -119,10 +119,10 @@ def test_what_was_executed_is_dropped(shapes, start):
         seen.append(actions[0])
         return carried(state, actions)
 
-    planner = Planner(recorded, PushProposals(shapes), SMALL)
+    planner = MPPIPlanner(recorded, PushProposals(shapes), SMALL)
     goal = goal_of(start, (0.1, 0.0))
     plan = planned(planner, start, goal)[-1].actions
-    planner.executed(3)
+    planner.shift(3)
     planned(planner, start, goal)
     np.testing.assert_array_equal(seen[2][:-3], plan[3:])  # the first sample is the last plan itself
     np.testing.assert_array_equal(seen[2][-3:], 0)
@@ -138,11 +138,11 @@ def test_a_can_is_brought_to_its_goal_by_the_shipped_network(shapes, start):
     model = load_push_model(None, FIELDS, (APPLE, CAN))
     goal = goal_of(start, (0.02, -0.12))  # toward the pusher
     settings = PlanSettings(samples=32, horizon=12, refined=6)
-    planner, state, before = Planner(model.rollout, PushProposals(shapes), settings), start, None
+    planner, state, before = MPPIPlanner(model.rollout, PushProposals(shapes), settings), start, None
     for step in range(12):
         actions = list(planner.plan(state, goal, PoseCost(goal, 0.0), np.random.default_rng(step), before))[-1].actions
         future = model.rollout(state, actions[None, :2], before)
-        planner.executed(2)
+        planner.shift(2)
         before, state = (
             SceneState(
                 state.names, Pose(future.positions[0, t], future.quaternions[0, t]), state.light, future.pusher[0, t]

@@ -27,7 +27,7 @@ def distance_to_box(points) -> np.ndarray:
 
 def test_on_an_empty_table_ways_are_straight():
     start, ends = np.array([-0.2, 0.1]), np.array([[0.3, 0.05], [-0.2, 0.1], [0.0, -0.3]])
-    ways = FreeSpace([]).ways_from(start)
+    ways = FreeSpace([]).paths_from(start)
     for end in ends:
         way = ways.to(end)
         np.testing.assert_array_equal(way[[0, -1]], [start, end])
@@ -40,13 +40,13 @@ def test_ways_go_around_what_stands_in_them(x, y, u, v):
     start, end = np.array([x, y]), np.array([u, v])
     if not space.is_free(np.stack([start, end])).all():
         return
-    way = space.ways_from(start).to(end)
+    way = space.paths_from(start).to(end)
     assert distance_to_box(along(way)).min() > PUSHER_RADIUS_M + CLEARANCE_M - 2 * CELL_M
     assert length_of(way) < np.linalg.norm(end - start) + 0.25
 
 
 def test_the_other_side_of_a_box_is_reached_by_the_shorter_way_around():
-    way = FreeSpace([BOX]).ways_from(np.array([-0.02, -0.1])).to(np.array([-0.02, 0.1]))
+    way = FreeSpace([BOX]).paths_from(np.array([-0.02, -0.1])).to(np.array([-0.02, 0.1]))
     assert along(way)[:, 0].min() < -0.05 - PUSHER_RADIUS_M  # by the left end
     assert along(way)[:, 0].max() < 0.0
     aside = 0.05 + PUSHER_RADIUS_M + CLEARANCE_M - 0.02
@@ -57,7 +57,7 @@ def test_from_a_place_in_contact_a_way_leads_out():
     space = FreeSpace([BOX])
     start = np.array([0.0, 0.03 + PUSHER_RADIUS_M])
     assert not space.is_free(start[None])[0]
-    way = space.ways_from(start).to(np.array([0.0, -0.2]))
+    way = space.paths_from(start).to(np.array([0.0, -0.2]))
     points = along(way)
     inside = distance_to_box(points) < PUSHER_RADIUS_M - CELL_M
     assert not inside.any()
@@ -65,9 +65,9 @@ def test_from_a_place_in_contact_a_way_leads_out():
 
 def test_a_way_does_not_depend_on_those_asked_for_before():
     space, start, end = FreeSpace([BOX]), np.array([-0.2, 0.0]), np.array([0.2, 0.01])
-    ways = space.ways_from(start)
+    ways = space.paths_from(start)
     ways.to(np.array([0.0, 0.3]))
-    np.testing.assert_array_equal(ways.to(end), space.ways_from(start).to(end))
+    np.testing.assert_array_equal(ways.to(end), space.paths_from(start).to(end))
 
 
 def test_out_of_reach_is_not_free():
