@@ -1,7 +1,6 @@
 """The job registry: one job runs at a time in a process of its own, the others wait their turn.
 
-Everything is written through to the store. A service that stops fails the job it was running; waiting ones go on after
-the next start.
+A service that stops fails the job it was running; waiting ones go on after the next start.
 """
 
 from __future__ import annotations

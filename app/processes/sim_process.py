@@ -39,13 +39,13 @@ from app.processes.scene_messages import (
     TakeView,
     WatchFrames,
 )
-from osfcore.errors import InvalidInput, OsfError, UnknownName
-from osfcore.geometry.cameras import Camera, default_cameras, goal_camera, image_side
+from app.processes.scene_pictures import image_png, mask_png
+from osfcore.errors import OsfError, UnknownName
+from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S, check_action
-from osfcore.inspection.mask_tint import tint_masks
 from osfcore.io.image_file import encode_jpeg, encode_png, to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -147,12 +147,12 @@ class Simulation:
             case Act(scene, actions):
                 return self._act(scene, tuple(check_action(a) for a in actions))
             case TakeImage():
-                return self._image(command)
+                return image_png(self._world(command.id), command)
             case TakeView(scene, camera, pusher):
                 image = self._world(scene).render((camera,), with_pusher=pusher).images[0]
                 return encode_png(to_uint8(image))
             case TakeMask():
-                return self._mask(command)
+                return mask_png(self._world(command.id), command)
             case ObserveScene():
                 return self._observe(command)
             case ComposeGoal():
@@ -287,29 +287,6 @@ class Simulation:
         return self._time_offsets[scene] + self._worlds[scene].time_s
 
     # Pictures
-
-    def _camera(self, name: str, size: int) -> Camera:
-        cameras = {c.name: c for c in (*default_cameras(image_side(size)), goal_camera(size))}
-        if name not in cameras:
-            raise UnknownName("camera", name, cameras)
-        return cameras[name]
-
-    def _image(self, command: TakeImage) -> bytes:
-        world, camera = self._world(command.id), self._camera(command.camera, command.size)
-        seen = world.render((camera,), masks=command.masks, with_pusher=command.pusher)
-        pixels = to_uint8(seen.images[0])
-        if command.masks and seen.masks is not None:
-            pixels = tint_masks(pixels, seen.masks[0])
-        return encode_png(pixels)
-
-    def _mask(self, command: TakeMask) -> bytes:
-        world, camera = self._world(command.id), self._camera(command.camera, command.size)
-        if command.object not in world.names:
-            raise UnknownName("object on the table", command.object, world.names)
-        masks = world.render((camera,), masks=True).masks
-        if masks is None:
-            raise InvalidInput("renderer", "without masks", "one that makes masks")
-        return encode_png(masks[0][world.names.index(command.object)].astype(np.uint8) * 255)
 
     def _observe(self, command: ObserveScene) -> SceneRecord:
         from osfcore.io.observation_file import write_observation

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from app.processes.scene_messages import SceneRecord
-from app.services.runner import MAX_SEED
+from app.services.scenes import MAX_SEED
 from osfcore.geometry.cameras import (
     DEFAULT_IMAGE_SIDE,
     MAX_IMAGE_SIDE,

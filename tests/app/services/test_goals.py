@@ -13,7 +13,7 @@ from app.processes.process_server import InternalError
 from app.processes.scene_messages import ComposedGoal
 from app.services.event_hub import Hub
 from app.services.goals import GOAL_SIDE, Draft, DraftChanged, DraftUnsound, Goals, GoalsChanged, NoDraft, NoTable
-from app.services.runner import SceneHeld
+from app.services.scenes import SceneHeld
 from app.storage.database import CannotStore
 from app.storage.goal_store import GoalStore, TooManyGoals
 from app.storage.photos import PhotoRefused

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.services.presets import PRESETS, preset, set_up
-from app.services.runner import TooManyScenes
+from app.services.scenes import TooManyScenes
 from app.storage.database import CannotStore
 from osfcore.errors import UnknownName
 from osfcore.fields.field_library import FieldLibrary

@@ -12,7 +12,8 @@ import pytest
 from app.jobs.job import JobChanged, TrainingAlready
 from app.processes.scene_messages import SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
-from app.services.runner import Runner, SceneHeld, TooManyScenes
+from app.services.runner import Runner
+from app.services.scenes import SceneHeld, TooManyScenes
 from app.services.service_settings import Settings
 from app.storage.database import Store
 from osfcore.errors import InvalidInput, UnknownName

@@ -13,7 +13,7 @@ from app.processes.scene_messages import SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene, Notice
 from app.services.fields import MissingFields
 from app.services.pushes import MAX_ACTIONS
-from app.services.runner import SceneHeld
+from app.services.scenes import SceneHeld
 from app.viewer.nodes.push_nodes import PushNodes
 from app.viewer.panels.push_controls import PATH
 from app.viewer.panels.push_panel import PushPanel

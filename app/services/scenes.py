@@ -1,0 +1,349 @@
+"""Scenes: kept in the store, simulated in a process of their own, changed by one caller at a time."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import uuid
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from app.processes.process_client import ProcessClient, Status
+from app.processes.scene_messages import (
+    Act,
+    AdoptScene,
+    Command,
+    ComposedGoal,
+    ComposeGoal,
+    CreateScene,
+    DropScene,
+    EditScene,
+    FramesTaken,
+    ObserveScene,
+    ResetScene,
+    SceneChanged,
+    SceneRecord,
+    ShowScene,
+    TakeImage,
+    TakeMask,
+    WatchFrames,
+)
+from app.processes.sim_process import simulation_main
+from app.services.event_hub import CurrentScene, Hub, Notice
+from app.services.scene_images import SceneImages
+from app.services.service_settings import Settings
+from app.storage.database import Store, now_utc
+from osfcore.errors import InvalidInput, MissingAssets, OsfError, UnknownName
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, unit_quaternion
+from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.geometry.workspace import check_action
+from osfcore.objects.asset_library import AssetLibrary
+
+DEMO_OBJECTS = 3
+MAX_SEED = 2**31 - 1
+_LOST = "The simulation stopped unexpectedly and is being restarted."
+
+
+class SceneHeld(OsfError):
+    """A job drives the scene, so hands have to stay off."""
+
+    def __init__(self, scene: str, job: str) -> None:
+        super().__init__(f"Job {job} is using scene {scene}; pause or cancel it first.")
+
+
+class TooManyScenes(OsfError):
+    """No more scenes are kept."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"There are {limit} scenes already, which is the most; delete one first.")
+
+
+class Scenes:
+    """The scenes of one data directory. Changing one waits for the simulation; any thread may call."""
+
+    def __init__(self, settings: Settings, store: Store, library: AssetLibrary) -> None:
+        self._settings = settings
+        self._store = store
+        self.library = library
+        self.hub = Hub()
+        self._simulation = ProcessClient(
+            simulation_main,
+            (library.root, settings.max_live_worlds),
+            "simulation",
+            answer_s=settings.stage_timeout_s,
+            keeps_running=True,
+            greeting=self._greeting,
+            on_event=self._on_simulation_event,
+            on_lost=lambda: self.hub.publish(Notice("error", _LOST)),
+        )
+        self._lock = threading.RLock()
+        self._records: dict[str, SceneRecord] = {}
+        self._current: str | None = None
+        self._watchers = 0
+        self._images = SceneImages(
+            settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._simulation.call_async
+        )
+        self._scenes_in_the_making = 0
+
+    def start(self) -> None:
+        """Take over the scenes that the store holds, and start the simulation."""
+        records, self._current = self._store.scenes()
+        self._records = {record.id: record for record in records}
+        if self._current is None and records:
+            self._current = records[-1].id
+        self._simulation.start()
+
+    def stop(self) -> None:
+        """End the simulation. Calling it again does nothing."""
+        self._simulation.stop()
+
+    def holder(self, scene: str) -> str | None:
+        """The job that drives a scene, if one does: then only that job may change it."""
+        return None
+
+    # Reading
+
+    @property
+    def simulation_status(self) -> Status:
+        """Whether scenes can be worked with."""
+        return self._simulation.status
+
+    def scenes(self) -> tuple[SceneRecord, ...]:
+        """All scenes, oldest first."""
+        with self._lock:
+            return tuple(self._records.values())
+
+    @property
+    def current(self) -> str | None:
+        """The scene that is shown."""
+        return self._current
+
+    def scene(self, scene: str) -> SceneRecord:
+        """One scene.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        with self._lock:
+            if scene not in self._records:
+                raise UnknownName("scene", scene, self._records)
+            return self._records[scene]
+
+    # Changing
+
+    def create_scene(
+        self,
+        names: tuple[str, ...] | None = None,
+        count: int = DEMO_OBJECTS,
+        seed: int | None = None,
+        light: Light | None = None,
+        poses: tuple[tuple[str, Pose], ...] | None = None,
+        image_size: int = DEFAULT_IMAGE_SIDE,
+    ) -> SceneRecord:
+        """Make a scene and show it.
+
+        Raises:
+            TooManyScenes: if there are too many.
+            OsfError: if the request makes no sense or cannot be met; then nothing changes.
+        """
+        image_side(image_size)
+        if poses is not None:
+            posed = tuple(name for name, _ in poses)
+            if names is not None and set(names) != set(posed):
+                raise InvalidInput("list of objects", ", ".join(names), "the objects that have poses, or left out")
+            names = posed
+        self._check_names(names)
+        with self._lock:
+            if len(self._records) + self._scenes_in_the_making >= self._settings.max_scenes:
+                raise TooManyScenes(self._settings.max_scenes)
+            self._scenes_in_the_making += 1
+        command = CreateScene(
+            id=uuid.uuid4().hex[:12],
+            seed=secrets.randbelow(MAX_SEED) if seed is None else seed,
+            created_at=now_utc(),
+            image_size=image_size,
+            names=names,
+            count=count,
+            light=light,
+            poses=None if poses is None else _stacked([pose for _, pose in poses]),
+        )
+        try:
+            record: SceneRecord = self._simulation.call(command)
+            with self._lock:
+                self._store.save_scene(record)
+                self._records[record.id] = record
+        finally:
+            with self._lock:
+                self._scenes_in_the_making -= 1
+        self.activate(record.id)
+        return record
+
+    def delete_scene(self, scene: str) -> None:
+        """Forget a scene; if it was shown, the latest other one is shown.
+
+        Raises:
+            UnknownName: if there is none.
+            SceneHeld: if a job uses it.
+        """
+        self._check_free(scene)
+        with self._lock:
+            self.scene(scene)
+            self._store.delete_scene(scene)
+            del self._records[scene]
+            self._simulation.submit(DropScene(scene))
+            was_current = self._current == scene
+            if was_current:
+                self._show(next(reversed(self._records), None))
+
+    def activate(self, scene: str) -> SceneRecord:
+        """Show a scene in viewer and pages.
+
+        Raises:
+            UnknownName: if there is none.
+        """
+        with self._lock:
+            record = self.scene(scene)
+            self._show(scene)
+            return record
+
+    def reset_scene(self, scene: str) -> SceneRecord:
+        """Put a scene back to how it was created.
+
+        Raises:
+            UnknownName: if there is none.
+            SceneHeld: if a job uses it.
+        """
+        self._check_free(scene)
+        return self._change(ResetScene(scene))
+
+    def edit_scene(
+        self, scene: str, light: Light | None = None, poses: tuple[tuple[str, Pose], ...] = (), *, settle: bool = False
+    ) -> SceneRecord:
+        """Move light and objects by hand, all or nothing.
+
+        Raises:
+            UnknownName: if there is no such scene or object.
+            SceneHeld: if a job uses the scene.
+            OsfError: if something would overlap or makes no sense; then nothing moves.
+        """
+        self._check_free(scene)
+        _check_poses(poses)
+        return self._change(EditScene(scene, light, poses, settle))
+
+    def act(self, scene: str, actions: Iterable[object]) -> SceneRecord:
+        """Hold each velocity (vx, vy, 0) [m/s] for 0.2 s.
+
+        Raises:
+            UnknownName: if there is no such scene.
+            SceneHeld: if a job uses it.
+            InvalidInput: if a velocity is out of range; then nothing moves.
+        """
+        self._check_free(scene)
+        return self._change(Act(scene, tuple(check_action(action) for action in actions)))
+
+    async def image(self, command: TakeImage | TakeMask) -> bytes:
+        """A PNG of a scene as it is now; asked for twice, it is made once.
+
+        Raises:
+            UnknownName: if there is no such scene, camera or object.
+            InvalidInput: if the size is out of range.
+        """
+        image_side(command.size)
+        return await self._images.image(command)
+
+    def observe(self, scene: str, folder: Path, *, goal: bool, masks: bool) -> SceneRecord:
+        """Write what the robot sees of a scene now as an observation folder; tells the scene as it was then.
+
+        Raises:
+            UnknownName: if there is no such scene.
+            OsfError: if the simulation is not there now.
+        """
+        self.scene(scene)
+        return self._simulation.call(ObserveScene(scene, folder, goal, masks))
+
+    def compose(self, command: ComposeGoal) -> ComposedGoal:
+        """How a scene could become, seen by the goal camera; the scene stays as it is.
+
+        Raises:
+            UnknownName: if there is no such scene or object.
+            SceneHeld: if a job uses the scene.
+            OsfError: if something would overlap, or makes no sense.
+        """
+        self.scene(command.id)
+        self._check_free(command.id)
+        _check_poses(command.poses)
+        image_side(command.size)
+        return self._simulation.call(command)
+
+    def watch_frames(self, change: int) -> None:
+        """Tell that `change` more (or less, if negative) listeners look at live images."""
+        with self._lock:
+            before, self._watchers = self._watchers, max(self._watchers + change, 0)
+            if (before > 0) != (self._watchers > 0):
+                self._simulation.submit(WatchFrames(self._watchers > 0))
+
+    # Inside
+
+    def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
+        self.scene(command.id)
+        record: SceneRecord = self._simulation.call(command)
+        with self._lock:
+            latest = self._records.get(command.id)
+            if latest is not None:
+                self._store.save_scene(latest)
+        return record
+
+    def _show(self, scene: str | None) -> None:
+        self._current = scene
+        self._store.set_current(scene)
+        self._simulation.submit(ShowScene(scene))
+        self.hub.publish(CurrentScene(None if scene is None else self._records[scene]))
+
+    def _check_names(self, names: tuple[str, ...] | None) -> None:
+        if names is None:
+            return
+        if not 1 <= len(names) <= MAX_OBJECTS:
+            raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
+        if len(set(names)) != len(names):
+            raise InvalidInput("list of objects", ", ".join(names), "without repetition")
+        for name in names:
+            self._check_object(name)
+
+    def _check_object(self, name: str) -> None:
+        if not self.library.has(name):
+            self.library.info(name)  # raises UnknownName for what nobody knows
+            raise MissingAssets([name])
+
+    def _check_free(self, scene: str) -> None:
+        job = self.holder(scene)
+        if job is not None:
+            raise SceneHeld(scene, job)
+
+    def _greeting(self) -> list[Command]:
+        with self._lock:
+            adopt: list[Command] = [AdoptScene(record) for record in self._records.values()]
+            return [*adopt, ShowScene(self._current), WatchFrames(self._watchers > 0)]
+
+    def _on_simulation_event(self, event: SceneChanged | FramesTaken) -> None:
+        if isinstance(event, SceneChanged):
+            with self._lock:
+                if event.record.id in self._records:
+                    self._records[event.record.id] = event.record
+        self.hub.publish(event)
+
+
+def _check_poses(poses: tuple[tuple[str, Pose], ...]) -> None:
+    if len({name for name, _ in poses}) != len(poses):
+        raise InvalidInput("list of objects", ", ".join(name for name, _ in poses), "without repetition")
+    _stacked([pose for _, pose in poses])
+
+
+def _stacked(poses: list[Pose]) -> Pose:
+    """Poses as one batch, with quaternions checked."""
+    quaternions = np.array([pose.quaternion for pose in poses], float).reshape(-1, 4)
+    positions = np.array([pose.position for pose in poses], float).reshape(-1, 3)
+    return Pose(positions, unit_quaternion(quaternions, "quaternions"))
