@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -11,7 +13,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from app.api.schemas.common import Problem, ProblemPointer
-from osfcore.errors import OsfError
+from osfcore.errors import OsfError, UnknownName
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +65,15 @@ _TITLES = {
 
 class NotFound(OsfError):
     """What the path names does not exist."""
+
+
+@contextmanager
+def named_in_path() -> Iterator[None]:
+    """Answer 404 instead of 422 where the name that is unknown stands in the path."""
+    try:
+        yield
+    except UnknownName as error:
+        raise NotFound(str(error)) from None
 
 
 class ProblemResponse(JSONResponse):

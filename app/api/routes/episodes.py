@@ -10,14 +10,14 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import ValidationError
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
 from app.api.routes.events import followed
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
 from app.jobs.job import Job
-from osfcore.errors import CorruptFile, UnknownName
+from osfcore.errors import CorruptFile
 
 router = APIRouter(prefix="/api/episodes", tags=["episodes"], responses=problems())
 _MEDIA_TYPES = {
@@ -39,10 +39,8 @@ _FILE = {
 
 
 def _found(services: ServicesDep, episode: Annotated[str, Path(description="Identifier of an episode.")]) -> Job:
-    try:
+    with named_in_path():
         return services.episodes.get(episode)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
 
 
 FoundDep = Annotated[Job, Depends(_found)]
@@ -120,10 +118,8 @@ async def frame(
     ] = "all",
 ) -> Response:  # fmt: skip
     """Show one step."""
-    try:
+    with named_in_path():
         png = await asyncio.to_thread(services.episodes.frame, job, step, part)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
     return Response(png, media_type="image/png", headers={"Cache-Control": "max-age=3600"})
 
 
@@ -132,10 +128,8 @@ def file(
     services: ServicesDep, job: FoundDep, name: Annotated[str, Path(description="One of the episode's files.")]
 ) -> FileResponse:
     """Download what an episode has left: report, table of steps, goal image, video, and a recording for the viewer."""
-    try:
+    with named_in_path():
         path = services.episodes.file(job, name)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
     return FileResponse(path, media_type=_MEDIA_TYPES[path.suffix], content_disposition_type="inline", filename=name)
 
 

@@ -11,7 +11,7 @@ from starlette.requests import ClientDisconnect
 
 from app.api.bodies import JSON, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
 from app.api.routes.events import followed
@@ -20,7 +20,7 @@ from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
 from app.jobs.job import Job
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked, Estimates
-from osfcore.errors import OsfError, UnknownName
+from osfcore.errors import OsfError
 
 UPLOAD_PATH = "/api/estimates"
 _ZIP = "application/zip"
@@ -39,10 +39,8 @@ View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, fro
 
 
 def _found(services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]) -> Job:
-    try:
+    with named_in_path():
         return services.estimates.get(estimate)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
 
 
 FoundDep = Annotated[Job, Depends(_found)]
@@ -124,12 +122,10 @@ async def image(
     ] = None,
 ) -> Response:
     """Show what a camera saw, and what it would see if a step's guess were true."""
-    try:
+    with named_in_path():
         if kind == "observed":
             return FileResponse(await asyncio.to_thread(services.estimates.observed, job, view), media_type="image/png")
         order = await asyncio.to_thread(services.estimates.comparison, job, view, step)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
     return compared_png(await compared(services, order), kind)
 
 

@@ -7,11 +7,10 @@ from fastapi.responses import FileResponse
 from starlette.requests import ClientDisconnect
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
 from app.services.image_sets import SetRecord
-from osfcore.errors import UnknownName
 from osfcore.fields.field_library import FieldInfo
 
 UPLOAD_PATH = "/api/fields/sets"
@@ -105,14 +104,10 @@ def _out(services: Services, info: FieldInfo) -> FieldOut:
 
 
 def _found(services: Services, name: str) -> FieldInfo:
-    try:
+    with named_in_path():
         return services.fields.get(name)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
 
 
 def _found_set(services: Services, set_id: str) -> SetRecord:
-    try:
+    with named_in_path():
         return services.runner.sets.get(set_id)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None

@@ -10,12 +10,12 @@ from starlette.requests import ClientDisconnect
 
 from app.api.bodies import JSON, kind_of, parsed, whole_body
 from app.api.dependencies import Services, ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
 from app.services.goals import Draft, NoDraft
 from app.storage.goal_store import GoalRecord
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.io.scene_file import camera_from_json
 
@@ -36,10 +36,8 @@ router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems())
 
 
 def _found(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
-    try:
+    with named_in_path():
         return services.goals.get(goal)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
 
 
 FoundDep = Annotated[GoalRecord, Depends(_found)]

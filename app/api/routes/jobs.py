@@ -6,12 +6,11 @@ from fastapi import APIRouter, Body, Path, Response, status
 from fastapi.responses import FileResponse
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
 from app.jobs.job import Job, check_file_name
 from app.jobs.kinds.fields import PREVIEW
-from osfcore.errors import UnknownName
 
 router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems())
 FileName = Annotated[str, Path(description="One of the job's files.")]
@@ -69,10 +68,8 @@ def resume(services: ServicesDep, job: JobId) -> JobOut:
 def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
     """Download what a job has made."""
     found = _found(services, job)
-    try:
+    with named_in_path():
         path = services.runner.jobs.folder(job) / check_file_name(found, name)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
     if not path.is_file():
         raise NotFound(f"{name} of job {job} has been removed from the data directory.")
     return FileResponse(path, filename=name, media_type="application/octet-stream")
@@ -89,7 +86,5 @@ def preview(services: ServicesDep, job: JobId) -> FileResponse:
 
 
 def _found(services: Services, job: str) -> Job:
-    try:
+    with named_in_path():
         return services.runner.jobs.get(job)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None

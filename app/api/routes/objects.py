@@ -6,10 +6,10 @@ from typing import Annotated
 from fastapi import APIRouter, Path
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.schemas.common import ObjectList, ObjectOut
-from osfcore.errors import OsfError, UnknownName
+from osfcore.errors import OsfError
 from osfcore.objects.catalogue import CATALOGUE
 
 router = APIRouter(prefix="/api/objects", tags=["objects"], responses=problems())
@@ -29,10 +29,8 @@ def list_all(services: ServicesDep) -> ObjectList:
 @router.get("/{name}", responses=problems(404))
 def get(services: ServicesDep, name: Annotated[str, Path(examples=["006_mustard_bottle"])]) -> ObjectOut:
     """Tell what is known of one object."""
-    try:
+    with named_in_path():
         return _object(services, name)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
 
 
 def _object(services: Services, name: str) -> ObjectOut:

@@ -4,13 +4,12 @@ from fastapi import APIRouter, Path, status
 from pydantic import BaseModel, Field
 
 from app.api.dependencies import ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.schemas.common import SceneOut
 from app.api.schemas.goals import GoalOut
 from app.services.presets import PRESETS, preset, set_up
 from app.storage.paths import static_folder
-from osfcore.errors import UnknownName
 
 router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems())
 
@@ -61,10 +60,8 @@ def list_all(services: ServicesDep) -> PresetList:
 @router.post("/{preset_id}", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 503, 507))
 def make(services: ServicesDep, preset_id: str = Path(description="Identifier of a preset.")) -> PresetMade:
     """Make a preset's scene, which is then shown, and its goal image."""
-    try:
+    with named_in_path():
         wanted = preset(preset_id)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
     scene, goal = set_up(wanted, services.runner, services.goals)
     return PresetMade(scene=services.scene_out(scene), goal=GoalOut.of(goal))
 

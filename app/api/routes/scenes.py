@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response, status
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.problems import NotFound
+from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
 from app.processes.scene_messages import SceneRecord, TakeImage, TakeMask
@@ -131,10 +131,8 @@ def found(services: Services, scene: str) -> SceneRecord:
     Raises:
         NotFound: if there is none.
     """
-    try:
+    with named_in_path():
         return services.runner.scene(scene)
-    except UnknownName as error:
-        raise NotFound(str(error)) from None
 
 
 def view_of(services: Services, scene: str, camera: str) -> SceneRecord:
