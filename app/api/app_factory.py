@@ -18,7 +18,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
 from app.api import problems, relay
-from app.api.dependencies import Services, Shelf
+from app.api.dependencies import ObjectCatalogue, Services
 from app.api.http_metrics import Metrics, MetricsMiddleware
 from app.api.routes import comparisons as neural
 from app.api.routes import (
@@ -119,22 +119,33 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(runner.start)
         neural = ProcessClient(renderer_main, (settings.data_dir,), "neural renderer")
         stack.push_async_callback(run_in_threadpool, neural.stop)
-        shelf = Shelf(runner.library)
-        fields = FieldCatalogue(settings.data_dir, shelf.names)
-        found = Estimates(runner, fields)
-        stack.push_async_callback(run_in_threadpool, found.stop)
+        objects = ObjectCatalogue(runner.library)
+        fields = FieldCatalogue(settings.data_dir, objects.names)
+        estimate_service = Estimates(runner, fields)
+        stack.push_async_callback(run_in_threadpool, estimate_service.stop)
         predictor = ProcessClient(predictor_main, (settings.data_dir,), "predictor of pushes")
         stack.push_async_callback(run_in_threadpool, predictor.stop)
-        predicted = Predictions(runner, fields.names, predictor)
-        wanted = Goals(runner, settings.data_dir, settings.max_goals)
-        await run_in_threadpool(wanted.start)
-        acted = Episodes(runner, fields, wanted)
-        viewer = Viewer(runner, neural, fields.names, found, predicted, wanted)
+        prediction_service = Predictions(runner, fields.names, predictor)
+        goal_service = Goals(runner, settings.data_dir, settings.max_goals)
+        await run_in_threadpool(goal_service.start)
+        episode_service = Episodes(runner, fields, goal_service)
+        viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
-        driving = Driver(runner.hub.publish)
+        driver_seat = Driver(runner.hub.publish)
         services = Services(
-            settings, store, runner, viewer, shelf, fields, neural, found, predicted, wanted, acted, driving
+            settings,
+            store,
+            runner,
+            viewer,
+            objects,
+            fields,
+            neural,
+            estimate_service,
+            prediction_service,
+            goal_service,
+            episode_service,
+            driver_seat,
         )
         app.state.services = services
         app.state.metrics.watch(runner)

@@ -30,7 +30,7 @@ from osfcore.objects.catalogue import CATALOGUE
 _FRESH_S = 1.0
 
 
-class Shelf:
+class ObjectCatalogue:
     """The object library, looked through at most once a second."""
 
     def __init__(self, library: AssetLibrary) -> None:
@@ -71,7 +71,7 @@ class Services:
     store: Store
     runner: Runner
     viewer: Viewer
-    shelf: Shelf
+    objects: ObjectCatalogue
     fields: FieldCatalogue
     neural: ProcessClient
     estimates: Estimates
@@ -83,7 +83,7 @@ class Services:
 
     def scene_out(self, record: SceneRecord) -> SceneOut:
         """A scene as JSON."""
-        return SceneOut.of(record, self.shelf.labels(), is_current=record.id == self.runner.current)
+        return SceneOut.of(record, self.objects.labels(), is_current=record.id == self.runner.current)
 
 
 def get_services(connection: HTTPConnection) -> Services:

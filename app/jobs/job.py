@@ -88,11 +88,11 @@ class JobChanged:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class JobSeen:
+class JobView:
     """What a running job lets the live view draw; it is neither kept nor told to pages."""
 
     job: Job
-    seen: object
+    view: object
 
 
 def job_fields(job: Job) -> dict[str, Any]:

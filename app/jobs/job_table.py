@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from app.jobs.job import Job, JobChanged, JobSeen, job_fields, job_from_fields
+from app.jobs.job import Job, JobChanged, JobView, job_fields, job_from_fields
 from app.storage.database import Store
 from osfcore.errors import OsfError, UnknownName
 
@@ -23,7 +23,7 @@ class JobTable:
         publish: told of every change; progress is thinned out.
     """
 
-    def __init__(self, store: Store, publish: Callable[[JobChanged | JobSeen], None]) -> None:
+    def __init__(self, store: Store, publish: Callable[[JobChanged | JobView], None]) -> None:
         self._store = store
         self._publish = publish
         self._jobs: dict[str, Job] = {}

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import INPUTS, Job, JobChanged, JobSeen, State, WrongJobState, ended
+from app.jobs.job import INPUTS, Job, JobChanged, JobView, State, WrongJobState, ended
 from app.jobs.job_process import JobProcess
 from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, Outcome, after
@@ -62,7 +62,7 @@ class Jobs:
         self,
         store: Store,
         data_dir: Path,
-        publish: Callable[[JobChanged | JobSeen], None],
+        publish: Callable[[JobChanged | JobView], None],
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
@@ -311,8 +311,8 @@ class Jobs:
             result = step.result or None
             job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
             self._table.set_progress(job)
-        if step.seen is not None:
-            self._publish(JobSeen(job, step.seen))
+        if step.view is not None:
+            self._publish(JobView(job, step.view))
 
     def _answer(self, run: JobProcess, asked: SceneCommand) -> None:
         """Carry out what a job asks for, with the scene that it drives and no other."""

@@ -76,7 +76,7 @@ KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "episode": _episode,
 }
 _WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
-_NOT_EXTRA = ("done", "total", "note", "seen")
+_NOT_EXTRA = ("done", "total", "note", "view")
 
 
 def job_main(server: ProcessServer) -> None:
@@ -114,7 +114,7 @@ def run_job(
             result = _extras(step)
             now = time.monotonic()
             if now - last >= step_interval_s or step.done == step.total or getattr(step, "must_be_told", False):
-                send(JobStep(step.done, step.total, step.note, result, getattr(step, "seen", None)))
+                send(JobStep(step.done, step.total, step.note, result, getattr(step, "view", None)))
                 last = now
             if getattr(step, "ends_round", False) and control.rests_now():
                 send(JobRests())

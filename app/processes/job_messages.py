@@ -35,14 +35,14 @@ class JobStep:
         total: units in all.
         note: what is being done, for a person.
         result: what its kind tells besides.
-        seen: what the live view draws of it, and nobody keeps; None for most kinds.
+        view: what the live view draws of it, and nobody keeps; None for most kinds.
     """
 
     done: int
     total: int
     note: str
     result: dict[str, Any]
-    seen: object = None
+    view: object = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -189,7 +189,7 @@ def _scene_event(services: Services) -> ServerSentEvent:
 def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
     if changed.draft is None:
         return ServerSentEvent(event="draft", raw_data="null")
-    return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.shelf.labels()))
+    return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.objects.labels()))
 
 
 def _frame(taken: FramesTaken) -> FrameEvent:

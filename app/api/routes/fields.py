@@ -94,7 +94,7 @@ def _out(services: Services, info: FieldInfo) -> FieldOut:
     has_mesh = services.fields.has_mesh(info.name)
     return FieldOut(
         name=info.name,
-        label=services.shelf.labels().get(info.name, info.name),
+        label=services.objects.labels().get(info.name, info.name),
         source=info.source,
         bytes=info.bytes,
         metrics=dict(info.metrics),

@@ -155,7 +155,7 @@ def _made(services: Services, body: GoalIn) -> GoalRecord:
 
 
 def _draft_out(services: Services, draft: Draft) -> DraftOut:
-    return DraftOut.of(draft, services.shelf.labels())
+    return DraftOut.of(draft, services.objects.labels())
 
 
 def _camera(text: str) -> Camera:

@@ -19,6 +19,6 @@ async def get(services: ServicesDep) -> Health:
         status="ok",
         version=VERSION,
         uptime_s=round(services.runner.uptime_s, 3),
-        objects_available=len(services.shelf.names()),
+        objects_available=len(services.objects.names()),
         stage=services.runner.simulation_status,
     )

@@ -18,7 +18,7 @@ router = APIRouter(prefix="/api/objects", tags=["objects"], responses=problems()
 @router.get("")
 def list_all(services: ServicesDep) -> ObjectList:
     """List the objects of the catalogue and those that were added."""
-    names = dict.fromkeys((*CATALOGUE, *services.shelf.names()))
+    names = dict.fromkeys((*CATALOGUE, *services.objects.names()))
     listed = []
     for name in names:
         with contextlib.suppress(OsfError):  # a damaged object of the user's must not hide the others

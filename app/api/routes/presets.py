@@ -41,7 +41,7 @@ class PresetMade(BaseModel):
 @router.get("")
 def list_all(services: ServicesDep) -> PresetList:
     """List tables to begin with."""
-    usable = set(services.shelf.names()) & set(services.fields.names())
+    usable = set(services.objects.names()) & set(services.fields.names())
     return PresetList(
         presets=[
             PresetOut(

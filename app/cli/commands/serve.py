@@ -128,7 +128,7 @@ def _server(serve: Serve, url: str) -> uvicorn.Server:
 
 
 def _tell_ready(app: FastAPI, url: str) -> None:
-    if not app.state.services.shelf.names():
+    if not app.state.services.objects.names():
         print(
             "There are no objects on this machine yet; fetch them on the page or with 'osf assets fetch'.",
             file=sys.stderr,

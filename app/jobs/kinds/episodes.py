@@ -43,7 +43,7 @@ class EpisodeProgress:
         steps: rounds whose results are in the report.
         outcome: how it ended; only at the end.
         text: the same in a sentence.
-        seen: what just happened, as a picture shows it.
+        view: what just happened, as a picture shows it.
     """
 
     done: int
@@ -53,21 +53,21 @@ class EpisodeProgress:
     steps: int = 0
     outcome: str | None = None
     text: str | None = None
-    seen: Event | PlanSketch | None = None
+    view: Event | PlanSketch | None = None
 
     @property
     def ends_round(self) -> bool:
         """Whether a round of the loop is over, so that a job that goes on by single steps rests now."""
         from osfcore.control.events import Stepped
 
-        return isinstance(self.seen, Stepped)
+        return isinstance(self.view, Stepped)
 
     @property
     def must_be_told(self) -> bool:
         """Whether a view that misses this would show something wrong."""
         from osfcore.control.events import Looking
 
-        return self.seen is not None and not isinstance(self.seen, Looking)
+        return self.view is not None and not isinstance(self.view, Looking)
 
 
 def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeProgress]:
@@ -101,11 +101,11 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         record.take(event)
         told = _told(told, event, episode.settings.steps)
         yield told
-    yield replace(told, note="Writing video and recording", seen=None)
+    yield replace(told, note="Writing video and recording", view=None)
     record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
     world.close()
-    yield replace(told, note=told.text or told.note, seen=None)
+    yield replace(told, note=told.text or told.note, view=None)
 
 
 def _told(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
@@ -119,17 +119,17 @@ def _told(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
     then = replace(before, total=total, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
     match event:
         case Observed():  # its images are on the page already
-            return replace(then, seen=None)
+            return replace(then, view=None)
         case Planning(number, round_):
-            return replace(then, seen=sketch_of(number, round_))
+            return replace(then, view=sketch_of(number, round_))
         case Acted(number):
-            return replace(then, done=number, seen=event)
+            return replace(then, done=number, view=event)
         case Stepped():
-            return replace(then, steps=before.steps + 1, seen=event)
+            return replace(then, steps=before.steps + 1, view=event)
         case Finished(_, outcome, text):
-            return replace(then, outcome=outcome, text=text, note=text, seen=event)
+            return replace(then, outcome=outcome, text=text, note=text, view=event)
         case _:
-            return replace(then, seen=event)
+            return replace(then, view=event)
 
 
 def settings_of(given: Mapping[str, Any]) -> EpisodeSettings:

@@ -43,7 +43,7 @@ class Estimating:
         losses: of each object, in the units of the stage.
         loss: of the whole, likewise; None where only the objects are looked at.
         trusted: whether the result may be acted on; None until it is there.
-        seen: the step itself.
+        view: the step itself.
     """
 
     done: int
@@ -54,7 +54,7 @@ class Estimating:
     losses: tuple[float | None, ...] = ()
     loss: float | None = None
     trusted: bool | None = None
-    seen: EstimateStep | None = None
+    view: EstimateStep | None = None
 
 
 def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimating]:

@@ -19,7 +19,7 @@ from osfcore.geometry.states import Observation, SceneState
 from osfcore.geometry.workspace import check_action
 from osfcore.io.observation_file import read_observation
 
-_SEEN = ".seen"
+_FOLDER = ".seen"
 Ask = Callable[[Act | ObserveScene | TakeView], Any]
 
 
@@ -53,12 +53,12 @@ class RemoteWorld:
         Raises:
             ProcessUnavailable: if the simulation is not there now.
         """
-        place = self._folder / _SEEN
+        place = self._folder / _FOLDER
         shutil.rmtree(place, ignore_errors=True)
         self.record = self._ask(ObserveScene(self._scene, place, goal=False, masks=masks))
-        seen = read_observation(place)
+        observation = read_observation(place)
         shutil.rmtree(place, ignore_errors=True)
-        return seen
+        return observation
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s.
@@ -71,7 +71,7 @@ class RemoteWorld:
 
     def close(self) -> None:
         """Remove images on their way. Calling it again does nothing."""
-        shutil.rmtree(self._folder / _SEEN, ignore_errors=True)
+        shutil.rmtree(self._folder / _FOLDER, ignore_errors=True)
 
     def truth(self) -> SceneState:
         """Where everything truly was, at the last moment that was told; for reports, never for the loop."""

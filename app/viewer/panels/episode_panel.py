@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 import viser
 
-from app.jobs.job import Job, JobChanged, JobSeen
+from app.jobs.job import Job, JobChanged, JobView
 from app.processes.plan_summary import PlanSketch
 from app.processes.scene_messages import SceneChanged
 from app.services.episodes import KIND
@@ -146,8 +146,8 @@ class EpisodePanel(Panel):
     def _store(self, event: object) -> bool:
         state = self._state
         match event:
-            case JobSeen(job, seen) if job.kind == KIND:
-                self._state = state.with_job(job).with_event(seen)
+            case JobView(job, view) if job.kind == KIND:
+                self._state = state.with_job(job).with_event(view)
             case JobChanged(_, job) if job.kind == KIND and self._is_latest(job):
                 self._state = state.with_job(job)
             case CurrentScene(record):
@@ -158,7 +158,7 @@ class EpisodePanel(Panel):
                 self._state = _EpisodeState()  # a new goal begins: the former one would be taken for it
             case SceneChanged(record) if not state.is_live and self._is_of(state, record.id):
                 self._state = replace(state, sight=None)  # somebody has moved something: the estimate is outdated
-            case JobSeen(_, EstimateStep()) if not state.is_live:
+            case JobView(_, EstimateStep()) if not state.is_live:
                 self._state = replace(state, sight=None)
             case _:
                 return False

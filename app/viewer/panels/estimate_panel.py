@@ -16,7 +16,7 @@ import viser
 from PIL import Image
 from viser import uplot
 
-from app.jobs.job import Job, JobChanged, JobSeen
+from app.jobs.job import Job, JobChanged, JobView
 from app.processes.neural_messages import Comparison, NeuralAnswer
 from app.processes.process_client import ProcessClient
 from app.services.estimates import KIND, Asked, Estimates
@@ -88,7 +88,7 @@ class EstimatePanel(Panel):
 
     def _store(self, event: object) -> bool:
         match event:
-            case JobSeen(job, EstimateStep() as step) if job.kind == KIND and self._is_here(job):
+            case JobView(job, EstimateStep() as step) if job.kind == KIND and self._is_here(job):
                 self._job = job
                 self._steps.append(step)
             case JobChanged(_, job) if job.kind == KIND and self._is_here(job) and self._is_latest(job):

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from app.jobs.clock import JobClock
-from app.jobs.job import JobSeen
+from app.jobs.job import JobView
 from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped
 from app.jobs.registry import Jobs, QueueFull, WrongJobState
 from app.processes.job_messages import CancelJob, JobCancelled, JobRests, JobStep, PauseJob, SceneCommand, StepJob
@@ -291,9 +291,9 @@ def test_what_a_job_lets_the_live_view_draw_is_told_but_not_kept(open_jobs, play
     jobs, events = open_jobs(start_process=played.start)
     job = jobs.submit("estimate", {})
     until_state(jobs, job, "running")
-    played.send(JobStep(7, 10, "Look", {}, seen="a view"))
-    (seen,) = until(lambda: [event for event in events if isinstance(event, JobSeen)])
-    assert (seen.job.id, seen.seen) == (job.id, "a view")
+    played.send(JobStep(7, 10, "Look", {}, view="a view"))
+    (seen,) = until(lambda: [event for event in events if isinstance(event, JobView)])
+    assert (seen.job.id, seen.view) == (job.id, "a view")
     assert "a view" not in str(jobs.get(job.id))
 
 

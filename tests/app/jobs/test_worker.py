@@ -140,7 +140,7 @@ class Told:
     must_be_told: bool
     total: int = 100
     note: str = "Working"
-    seen: str | None = None
+    view: str | None = None
     ends_round: bool = False
 
 
@@ -162,10 +162,10 @@ def run(monkeypatch, steps, orders=()):
 
 
 def test_steps_that_must_be_told_are_never_thinned_out(monkeypatch):
-    steps = [Told(number, number % 3 == 0, seen=f"view {number}") for number in range(30)]
+    steps = [Told(number, number % 3 == 0, view=f"view {number}") for number in range(30)]
     told, outcome = run(monkeypatch, steps)
     assert [step.done for step in told] == list(range(0, 30, 3))
-    assert [step.seen for step in told] == [f"view {number}" for number in range(0, 30, 3)]
+    assert [step.view for step in told] == [f"view {number}" for number in range(0, 30, 3)]
     assert outcome == {"must_be_told": False, "ends_round": False}
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.jobs.job import JobChanged, JobSeen
+from app.jobs.job import JobChanged, JobView
 from app.viewer.nodes.scene_nodes import VIEW_FROM
 from app.viewer.viewer import LoopbackViser
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M
@@ -22,7 +22,10 @@ def test_a_dropped_object_falls_and_one_in_another_goes_back(live, browser, show
     fallen = until(has_fallen)
     browser.drag(f"/handles/{BOX}", fallen["objects"][1]["position"])
     until(lambda: browser.table_agrees(fallen))
-    assert live.request("GET", f"/api/scenes/{shown['id']}")[1]["objects"] == fallen["objects"]
+    after = live.request("GET", f"/api/scenes/{shown['id']}")[1]
+    for put_back, lying in zip(after["objects"], fallen["objects"], strict=True):
+        assert put_back["position"] == pytest.approx(lying["position"], abs=1e-4)  # may still have been coming to rest
+        assert put_back["quaternion"] == pytest.approx(lying["quaternion"], abs=1e-3)
 
 
 def test_handles_show_only_when_wanted(live, browser, shown):
@@ -55,7 +58,7 @@ def test_an_episode_on_the_table_is_drawn_in_place_of_an_estimate(live, browser,
     hub = live.services.runner.hub
     mine = job(scene=shown["id"])
     for seen in (found(), sketch(), stepped()):
-        hub.publish(JobSeen(mine, seen))
+        hub.publish(JobView(mine, seen))
     until(lambda: browser.shows("/episode/plan/ways") and browser.shows("/episode/estimate/light"))
     until(lambda: not browser.shows("/light"))
     assert browser.below("/estimate/guess") == set()

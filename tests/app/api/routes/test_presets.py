@@ -49,7 +49,7 @@ def test_the_same_preset_is_the_same_table_again(service, made):
 
 def test_what_cannot_be_made_is_told_and_leaves_nothing(service, services, monkeypatch):
     is_problem(service.post("/api/presets/seventh"), 404)
-    missing = next(one for one in PRESETS if set(one.objects) - set(services.shelf.names()))
+    missing = next(one for one in PRESETS if set(one.objects) - set(services.objects.names()))
     before = service.get("/api/scenes").json()
     assert "osf assets fetch" in is_problem(service.post(f"/api/presets/{missing.id}"), 422)["detail"]
 

@@ -83,7 +83,7 @@ def test_an_episode_pushes_what_is_on_the_scene_and_leaves_its_files(place, stag
     before = stage.world.truth()
     *steps, last = list(episode_job(params(stage), place))
     assert all(isinstance(step, EpisodeProgress) for step in steps)
-    assert [step.seen.number for step in steps if isinstance(step.seen, Acted)] == [1, 2, 3]
+    assert [step.view.number for step in steps if isinstance(step.view, Acted)] == [1, 2, 3]
     assert sum(step.ends_round for step in steps) == 4
     assert stage.world.time_s == pytest.approx(0.6)
     assert not np.array_equal(stage.world.truth().pusher, before.pusher)
@@ -103,13 +103,13 @@ def test_what_is_told_rises_and_names_every_part_of_the_loop(place, stage, sight
     assert (told[-1].done, told[-1].steps, told[-1].total) == (3, 4, 3)
     assert [step.outcome for step in told[:-4]] == [None] * (len(told) - 4)
     assert all(step.note for step in told)
-    assert not any(isinstance(step.seen, Observed | Planning) for step in told)
-    assert sum(isinstance(step.seen, PlanSketch) for step in told) >= 3
+    assert not any(isinstance(step.view, Observed | Planning) for step in told)
+    assert sum(isinstance(step.view, PlanSketch) for step in told) >= 3
 
 
 def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
     for step in episode_job(params(stage), place):
-        assert step.must_be_told == (step.seen is not None and not isinstance(step.seen, Looking))
+        assert step.must_be_told == (step.view is not None and not isinstance(step.view, Looking))
 
 
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
@@ -156,7 +156,7 @@ def test_an_object_that_stays_did_not_have_to_move(place, stage, sighted, shift,
 def test_settings_may_change_on_the_way(place, stage, sighted):  # noqa: F811
     acted = 0
     for step in episode_job(params(stage), place):
-        acted += isinstance(step.seen, Acted)
+        acted += isinstance(step.view, Acted)
         if acted == 1:
             place.orders.told = [{"settings": {**SMALL, "steps": 2}}]
     assert acted == 2
@@ -207,7 +207,7 @@ def test_rounds_end_where_a_step_of_the_loop_does():
     state = sure(SceneState((), Pose(np.zeros((0, 3)), np.zeros((0, 4))), Light(np.array([0.0, 0, 1])), None))
     image = np.zeros((16, 16, 3))
     stepped = Stepped(1, 3, state, np.zeros(0), np.zeros(0), 0.0, image, {})
-    assert EpisodeProgress(1, 3, "Looking", seen=stepped).ends_round
-    assert not EpisodeProgress(1, 3, "Pushing", seen=Acted(1, np.zeros(3))).ends_round
+    assert EpisodeProgress(1, 3, "Looking", view=stepped).ends_round
+    assert not EpisodeProgress(1, 3, "Pushing", view=Acted(1, np.zeros(3))).ends_round
     assert not EpisodeProgress(0, 3, "Loading").ends_round
     assert not EpisodeProgress(0, 3, "Loading").must_be_told

@@ -60,12 +60,12 @@ def asked(monkeypatch):
 
 def test_all_steps_are_told_and_kept_and_the_result_is_a_state_file(place, asked):
     loading, *told = estimate_job(FIRST, place)
-    assert (loading.step, loading.stage, loading.seen) == (0, None, None)
+    assert (loading.step, loading.stage, loading.view) == (0, None, None)
     assert [step.step for step in told] == [1, 2, 3]
     assert [step.losses for step in told] == [(0.5,), (), (0.1,)]
     assert [step.loss for step in told] == [None, 0.25, 0.1]  # JSON has no NaN
     assert [step.trusted for step in told] == [None, None, True]
-    assert told[1].seen.guess.poses.position[0, 0] == 0.2
+    assert told[1].view.guess.poses.position[0, 0] == 0.2
     kept = read_steps(place.folder / STEPS)
     assert [(k["step"], k["stage"], k["note"], k["loss"]) for k in kept] == [
         (t.step, t.stage, t.note, t.loss) for t in told

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from app.jobs.job import Job, JobChanged, JobSeen, State
+from app.jobs.job import Job, JobChanged, JobView, State
 from app.processes.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
@@ -65,7 +65,7 @@ class Room:
         self.ordered.append(("cancel", job))
 
     def see(self, what, of=None):
-        self.hear(JobSeen(of or job(), what))
+        self.hear(JobView(of or job(), what))
 
     def hear(self, event):
         self.panel.show(event)
@@ -128,10 +128,10 @@ def test_no_goal_is_lost_however_much_comes_at_once(room, monkeypatch):
         show_look(seen)
 
     monkeypatch.setattr(room.drawing, "show_look", slowly)
-    room.panel.show(JobSeen(job(), look(x=0.2)))
+    room.panel.show(JobView(job(), look(x=0.2)))
     assert at.wait(10)
     for seen in (found(), *(look(x=0.01 * n) for n in range(50)), stepped(), sketch(), sketch()):
-        room.panel.show(JobSeen(job(), seen))
+        room.panel.show(JobView(job(), seen))
     go_on.set()
     until(lambda: room.panel.is_idle)
     assert room.goal() == set(NAMES)
@@ -231,7 +231,7 @@ def test_what_hands_or_an_estimate_do_after_the_end_outdates_what_was_believed(r
     room.see(stepped(), job(name="b"))
     room.hear(JobChanged(1, job("done", name="b")))
     assert room.estimate() is not None
-    room.hear(JobSeen(Job("c", "estimate", {}), look().step))
+    room.hear(JobView(Job("c", "estimate", {}), look().step))
     assert room.estimate() is None
 
 
@@ -270,7 +270,7 @@ def test_another_scene_clears_the_view_and_coming_back_shows_a_running_episode_a
     room.hear(CurrentScene(record("other")))
     until(lambda: room.goal() == set())
     assert room.gui.shows("/light")
-    room.panel.show(JobSeen(job(), found(0.5)))  # goes on unseen
+    room.panel.show(JobView(job(), found(0.5)))  # goes on unseen
     room.hear(CurrentScene(record("s")))
     until(room.goal)
     np.testing.assert_allclose(room.gui.node(f"/episode/goal/where/{BOX}").position, [0.5, 0, 0.1], atol=1e-6)
@@ -294,7 +294,7 @@ def test_one_that_waits_does_not_take_the_view_and_the_next_one_begins_anew(room
 
 
 def test_jobs_of_other_kinds_are_ignored(room):
-    room.panel.show(JobSeen(Job("c", "collect", {}), found()))
+    room.panel.show(JobView(Job("c", "collect", {}), found()))
     room.panel.show(JobChanged(1, Job("c", "collect", {}, "running")))
     until(lambda: room.panel.is_idle)
     assert room.goal() == set()
@@ -304,6 +304,6 @@ def test_jobs_of_other_kinds_are_ignored(room):
 def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr(room.drawing, "show_goal", lambda _: 1 / 0)
-        room.hear(JobSeen(job(), found()))
+        room.hear(JobView(job(), found()))
     room.see(stepped())
     assert room.goal()

@@ -9,7 +9,7 @@ import pytest
 import viser
 from PIL import Image
 
-from app.jobs.job import Job, JobChanged, JobSeen
+from app.jobs.job import Job, JobChanged, JobView
 from app.processes.neural_messages import Comparison
 from app.services.event_hub import CurrentScene
 from app.viewer.nodes.estimate_nodes import EstimateNodes
@@ -66,7 +66,7 @@ class Room:
         )  # fmt: skip
 
     def see(self, of, what):
-        self.panel.show(JobSeen(of, what))
+        self.panel.show(JobView(of, what))
         until(lambda: self.panel.is_idle)
 
     def says(self, words):
@@ -156,7 +156,7 @@ def test_one_that_waits_does_not_take_the_view_from_one_that_runs(room):
 
 def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
     other = Job("e", "episode", {"scene": "s", "names": [BOX]}, "running")
-    room.panel.show(JobSeen(other, step()))
+    room.panel.show(JobView(other, step()))
     room.panel.show(JobChanged(1, other))
     assert room.panel.is_idle
     assert room.drawing.is_empty
