@@ -37,11 +37,13 @@ $(VENV)/.dev-installed: $(VENV)/.installed
 	@$(PIP) install -q -c requirements.lock -e '.[dev]' || { $(OFFLINE); exit 1; }
 	@touch $@
 
+# Two processes; one that runs several tests at a time would upset those that watch a browser.
 test: dev
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 test-all: dev test-types
-	$(BIN)/pytest -m 'not soak'
+	$(BIN)/pytest -n 2 --dist loadfile -m 'not soak and not e2e'
+	$(BIN)/pytest -m e2e
 
 # Shapes and types of arrays are checked while the tests run.
 TYPED := geometry metrics planning
@@ -50,7 +52,7 @@ test-types: dev
 	  --jaxtyping-packages=osfcore.geometry,osfcore.metrics,osfcore.planning,tests.typecheck.checked
 
 coverage: dev
-	$(BIN)/pytest --cov=osfcore --cov=app --cov-report=term:skip-covered
+	$(BIN)/pytest -n 2 --dist loadfile --cov=osfcore --cov=app --cov-report=term:skip-covered
 
 lint: dev
 	$(BIN)/ruff check

@@ -18,11 +18,11 @@ from app.episodes.frames import TILE_PX, frame, read_frames, write_video
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.io.scene_file import Scene, scene_to_json
+from osfcore.io.json_codec import encode
+from osfcore.io.scene_file import ObjectJson, state_to_json
 from osfcore.io.state_file import estimated_to_json
 from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
@@ -145,7 +145,7 @@ class EpisodeRecord:
             "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)),
             "estimate_off_mm": _by_name(truth.names, 1000 * off),
             "estimate": estimated_to_json(estimate),
-            "truth": _scene(truth),
+            "truth": state_to_json(truth),
         }
         if self._about.goal is not None:
             told["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._about.goal))
@@ -196,7 +196,7 @@ class EpisodeRecord:
         if about.goal is not None and about.moved:  # else there is nothing to score
             task = RearrangementTask(0, self._start, about.goal, about.moved)
             score = score_of(task, self._table.truth(), about.symmetries)
-            report["score"], report["success_2cm"] = score.to_json(), score.is_success()
+            report["score"], report["success_2cm"] = encode(score), score.is_success()
         return report
 
 
@@ -209,18 +209,7 @@ def _shift(state: SceneState, goal: SceneState) -> Float[np.ndarray, "N"]:
     return np.linalg.norm(state.poses.position - there, axis=1)
 
 
-def _scene(state: SceneState) -> dict[str, Any]:
-    scene = scene_to_json(Scene(state, ()))
-    del scene["cameras"]
-    return scene
-
-
 def _goal_to_json(goal: GoalFound) -> dict[str, Any]:
-    names, poses = goal.goal.names, goal.goal.poses
-    wanted = [_pose_to_json(name, poses[n]) for n, name in enumerate(names)]
+    objects = [encode(ObjectJson.of(name, goal.goal.poses[n])) for n, name in enumerate(goal.goal.names)]
     estimate = None if goal.estimate is None else estimated_to_json(goal.estimate)
-    return {"objects": wanted, "estimate": estimate}
-
-
-def _pose_to_json(name: str, pose: Pose) -> dict[str, Any]:
-    return {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
+    return {"objects": objects, "estimate": estimate}

@@ -19,12 +19,13 @@ from app.services.runner import Runner
 from app.storage.database import CannotStore
 from app.storage.goal_store import Poses, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
+from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
 from osfcore.geometry.poses import unit_quaternion
 from osfcore.geometry.states import SceneState
-from osfcore.io.files import as_mapping, entry_of, list_of, read_json
+from osfcore.io.files import read_json
 from osfcore.io.image_file import encode_png
-from osfcore.io.scene_file import camera_to_json, scene_from_json
+from osfcore.io.json_codec import Entry, decode
+from osfcore.io.scene_file import StateJson, camera_to_json
 
 KIND = "episode"
 FILES = (REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, RECORDING_FILE)
@@ -239,14 +240,23 @@ def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
     return poses
 
 
+class _Step(Entry):
+    truth: StateJson
+
+
+class _Report(Entry):
+    steps: list[_Step]
+
+
 def _as_report(data: object) -> dict[str, Any]:
-    report = as_mapping(data, "report")
-    list_of(report, "steps", "report")
-    return report
+    if not isinstance(data, dict) or not isinstance(data.get("steps"), list):
+        raise InvalidInput("report", shown(repr(data)), "a JSON object with a list of steps")
+    return data
 
 
 def _as_states(data: object) -> list[SceneState]:
-    steps = [as_mapping(step, "step") for step in list_of(_as_report(data), "steps", "report")]
+    """The true states of a report."""
+    steps = decode(_Report, data, "report").steps
     if not steps:
         raise InvalidInput("number of steps", 0, "1 at least")
-    return [scene_from_json(entry_of(step, "truth", "step")).state for step in steps]
+    return [step.truth.state() for step in steps]

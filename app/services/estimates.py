@@ -7,7 +7,7 @@ truth of a scene stays beside that folder, where only this module reads it, afte
 from __future__ import annotations
 
 import uuid
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,10 @@ from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName, che
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.io.files import read_json, write_json
-from osfcore.io.scene_file import Scene, camera_from_json, read_scene, scene_to_json
-from osfcore.io.state_file import estimated_to_json, read_estimated, write_estimated
+from osfcore.io.json_codec import decode
+from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson
+from osfcore.io.scene_file import read_scene, state_to_json
+from osfcore.io.state_file import EstimateJson, read_estimated, write_estimated
 
 KIND = "estimate"
 _ARCHIVE = "observation.zip"
@@ -126,10 +128,10 @@ class Estimates:
         with self._runner.jobs.new_inputs() as folder:
             is_goal = asked.mode == "goal"
             seen = self._runner.observe(scene, folder / OBSERVATION, goal=is_goal, masks=asked.mode == "first")
-            write_json(folder / TRUTH, scene_to_json(Scene(seen.state, ())))
+            write_json(folder / TRUTH, state_to_json(seen.state))
             if prior is not None:
                 write_estimated(folder / PRIOR, prior)
-            cameras = _cameras(folder / OBSERVATION)
+            cameras = _observation(folder / OBSERVATION).cameras
             of = {"scene": scene, "revision": seen.revision, "file_name": None}
             return self._submit(asked, of, names, tuple(camera.name for camera in cameras), folder)
 
@@ -205,9 +207,9 @@ class Estimates:
         """What was told of each step so far, see `read_steps`."""
         return read_steps(self._runner.jobs.folder(job.id) / STEPS)
 
-    def result(self, job: Job) -> dict[str, Any] | None:
+    def result(self, job: Job) -> EstimateJson | None:
         """What state.json holds; None until it is there."""
-        return estimated_to_json(self._state(job)) if job.state == "done" else None
+        return EstimateJson.of_estimate(self._state(job)) if job.state == "done" else None
 
     def simulation_errors(self, job: Job) -> dict[str, Any] | None:
         """How far the result is from the truth, which only a simulation knows; None without either."""
@@ -248,7 +250,8 @@ class Estimates:
         folder = self._runner.jobs.inputs(job.id) / OBSERVATION
         if not folder.is_dir():
             raise NoImages(job.id, f"it was {job.state}" if job.state == "cancelled" else f"it has {job.state}")
-        return _cameras(folder)[view], folder / _images(folder)[names[view]]
+        observation = _observation(folder)
+        return observation.cameras[view].camera(), folder / observation.images[names[view]]
 
     def _state(self, job: Job) -> EstimatedState:
         return read_estimated(self._runner.jobs.folder(job.id) / STATE)
@@ -298,14 +301,5 @@ def _check_fits(mode: Mode, found: Uploaded) -> None:
         raise InvalidInput("number of views of a goal", len(found.cameras), "1")
 
 
-def _cameras(folder: Path) -> tuple[Camera, ...]:
-    return read_json(folder / "observation.json", lambda data: tuple(map(camera_from_json, _root(data)["cameras"])))
-
-
-def _images(folder: Path) -> Mapping[str, str]:
-    return read_json(folder / "observation.json", lambda data: _root(data)["images"])
-
-
-def _root(data: object) -> dict[str, Any]:
-    assert isinstance(data, dict)  # it was checked when it came
-    return data
+def _observation(folder: Path) -> ObservationJson:
+    return read_json(folder / OBSERVATION_FILE, lambda data: decode(ObservationJson, data, "observation"))

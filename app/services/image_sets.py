@@ -14,15 +14,20 @@ import uuid
 from collections.abc import AsyncIterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import Field, StrictInt
 from starlette.concurrency import run_in_threadpool
 
 from app.storage.database import CannotStore, now_utc
 from app.storage.uploads import Examiner, save
-from osfcore.errors import CorruptFile, OsfError, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
+from osfcore.io.files import read_json
+from osfcore.io.json_codec import Text, decode
 
 _ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"
 _TEMPORARY_PREFIX = ".new-"
+_Count = Annotated[StrictInt, Field(ge=0, lt=1 << 31)]
 
 
 class TooManySets(OsfError):
@@ -60,12 +65,12 @@ class SetRecord:
         summary: the same in words.
     """
 
-    id: str
-    file_name: str
-    created_at: str
-    train: int
-    test: int
-    summary: str
+    id: Text
+    file_name: Text
+    created_at: Text
+    train: _Count
+    test: _Count
+    summary: Text
 
 
 class ImageSets:
@@ -197,12 +202,10 @@ def _names(folder: Path) -> dict[str, str]:
 
 
 def _read(path: Path) -> SetRecord:
-    try:
-        record = SetRecord(**json.loads(path.read_text(encoding="utf-8")))
-        "".join((record.id, record.file_name, record.created_at, record.summary)).encode()  # text, and whole characters
-        counts = (record.train, record.test)
-        if record.id != path.parent.name or not all(type(n) is int and 0 <= n < 1 << 31 for n in counts):
-            raise ValueError("of another place or kind")
-    except (ValueError, TypeError, RecursionError) as error:
-        raise CorruptFile(path, "it does not describe an image set") from error
-    return record
+    def parse(data: object) -> SetRecord:
+        record = decode(SetRecord, data, "image set")
+        if record.id != path.parent.name:
+            raise InvalidInput("id", shown(record.id), "the name of its folder")
+        return record
+
+    return read_json(path, parse)

@@ -15,13 +15,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
-
 from app.processes.scene_messages import SceneRecord
 from osfcore.errors import CorruptFile, OsfError
-from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
+from osfcore.io.json_codec import decode, encode
+from osfcore.io.scene_file import StateJson
 
 FILE = "service.sqlite3"
 SCHEMA_VERSION = 1
@@ -154,8 +152,8 @@ class Store:
             record.seed,
             record.created_at,
             record.image_size,
-            json.dumps(state_to_json(record.initial)),
-            json.dumps(state_to_json(record.state)),
+            json.dumps(encode(StateJson.of(record.initial))),
+            json.dumps(encode(StateJson.of(record.state))),
             record.time_s,
             record.revision,
         )
@@ -224,18 +222,6 @@ class Store:
         return tuple((event, json.loads(text)) for event, text in rows)
 
 
-def state_to_json(state: SceneState) -> dict[str, Any]:
-    """A state as in scene.json, without cameras."""
-    return {
-        "objects": [
-            {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
-            for name, pose in ((n, state.pose(n)) for n in state.names)
-        ],
-        "light": {"position": state.light.position.tolist()},
-        "pusher": None if state.pusher is None else {"position": state.pusher.tolist()},
-    }
-
-
 def _record_from_row(row: tuple[Any, ...]) -> SceneRecord:
     scene, seed, created_at, image_size, initial, state, time_s, revision, _ = row
     return SceneRecord(
@@ -244,15 +230,4 @@ def _record_from_row(row: tuple[Any, ...]) -> SceneRecord:
 
 
 def _state_from_json(text: str) -> SceneState:
-    fields = json.loads(text)
-    objects, pusher = fields["objects"], fields["pusher"]
-    poses = Pose(
-        np.array([o["position"] for o in objects], float).reshape(-1, 3),
-        np.array([o["quaternion"] for o in objects], float).reshape(-1, 4),
-    )
-    return SceneState(
-        tuple(o["name"] for o in objects),
-        poses,
-        Light(np.array(fields["light"]["position"], float)),
-        None if pusher is None else np.array(pusher["position"], float),
-    )
+    return decode(StateJson, json.loads(text), "state").state()

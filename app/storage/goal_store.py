@@ -9,13 +9,15 @@ import threading
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from app.storage.database import CannotStore
-from osfcore.errors import CorruptFile, OsfError, UnknownName, finite_vector
+from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
-from osfcore.io.scene_file import camera_from_json, camera_to_json
+from osfcore.io.files import read_json
+from osfcore.io.json_codec import Entry, Text, decode, encode
+from osfcore.io.scene_file import CameraJson, ObjectJson, camera_to_json
 
 Source = Literal["upload", "composed", "drawn"]
 Poses = tuple[tuple[str, Pose], ...]
@@ -51,6 +53,18 @@ class GoalRecord:
     scene: str | None
     camera: Camera
     poses: Poses | None
+
+
+class GoalJson(Entry):
+    """What goal.json holds."""
+
+    id: Text
+    name: Text
+    created_at: Text
+    source: Source
+    scene: Text | None
+    camera: CameraJson
+    objects: list[ObjectJson] | None
 
 
 class GoalStore:
@@ -134,48 +148,24 @@ class GoalStore:
 
 def poses_to_json(poses: Poses) -> list[dict[str, Any]]:
     """Poses as in scene.json."""
-    return [
-        {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
-        for name, pose in poses
-    ]
+    return [encode(ObjectJson.of(name, pose)) for name, pose in poses]
 
 
 def _to_json(record: GoalRecord) -> dict[str, Any]:
-    return {
-        "id": record.id,
-        "name": record.name,
-        "created_at": record.created_at,
-        "source": record.source,
-        "scene": record.scene,
-        "camera": camera_to_json(record.camera),
-        "objects": None if record.poses is None else poses_to_json(record.poses),
-    }
+    facts = {key: getattr(record, key) for key in ("id", "name", "created_at", "source", "scene")}
+    objects = None if record.poses is None else poses_to_json(record.poses)
+    return {**facts, "camera": camera_to_json(record.camera), "objects": objects}
 
 
 def _read(path: Path) -> GoalRecord:
-    try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-        record = GoalRecord(
-            id=facts["id"],
-            name=facts["name"],
-            created_at=facts["created_at"],
-            source=facts["source"],
-            scene=facts["scene"],
-            camera=camera_from_json(facts["camera"]),
-            poses=None if facts["objects"] is None else tuple(map(_named_pose, facts["objects"])),
-        )
-        "".join((record.name, record.created_at)).encode()  # text, and whole characters
-        if not (record.scene is None or (isinstance(record.scene, str) and record.scene.encode())):
-            raise TypeError("no scene")
-        if record.id != path.parent.name or record.source not in get_args(Source):
-            raise ValueError("of another place or kind")
-        return record
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OsfError) as error:
-        raise CorruptFile(path, "it does not describe a goal") from error
+    def parse(data: object) -> GoalRecord:
+        entry = decode(GoalJson, data, "goal")
+        if entry.id != path.parent.name:
+            raise InvalidInput("id", shown(entry.id), "the name of its folder")
+        poses = None if entry.objects is None else tuple((placed.name, placed.pose()) for placed in entry.objects)
+        for name, pose in poses or ():
+            unit_quaternion(pose.quaternion, f"quaternion of {shown(name)}")
+        facts = entry.model_dump(exclude={"camera", "objects"})
+        return GoalRecord(**facts, camera=entry.camera.camera(), poses=poses)
 
-
-def _named_pose(entry: dict[str, Any]) -> tuple[str, Pose]:
-    name = str(entry["name"])
-    name.encode()
-    position = finite_vector(entry["position"], 3, "position [m]")
-    return name, Pose(position, unit_quaternion(finite_vector(entry["quaternion"], 4, "quaternion")))
+    return read_json(path, parse)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from PIL import Image
 
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError
+from osfcore.errors import CannotWrite, CorruptFile, OsfError
 
 MAX_JSON_BYTES = 16_000_000
 _PNG_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
@@ -98,40 +98,6 @@ def read_json(path: Path, parse: Callable[[object], T]) -> T:
         raise CorruptFile(path, str(error).rstrip(".")) from error
     except ValueError as error:  # a number with thousands of digits
         raise CorruptFile(path, f"it is not valid JSON ({error})") from error
-
-
-def as_mapping(value: object, what: str) -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        InvalidInput: if it is something else.
-    """
-    if not isinstance(value, dict):
-        raise InvalidInput(what, repr(value)[:60], "a JSON object")
-    return value
-
-
-def entry_of(mapping: Mapping[str, Any], key: str, what: str) -> Any:  # noqa: ANN401
-    """An entry that must be there.
-
-    Raises:
-        InvalidInput: if it is missing.
-    """
-    if key not in mapping:
-        raise InvalidInput(f"{key!r} of {what}", "missing", "given")
-    return mapping[key]
-
-
-def list_of(mapping: Mapping[str, Any], key: str, what: str) -> list[Any]:
-    """An entry that must be there and be a list.
-
-    Raises:
-        InvalidInput: if it is not.
-    """
-    value = entry_of(mapping, key, what)
-    if not isinstance(value, list):
-        raise InvalidInput(key, repr(value)[:60], "a list")
-    return value
 
 
 def is_text(name: str) -> bool:

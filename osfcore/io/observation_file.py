@@ -19,19 +19,32 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
+from pydantic import Field, FiniteFloat
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName, finite_vector, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import MAX_OBJECTS, Observation
-from osfcore.io.files import as_mapping, entry_of, is_text, list_of, read_json, reading_png, write_json
+from osfcore.io.files import is_text, read_json, reading_png, write_json
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.io.scene_file import camera_from_json, camera_to_json
+from osfcore.io.json_codec import Entry, Text, decode
+from osfcore.io.scene_file import CameraJson, PointJson, camera_to_json
 
 OBSERVATION_FILE = "observation.json"
 MAX_CAMERAS = 32  # keeps a whole observation below a gigabyte
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB, _RGBA = 0, 2, 6  # colour types of PNG
 _MASK_LEVEL = 127
+
+
+class ObservationJson(Entry):
+    """What observation.json holds."""
+
+    cameras: list[CameraJson]
+    images: dict[str, Any]  # `_inside` looks at the names of files
+    objects: list[Text]
+    masks: dict[str, dict[str, Any]] | None = None
+    pusher: PointJson | None = None
+    time_s: FiniteFloat = Field(0.0, ge=0)
 
 
 def is_observation(path: Path) -> bool:
@@ -107,27 +120,25 @@ def _check(observation: Observation) -> None:
             raise InvalidInput(f"shape of the {name}", array.shape, f"{shape}, with finite numbers")
     if observation.pusher is not None:
         finite_vector(observation.pusher, 3, "pusher position [m]")
-    _time(float(observation.time_s))
+    if not 0 <= observation.time_s < np.inf:  # also false for NaN
+        raise InvalidInput("time_s", observation.time_s, "a finite number of at least 0")
 
 
 def _observation(folder: Path, data: object) -> Observation:
-    root = as_mapping(data, "observation")
-    cameras = tuple(camera_from_json(entry) for entry in list_of(root, "cameras", "observation"))
+    entry = decode(ObservationJson, data, "observation")
+    cameras, names, files = tuple(c.camera() for c in entry.cameras), tuple(entry.objects), entry.images
     _check_cameras(cameras)
-    names = tuple(list_of(root, "objects", "observation"))
     _check_objects(names)
-    files = as_mapping(entry_of(root, "images", "observation"), "images")
     _check_known("camera", files, {camera.name for camera in cameras})
-    taken = [str(entry_of(files, camera.name, "images")) for camera in cameras]
+    if missing := [camera.name for camera in cameras if camera.name not in files]:
+        raise InvalidInput(f"image of camera {shown(missing[0])}", "missing", "given")
+    taken = [str(files[camera.name]) for camera in cameras]
     if len(set(taken)) != len(taken):
         raise InvalidInput("files of the images", ", ".join(taken), "all different")
     images = np.stack([_read_image(folder, files[camera.name], camera) for camera in cameras])
-    masks = None if root.get("masks") is None else _read_masks(folder, root["masks"], cameras, names)
-    pusher = None
-    if root.get("pusher") is not None:
-        position = entry_of(as_mapping(root["pusher"], "pusher"), "position", "pusher")
-        pusher = finite_vector(position, 3, "pusher position [m]")
-    return Observation(cameras, images, names, masks, pusher, _time(root.get("time_s", 0.0)))
+    masks = None if entry.masks is None else _read_masks(folder, entry.masks, cameras, names)
+    pusher = None if entry.pusher is None else np.array(entry.pusher.position)
+    return Observation(cameras, images, names, masks, pusher, entry.time_s)
 
 
 def _check_cameras(cameras: tuple[Camera, ...]) -> None:
@@ -141,10 +152,10 @@ def _check_cameras(cameras: tuple[Camera, ...]) -> None:
         raise InvalidInput("sizes of the cameras [px]", ", ".join(sizes), "the same")
 
 
-def _check_objects(names: tuple[Any, ...]) -> None:
+def _check_objects(names: tuple[str, ...]) -> None:
     if not 1 <= len(names) <= MAX_OBJECTS:
         raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
-    if not all(isinstance(name, str) and name for name in names):
+    if not all(names):
         raise InvalidInput("objects", list(names), "a list of names")
     if len(set(names)) != len(names):
         raise InvalidInput("list of objects", ", ".join(names), "without repetition")
@@ -156,12 +167,6 @@ def _check_known(kind: str, given: Mapping[str, Any], known: set[str]) -> None:
             raise UnknownName(kind, name, known)
 
 
-def _time(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e300:  # also for NaN
-        raise InvalidInput("time_s", shown(repr(value)), "a finite number of at least 0")
-    return float(value)
-
-
 def _read_image(folder: Path, file: object, camera: Camera) -> Float32[np.ndarray, "h w 3"]:
     path = _inside(folder, file, f"image of camera {shown(camera.name)}")
     pixels = _read_png(path, camera, {_RGB: (8,), _RGBA: (8,)}, "8-bit RGB")
@@ -171,13 +176,12 @@ def _read_image(folder: Path, file: object, camera: Camera) -> Float32[np.ndarra
 
 
 def _read_masks(
-    folder: Path, data: object, cameras: tuple[Camera, ...], names: tuple[str, ...]
+    folder: Path, by_camera: Mapping[str, Mapping[str, Any]], cameras: tuple[Camera, ...], names: tuple[str, ...]
 ) -> Bool[np.ndarray, "V N h w"]:
-    by_camera = as_mapping(data, "masks")
     _check_known("camera", by_camera, {camera.name for camera in cameras})
     masks = np.zeros((len(cameras), len(names), cameras[0].height, cameras[0].width), bool)
     for view, camera in enumerate(cameras):
-        files = as_mapping(by_camera.get(camera.name, {}), f"masks of camera {shown(camera.name)}")
+        files = by_camera.get(camera.name, {})
         _check_known("object", files, set(names))
         for name, file in files.items():
             path = _inside(folder, file, f"mask of {shown(name)} for camera {shown(camera.name)}")

@@ -13,12 +13,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, shown
+from osfcore.errors import InvalidInput
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.workspace import STEP_S
-from osfcore.io.files import as_mapping, entry_of, read_json, write_json
+from osfcore.io.files import read_json, write_json
+from osfcore.io.json_codec import Entry, decode
 
 _DIGITS = 9  # nanometres
+
+
+class _Actions(Entry):
+    actions: Any  # `check_actions` says it better
+    step_s: float = STEP_S
 
 
 def actions_from_json(data: object) -> Float[np.ndarray, "K T 3"]:
@@ -27,11 +33,10 @@ def actions_from_json(data: object) -> Float[np.ndarray, "K T 3"]:
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
     """
-    root = as_mapping(data, "actions file")
-    step = root.get("step_s", STEP_S)
-    if isinstance(step, bool) or step != STEP_S:
-        raise InvalidInput("step_s", shown(repr(step)), f"{STEP_S}: every action is held that long")
-    return check_actions(entry_of(root, "actions", "the actions file"))
+    entry = decode(_Actions, data, "the actions file")
+    if entry.step_s != STEP_S:
+        raise InvalidInput("step_s", entry.step_s, f"{STEP_S}: every action is held that long")
+    return check_actions(entry.actions)
 
 
 def read_actions(path: Path) -> Float[np.ndarray, "K T 3"]:

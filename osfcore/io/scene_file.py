@@ -8,18 +8,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from pydantic import Field
 
-from osfcore.errors import InvalidInput, finite_vector
+from osfcore.errors import InvalidInput, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from osfcore.io.files import as_mapping, entry_of, list_of, read_json
+from osfcore.io.files import read_json
+from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, Vector3, Vector4, decode, encode
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -30,31 +34,110 @@ class Scene:
     cameras: tuple[Camera, ...]
 
 
+class PointJson(Entry):
+    """A place in the world."""
+
+    position: Vector3 = Field(description="[m], world frame.")
+
+    @staticmethod
+    def of(position: Float[np.ndarray, "3"] | None) -> PointJson | None:
+        """From an array; None of None."""
+        return None if position is None else PointJson(position=position.tolist())
+
+
+class ObjectJson(Entry):
+    """Where an object is."""
+
+    name: Text
+    position: Vector3 = Field(description="[m], world frame.")
+    quaternion: Vector4 = Field(description="Unit quaternion (w, x, y, z).")
+
+    @staticmethod
+    def of(name: str, pose: Pose) -> ObjectJson:
+        """From a name and a single pose."""
+        return ObjectJson(name=name, position=pose.position.tolist(), quaternion=pose.quaternion.tolist())
+
+    def pose(self) -> Pose:
+        """The pose, its quaternion as it is given."""
+        return Pose(np.array(self.position), np.array(self.quaternion))
+
+
+class CameraJson(Entry):
+    """A pinhole camera with OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+
+    name: Text
+    T_world_camera: Matrix4 = Field(description="Maps camera coordinates to world coordinates [m].")
+    K: Matrix3 = Field(description="Intrinsics [px].")
+    width: int = Field(description="[px]")
+    height: int = Field(description="[px]")
+
+    @staticmethod
+    def of(camera: Camera) -> CameraJson:
+        """From a camera."""
+        matrix, K = camera.T_world_camera.matrix().tolist(), camera.intrinsics.tolist()
+        return CameraJson(name=camera.name, T_world_camera=matrix, K=K, width=camera.width, height=camera.height)
+
+    def camera(self) -> Camera:
+        """The camera.
+
+        Raises:
+            InvalidInput: if a value is out of range.
+        """
+        T_world_camera = np.array(self.T_world_camera)
+        R = T_world_camera[:3, :3]
+        is_rigid = np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) > 0
+        if not is_rigid or not np.allclose(T_world_camera[3], (0, 0, 0, 1)):
+            what = f"T_world_camera of camera {shown(self.name)}"
+            raise InvalidInput(what, self.T_world_camera, "a rotation and a translation, 4 x 4")
+        return Camera(self.name, Pose.from_matrix(T_world_camera), np.array(self.K), self.width, self.height)
+
+
+class StateJson(Entry):
+    """Where everything is."""
+
+    objects: list[ObjectJson]
+    light: PointJson
+    pusher: PointJson | None = None
+
+    @staticmethod
+    def of(state: SceneState) -> StateJson:
+        """From a state."""
+        light = PointJson(position=state.light.position.tolist())
+        return StateJson(objects=posed_objects(state), light=light, pusher=PointJson.of(state.pusher))
+
+    def state(self) -> SceneState:
+        """The state.
+
+        Raises:
+            InvalidInput: if a value is out of range.
+        """
+        positions = np.array([entry.position for entry in self.objects]).reshape(-1, 3)
+        quaternions = np.array([entry.quaternion for entry in self.objects]).reshape(-1, 4)
+        pusher = None if self.pusher is None else np.array(self.pusher.position)
+        names = tuple(entry.name for entry in self.objects)
+        return SceneState(names, Pose(positions, quaternions), Light(np.array(self.light.position)), pusher)
+
+
+class SceneJson(StateJson):
+    """A scene with its cameras."""
+
+    cameras: list[CameraJson] = Field(default_factory=list)
+
+
+def posed_objects(state: SceneState) -> list[ObjectJson]:
+    """The objects of a state."""
+    return [ObjectJson.of(name, state.pose(name)) for name in state.names]
+
+
+def state_to_json(state: SceneState) -> dict[str, Any]:
+    """A state as plain lists and numbers: a scene.json without cameras."""
+    data = encode(StateJson.of(state))
+    return data if state.pusher is not None else {key: data[key] for key in ("objects", "light")}
+
+
 def scene_to_json(scene: Scene) -> dict[str, Any]:
     """The scene as plain lists and numbers."""
-    state = scene.state
-    result: dict[str, Any] = {
-        "objects": [
-            {"name": name, "position": p.tolist(), "quaternion": q.tolist()}
-            for name, p, q in zip(state.names, state.poses.position, state.poses.quaternion, strict=True)
-        ],
-        "light": {"position": state.light.position.tolist()},
-    }
-    if state.pusher is not None:
-        result["pusher"] = {"position": state.pusher.tolist()}
-    result["cameras"] = [camera_to_json(camera) for camera in scene.cameras]
-    return result
-
-
-def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """One camera as plain lists and numbers."""
-    return {
-        "name": camera.name,
-        "T_world_camera": camera.T_world_camera.matrix().tolist(),
-        "K": camera.intrinsics.tolist(),
-        "width": camera.width,
-        "height": camera.height,
-    }
+    return {**state_to_json(scene.state), "cameras": [camera_to_json(camera) for camera in scene.cameras]}
 
 
 def scene_from_json(data: object) -> Scene:
@@ -63,30 +146,25 @@ def scene_from_json(data: object) -> Scene:
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
     """
-    root = as_mapping(data, "scene")
-    objects = [as_mapping(entry, "entry of objects") for entry in list_of(root, "objects", "scene")]
-    names = tuple(str(entry_of(entry, "name", "object")) for entry in objects)
-    positions = [
-        finite_vector(entry_of(o, "position", n), 3, f"position of {n} [m]")
-        for n, o in zip(names, objects, strict=True)
-    ]
-    turns = [
-        finite_vector(entry_of(o, "quaternion", n), 4, f"quaternion of {n}")
-        for n, o in zip(names, objects, strict=True)
-    ]
-    poses = Pose(np.array(positions).reshape(-1, 3), np.array(turns).reshape(-1, 4))
-    light = Light(
-        finite_vector(entry_of(as_mapping(entry_of(root, "light", "scene"), "light"), "position", "light"), 3, "light")
-    )
-    pusher = None
-    if root.get("pusher") is not None:
-        pusher = finite_vector(
-            entry_of(as_mapping(root["pusher"], "pusher"), "position", "pusher"), 3, "pusher position [m]"
-        )
-    cameras = tuple(camera_from_json(c) for c in list_of(root, "cameras", "scene")) if "cameras" in root else ()
+    entry = decode(SceneJson, data, "scene")
+    return Scene(entry.state(), cameras_of(entry.cameras))
+
+
+def cameras_of(entries: Iterable[CameraJson]) -> tuple[Camera, ...]:
+    """The cameras.
+
+    Raises:
+        InvalidInput: if a value is out of range, or two have the same name.
+    """
+    cameras = tuple(entry.camera() for entry in entries)
     if len({camera.name for camera in cameras}) != len(cameras):
-        raise InvalidInput("names of the cameras", [camera.name for camera in cameras], "all different")
-    return Scene(SceneState(names, poses, light, pusher), cameras)
+        raise InvalidInput("names of the cameras", ", ".join(camera.name for camera in cameras), "all different")
+    return cameras
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """One camera as plain lists and numbers."""
+    return encode(CameraJson.of(camera))
 
 
 def camera_from_json(data: object) -> Camera:
@@ -95,29 +173,7 @@ def camera_from_json(data: object) -> Camera:
     Raises:
         InvalidInput: if something is missing or out of range.
     """
-    entry = as_mapping(data, "camera")
-    name = str(entry_of(entry, "name", "camera"))
-    pose = finite_vector(
-        _flat(entry_of(entry, "T_world_camera", f"camera {name}")), 16, f"T_world_camera of camera {name}"
-    )
-    K = finite_vector(_flat(entry_of(entry, "K", f"camera {name}")), 9, f"K of camera {name}")
-    rotation = pose.reshape(4, 4)[:3, :3]
-    is_rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-    if not is_rigid or not np.allclose(pose[12:], (0, 0, 0, 1)):
-        raise InvalidInput(f"T_world_camera of camera {name}", pose.tolist(), "a rotation and a translation, 4 x 4")
-    sizes = [entry_of(entry, key, f"camera {name}") for key in ("width", "height")]
-    if not all(isinstance(size, int) for size in sizes):
-        raise InvalidInput(f"size of camera {name} [px]", sizes, "two whole numbers")
-    return Camera(name, Pose.from_matrix(pose.reshape(4, 4)), K.reshape(3, 3), *sizes)
-
-
-def _flat(rows: object) -> list[Any]:
-    """Numbers of nested lists in one list; what is not nested lists comes back as it is, for the check to refuse."""
-    return [entry for row in rows for entry in row] if _is_rows(rows) else [rows]
-
-
-def _is_rows(rows: object) -> TypeGuard[list[list[Any]]]:
-    return isinstance(rows, list) and all(isinstance(row, list) for row in rows)
+    return decode(CameraJson, data, "camera").camera()
 
 
 def read_scene(path: Path) -> Scene:

@@ -12,26 +12,107 @@ without uncertainty that is trusted. An uncertainty of null is one without bound
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
 
 from osfcore.errors import InvalidInput, shown
 from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.io.files import as_mapping, read_json, write_json
-from osfcore.io.scene_file import Scene, scene_from_json, scene_to_json
+from osfcore.io.files import read_json, write_json
+from osfcore.io.json_codec import Entry, Text, decode, encode
+from osfcore.io.scene_file import ObjectJson, PointJson, StateJson, posed_objects
+
+_Deviation = Annotated[FiniteFloat, Field(ge=0)]
+
+
+class PoseUncertaintyJson(Entry):
+    """Standard deviations; null for one without bounds."""
+
+    position_std_m: _Deviation | None = Field(default=0.0, description="Per axis [m].")
+    rotation_std_rad: _Deviation | None = Field(default=0.0, description="Per axis of a small rotation [rad].")
+
+
+class EstimatedObjectJson(ObjectJson):
+    """Where an object is believed to be."""
+
+    uncertainty: PoseUncertaintyJson = PoseUncertaintyJson()
+    doubt: Text = Field(default="", description="Why not to trust it; empty where it may be.")
+
+
+class LightUncertaintyJson(Entry):
+    """Standard deviation; null for one without bounds."""
+
+    direction_std_rad: _Deviation | None = Field(default=0.0, description="Per axis [rad].")
+
+
+class EstimatedLightJson(PointJson):
+    """Where the light is believed to be, 1 m from the table's centre."""
+
+    uncertainty: LightUncertaintyJson = LightUncertaintyJson()
+
+
+class EstimateJson(StateJson):
+    """A state and how far it can be trusted."""
+
+    objects: list[EstimatedObjectJson]  # pyright: ignore[reportIncompatibleVariableOverride]
+    light: EstimatedLightJson  # pyright: ignore[reportIncompatibleVariableOverride]
+    trusted: bool
+    reason: Text = Field(default="", description="Why not to trust it; empty where it may be.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _trusted_without_a_reason_not_to(cls, data: object) -> object:
+        return {"trusted": not data.get("reason"), **data} if isinstance(data, dict) else data
+
+    @staticmethod
+    def of_estimate(estimated: EstimatedState) -> EstimateJson:
+        """From an estimate."""
+        state, light_std = estimated.state, LightUncertaintyJson(direction_std_rad=_bounded(estimated.light_std))
+        deviations = zip(estimated.position_std, estimated.rotation_std, estimated.doubts, strict=True)
+        return EstimateJson(
+            objects=[
+                EstimatedObjectJson(
+                    **dict(entry),
+                    uncertainty=PoseUncertaintyJson(position_std_m=_bounded(m), rotation_std_rad=_bounded(rad)),
+                    doubt=doubt,
+                )
+                for entry, (m, rad, doubt) in zip(posed_objects(state), deviations, strict=True)
+            ],
+            light=EstimatedLightJson(position=state.light.position.tolist(), uncertainty=light_std),
+            pusher=PointJson.of(state.pusher),
+            trusted=estimated.trusted,
+            reason=estimated.reason,
+        )
+
+    def estimate(self) -> EstimatedState:
+        """The estimate.
+
+        Raises:
+            InvalidInput: if a value is out of range, or `trusted` and `reason` contradict each other.
+        """
+        if self.trusted == bool(self.reason):
+            allowed = "empty where trusted is true and a sentence where it is false"
+            raise InvalidInput("reason", shown(repr(self.reason)), allowed)
+        position = [_unbounded(entry.uncertainty.position_std_m) for entry in self.objects]
+        rotation = [_unbounded(entry.uncertainty.rotation_std_rad) for entry in self.objects]
+        light = _unbounded(self.light.uncertainty.direction_std_rad)
+        doubts = tuple(entry.doubt for entry in self.objects)
+        return EstimatedState(self.state(), np.array(position), np.array(rotation), light, doubts, self.reason)
+
+
+def _bounded(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _unbounded(value: float | None) -> float:
+    return np.inf if value is None else value
 
 
 def estimated_to_json(estimated: EstimatedState) -> dict[str, Any]:
     """The state as plain lists and numbers."""
-    result = scene_to_json(Scene(estimated.state, ()))
-    del result["cameras"]
-    deviations = zip(estimated.position_std, estimated.rotation_std, estimated.doubts, strict=True)
-    for entry, (position, rotation, doubt) in zip(result["objects"], deviations, strict=True):
-        entry["uncertainty"] = {"position_std_m": _number(position), "rotation_std_rad": _number(rotation)}
-        entry["doubt"] = doubt
-    result["light"]["uncertainty"] = {"direction_std_rad": _number(estimated.light_std)}
-    return {**result, "trusted": estimated.trusted, "reason": estimated.reason}
+    data = encode(EstimateJson.of_estimate(estimated))
+    return data if estimated.state.pusher is not None else {key: data[key] for key in data if key != "pusher"}
 
 
 def estimated_from_json(data: object) -> EstimatedState:
@@ -40,14 +121,7 @@ def estimated_from_json(data: object) -> EstimatedState:
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
     """
-    state = scene_from_json(data).state
-    root = as_mapping(data, "state")
-    objects = root["objects"]
-    position = [_deviation(entry, "position_std_m", shown(entry["name"])) for entry in objects]
-    rotation = [_deviation(entry, "rotation_std_rad", shown(entry["name"])) for entry in objects]
-    light = _deviation(root["light"], "direction_std_rad", "light")
-    doubts = tuple(_text(entry, "doubt", shown(entry["name"])) for entry in objects)
-    return EstimatedState(state, np.array(position), np.array(rotation), light, doubts, _reason(root))
+    return decode(EstimateJson, data, "state").estimate()
 
 
 def is_estimated(data: object) -> bool:
@@ -71,37 +145,3 @@ def write_estimated(path: Path, estimated: EstimatedState) -> None:
         CannotWrite: if the disk refuses.
     """
     write_json(path, estimated_to_json(estimated))
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _deviation(entry: dict[str, Any], key: str, what: str) -> float:
-    """A standard deviation; 0 where nothing is said of it."""
-    value = as_mapping(entry.get("uncertainty", {}), f"uncertainty of {what}").get(key, 0.0)
-    if value is None:
-        return float("inf")
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not 0 <= value < 1e300:  # also false for NaN
-        raise InvalidInput(f"{key} of {what}", shown(repr(value)), "a finite number of at least 0, or null")
-    return float(value)
-
-
-def _text(entry: dict[str, Any], key: str, what: str) -> str:
-    value = entry.get(key, "")
-    if not isinstance(value, str):
-        raise InvalidInput(f"{key} of {what}", shown(repr(value)), "a text")
-    return value
-
-
-def _reason(root: dict[str, Any]) -> str:
-    reason = _text(root, "reason", "state")
-    trusted = root.get("trusted", not reason)
-    if not isinstance(trusted, bool):
-        raise InvalidInput("trusted", shown(repr(trusted)), "true or false")
-    if trusted == bool(reason):
-        raise InvalidInput(
-            "reason", shown(repr(reason)), "empty where trusted is true and a sentence where it is false"
-        )
-    return reason

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -56,10 +55,6 @@ class RearrangementScore:
         """Whether what had to move has arrived, and nothing else was pushed away."""
         arrived = self.moved_mm <= 1000 * threshold_m and self.moved_deg <= threshold_deg
         return arrived and self.others_mm <= 1000 * OTHERS_M
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON."""
-        return asdict(self)
 
 
 def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, Symmetry]) -> RearrangementScore:

@@ -26,7 +26,8 @@ from jaxtyping import Float
 
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
 from osfcore.io.image_file import encode_png
-from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
+from osfcore.io.json_codec import decode
+from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.download import remove_old, told_as_fetch_failed
 
@@ -72,7 +73,7 @@ class AssetLibrary:
             return CATALOGUE[name]
         facts = self._known_facts(name)
         with self._as_corrupt(name):
-            return _info_from_json(facts["info"])
+            return decode(ObjectInfo, facts["info"], "info")
 
     def source(self, name: str) -> str:
         """Where an object on this machine came from, as told to `write`."""
@@ -244,23 +245,6 @@ def check_name(name: str) -> str:
         allowed = "1 to 64 lower-case letters, digits, '_' or '-', starting with a letter or digit"
         raise InvalidInput("object name", repr(name[:80]), allowed)
     return name
-
-
-def _info_from_json(facts: dict[str, Any]) -> ObjectInfo:
-    symmetry = facts["symmetry"]
-    rotations = tuple((float(w), float(x), float(y), float(z)) for w, x, y, z in symmetry["rotations"])
-    axis = None
-    if symmetry["axis"] is not None:
-        x, y, z = symmetry["axis"]
-        axis = (float(x), float(y), float(z))
-    return ObjectInfo(
-        name=str(facts["name"]),
-        label=str(facts["label"]),
-        mass_kg=float(facts["mass_kg"]),
-        symmetry=Symmetry(symmetry["kind"], rotations, axis, str(symmetry["reason"])),
-        licence=str(facts["licence"]),
-        attribution=str(facts["attribution"]),
-    )
 
 
 def _write_arrays(path: Path, asset: ObjectAsset) -> None:

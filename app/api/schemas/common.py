@@ -5,6 +5,7 @@ Lengths in metres, time in seconds, quaternions (w, x, y, z), world z up with th
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,31 +13,22 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from app.processes.scene_messages import SceneRecord
 from app.services.scenes import MAX_SEED
-from osfcore.geometry.cameras import (
-    DEFAULT_IMAGE_SIDE,
-    MAX_IMAGE_SIDE,
-    MIN_IMAGE_SIDE,
-    Camera,
-    default_cameras,
-    goal_camera,
-)
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.io.scene_file import CameraJson, ObjectJson, PointJson
 from osfcore.objects.asset import ObjectInfo
 
-Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 # Bounds far beyond anything on a table keep numbers away whose squares overflow.
 Component = Annotated[FiniteFloat, Field(ge=-1.1, le=1.1)]
 Coordinate = Annotated[FiniteFloat, Field(ge=-100, le=100)]
 Quaternion = Annotated[list[Component], Field(min_length=4, max_length=4, description="Unit quaternion (w, x, y, z).")]
 Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3, description="[m], world frame.")]
+Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Velocity = Annotated[
     Vector3, Field(description="Pusher velocity (vx, vy, 0) [m/s], |vx| and |vy| at most 0.3, held for 0.2 s.")
 ]
-Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
-Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
-Matrix4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
 ImageSize = Annotated[int, Field(ge=MIN_IMAGE_SIDE, le=MAX_IMAGE_SIDE, description="Side of the square images [px].")]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 ObjectName = Annotated[str, Field(min_length=1, max_length=64, examples=["006_mustard_bottle"])]
@@ -167,40 +159,15 @@ class ActionsIn(Input):
     actions: list[Velocity] = Field(min_length=1, max_length=50, examples=[[[0.2, 0.0, 0.0]]])
 
 
-class SceneObject(BaseModel):
+class SceneObject(ObjectJson):
     """An object on the table."""
 
-    name: str
     label: str
-    position: Position
-    quaternion: Quaternion
-
-
-class PointOut(BaseModel):
-    """A place in the world."""
-
-    position: Position
-
-
-class CameraOut(BaseModel):
-    """A pinhole camera with OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
-
-    name: str
-    T_world_camera: Matrix4 = Field(description="Maps camera coordinates to world coordinates [m].")
-    K: Matrix3 = Field(description="Intrinsics [px].")
-    width: int = Field(description="[px]")
-    height: int = Field(description="[px]")
 
     @staticmethod
-    def of(camera: Camera) -> CameraOut:
-        """From the core's camera."""
-        return CameraOut(
-            name=camera.name,
-            T_world_camera=camera.T_world_camera.matrix().tolist(),
-            K=camera.intrinsics.tolist(),
-            width=camera.width,
-            height=camera.height,
-        )
+    def labelled(name: str, pose: Pose, labels: dict[str, str]) -> SceneObject:
+        """With its label, where it has one."""
+        return SceneObject(**dict(ObjectJson.of(name, pose)), label=labels.get(name, name))
 
 
 class SceneOut(BaseModel):
@@ -212,9 +179,9 @@ class SceneOut(BaseModel):
     is_current: bool = Field(description="Whether it is the one that viewer and page show.")
     time_s: float = Field(description="Simulated time since creation or reset [s].")
     objects: list[SceneObject]
-    light: PointOut
-    pusher: PointOut | None = Field(description="Centre of the pusher.")
-    cameras: list[CameraOut]
+    light: PointJson
+    pusher: PointJson | None = Field(description="Centre of the pusher.")
+    cameras: list[CameraJson]
     image_size: int = Field(description="[px]")
     revision: int = Field(description="Grows with every change.")
 
@@ -222,37 +189,24 @@ class SceneOut(BaseModel):
     def of(record: SceneRecord, labels: dict[str, str], *, is_current: bool) -> SceneOut:
         """From the simulation's record."""
         state = record.state
-        poses = [(name, state.pose(name)) for name in state.names]
         return SceneOut(
             id=record.id,
             seed=record.seed,
             created_at=record.created_at,
             is_current=is_current,
             time_s=round(record.time_s, 6),
-            objects=[
-                SceneObject(
-                    name=name,
-                    label=labels.get(name, name),
-                    position=pose.position.tolist(),
-                    quaternion=pose.quaternion.tolist(),
-                )
-                for name, pose in poses
-            ],
-            light=PointOut(position=state.light.position.tolist()),
-            pusher=None if state.pusher is None else PointOut(position=state.pusher.tolist()),
+            objects=[SceneObject.labelled(name, state.pose(name), labels) for name in state.names],
+            light=PointJson(position=state.light.position.tolist()),
+            pusher=PointJson.of(state.pusher),
             cameras=_cameras(record.image_size),
             image_size=record.image_size,
             revision=record.revision,
         )
 
 
-_CAMERAS: dict[int, list[CameraOut]] = {}
-
-
-def _cameras(size: int) -> list[CameraOut]:
-    if size not in _CAMERAS:
-        _CAMERAS[size] = [CameraOut.of(camera) for camera in (*default_cameras(size), goal_camera(size))]
-    return _CAMERAS[size]
+@cache  # every scene tells its cameras
+def _cameras(size: int) -> list[CameraJson]:
+    return [CameraJson.of(camera) for camera in (*default_cameras(size), goal_camera(size))]
 
 
 class SceneList(BaseModel):

@@ -6,10 +6,11 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from app.api.schemas.common import Input, PointOut, Position, Quaternion, Seed
+from app.api.schemas.common import Input, Seed
 from app.jobs.job import Job, State
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked
+from osfcore.io.state_file import EstimateJson
 
 
 class EstimateIn(Input):
@@ -51,45 +52,6 @@ class StepOut(BaseModel):
     loss: float | None = Field(description="Of the whole, likewise; null where only objects are looked at.")
 
 
-class PoseUncertainty(BaseModel):
-    """Standard deviations; null for one without bounds."""
-
-    position_std_m: float | None = Field(description="Per axis [m].")
-    rotation_std_rad: float | None = Field(description="Per axis of a small rotation [rad].")
-
-
-class EstimatedObject(BaseModel):
-    """Where an object is believed to be."""
-
-    name: str
-    position: Position
-    quaternion: Quaternion
-    uncertainty: PoseUncertainty
-    doubt: str = Field(description="Why not to trust it; empty where it may be.")
-
-
-class LightUncertainty(BaseModel):
-    """Standard deviation; null for one without bounds."""
-
-    direction_std_rad: float | None = Field(description="Per axis [rad].")
-
-
-class EstimatedLight(PointOut):
-    """Where the light is believed to be, 1 m from the table's centre."""
-
-    uncertainty: LightUncertainty
-
-
-class EstimatedOut(BaseModel):
-    """The result, exactly as state.json holds it."""
-
-    objects: list[EstimatedObject]
-    light: EstimatedLight
-    pusher: PointOut | None = None
-    trusted: bool
-    reason: str = Field(description="Why not to trust it; empty where it may be.")
-
-
 class ObjectError(BaseModel):
     """How far one object is from where it truly is."""
 
@@ -126,7 +88,7 @@ class EstimateOut(BaseModel):
     finished_at: str | None
     error: str | None
     steps: list[StepOut] = Field(description="All steps so far, with their losses.")
-    estimate: EstimatedOut | None = Field(description="The result, as in state.json; null until it is there.")
+    estimate: EstimateJson | None = Field(description="The result, as in state.json; null until it is there.")
     simulation: SimulationErrors | None = Field(
         description="Simulation only: errors against the truth; null for uploads and before the result is there."
     )
@@ -134,7 +96,7 @@ class EstimateOut(BaseModel):
 
     @staticmethod
     def of_job(
-        job: Job, steps: tuple[dict[str, Any], ...], estimate: dict[str, Any] | None, errors: dict[str, Any] | None
+        job: Job, steps: tuple[dict[str, Any], ...], estimate: EstimateJson | None, errors: dict[str, Any] | None
     ) -> EstimateOut:
         """From the registry's job and what it has made."""
         return EstimateOut(
@@ -156,7 +118,7 @@ class EstimateOut(BaseModel):
             finished_at=job.finished_at,
             error=job.error,
             steps=[StepOut(**{key: step[key] for key in StepOut.model_fields}) for step in steps],
-            estimate=None if estimate is None else EstimatedOut.model_validate(estimate),
+            estimate=estimate,
             simulation=None if errors is None else SimulationErrors.model_validate(errors),
             files=list(job.files),
         )

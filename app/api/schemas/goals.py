@@ -6,11 +6,12 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, model_validator
 
-from app.api.schemas.common import CameraOut, Input, LightIn, ObjectPose, SceneObject, Seed
+from app.api.schemas.common import Input, LightIn, ObjectPose, SceneObject, Seed
 from app.services.goals import Draft
 from app.storage.goal_store import GoalRecord, Source
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.io.scene_file import CameraJson, ObjectJson
 
 GoalName = Annotated[str, Field(min_length=1, max_length=100, description="For people.")]
 SceneRef = Annotated[
@@ -64,14 +65,6 @@ class DraftKeep(Input):
     name: GoalName = "Composed"
 
 
-class PlacedOut(BaseModel):
-    """Where an object shall be."""
-
-    name: str
-    position: list[float] = Field(description="[m], world frame.")
-    quaternion: list[float] = Field(description="Unit quaternion (w, x, y, z).")
-
-
 class GoalOut(BaseModel):
     """A goal image that is kept."""
 
@@ -82,8 +75,8 @@ class GoalOut(BaseModel):
     scene: str | None = Field(description="That it was made from; null for an upload.")
     width: int = Field(description="[px]")
     height: int = Field(description="[px]")
-    camera: CameraOut = Field(description="That took the image.")
-    objects: list[PlacedOut] | None = Field(description="Where they are in the image; null where nobody knows.")
+    camera: CameraJson = Field(description="That took the image.")
+    objects: list[ObjectJson] | None = Field(description="Where they are in the image; null where nobody knows.")
 
     @staticmethod
     def of(record: GoalRecord) -> GoalOut:
@@ -96,8 +89,8 @@ class GoalOut(BaseModel):
             scene=record.scene,
             width=record.camera.width,
             height=record.camera.height,
-            camera=CameraOut.of(record.camera),
-            objects=None if record.poses is None else [_placed(name, pose) for name, pose in record.poses],
+            camera=CameraJson.of(record.camera),
+            objects=None if record.poses is None else [ObjectJson.of(*placed) for placed in record.poses],
         )
 
 
@@ -118,11 +111,5 @@ class DraftOut(BaseModel):
     @staticmethod
     def of(draft: Draft, labels: dict[str, str]) -> DraftOut:
         """From the service's own."""
-        objects = [
-            SceneObject(label=labels.get(name, name), **_placed(name, pose).model_dump()) for name, pose in draft.poses
-        ]
+        objects = [SceneObject.labelled(name, pose, labels) for name, pose in draft.poses]
         return DraftOut(scene=draft.scene, objects=objects, problem=draft.problem, revision=draft.revision)
-
-
-def _placed(name: str, pose: Pose) -> PlacedOut:
-    return PlacedOut(name=name, position=pose.position.tolist(), quaternion=pose.quaternion.tolist())

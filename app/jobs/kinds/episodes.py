@@ -18,7 +18,8 @@ from app.episodes.file_names import GOAL_FILE, RECORDING_FILE
 from app.jobs.job import INPUTS
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
-from osfcore.io.scene_file import camera_from_json
+from osfcore.io.json_codec import decode
+from osfcore.io.scene_file import ObjectJson, camera_from_json
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
@@ -155,11 +156,11 @@ def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> Goa
     return PoseGoal(names, _poses(given["poses"], names))
 
 
-def _poses(entries: list[dict[str, Any]], names: tuple[str, ...]) -> Pose:
+def _poses(data: object, names: tuple[str, ...]) -> Pose:
     """Poses from JSON, in the order of `names`."""
-    by_name = {entry["name"]: entry for entry in entries}
-    positions, quaternions = (np.array([by_name[n][part] for n in names], float) for part in ("position", "quaternion"))
-    return Pose(positions, quaternions)
+    by_name = {entry.name: entry for entry in decode(list[ObjectJson], data, "poses")}
+    entries = [by_name[name] for name in names]
+    return Pose(np.array([entry.position for entry in entries]), np.array([entry.quaternion for entry in entries]))
 
 
 def _moved(start: SceneState, wanted: SceneState | None) -> tuple[str, ...]:

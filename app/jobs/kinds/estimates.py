@@ -17,7 +17,8 @@ import numpy as np
 
 from app.jobs.job import INPUTS
 from osfcore.errors import CannotWrite, CorruptFile
-from osfcore.io.scene_file import Scene, scene_from_json, scene_to_json
+from osfcore.io.json_codec import decode
+from osfcore.io.scene_file import StateJson, state_to_json
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
@@ -129,7 +130,7 @@ def read_steps(path: Path) -> tuple[dict[str, Any], ...]:
 
 def guess_of(step: dict[str, Any]) -> SceneState:
     """The best scene of a step that was read."""
-    return scene_from_json(step["guess"]).state
+    return decode(StateJson, step["guess"], "guess").state()
 
 
 def _told(number: int, step: EstimateStep) -> Estimating:
@@ -147,10 +148,8 @@ def _number(value: float) -> float | None:
 
 
 def _keep(path: Path, told: Estimating, guess: SceneState) -> None:
-    scene = scene_to_json(Scene(guess, ()))
-    del scene["cameras"]
     names = ("done", "total", "note", "step", "stage", "losses", "loss")
-    line = json.dumps({**{name: getattr(told, name) for name in names}, "guess": scene})
+    line = json.dumps({**{name: getattr(told, name) for name in names}, "guess": state_to_json(guess)})
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")

@@ -24,6 +24,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import image_side
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import write_json
+from osfcore.io.json_codec import decode
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import DEFAULT_NAMES
 
@@ -131,22 +132,24 @@ def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrar
 
 def _report(kept: _Results) -> EstimateReport:
     def frames(key: str) -> tuple[FrameScore, ...]:
-        return tuple(FrameScore.from_json(result.figures["score"]) for result in kept[key])
+        return tuple(decode(FrameScore, result.figures["score"], "score") for result in kept[key])
 
     tracks = kept.get("track")
     bad = kept.get("bad")
     return EstimateReport(
         first=frames("first"),
-        tracks=None if tracks is None else tuple(TrackScore.from_json(result.figures["score"]) for result in tracks),
+        tracks=None
+        if tracks is None
+        else tuple(decode(TrackScore, result.figures["score"], "score") for result in tracks),
         goals=tuple(map(_goal_scores, kept["goal"])) if "goal" in kept else None,
         fixed_light=frames("fixed_light") if "fixed_light" in kept else None,
         views={views: frames(f"views_{views}") for views in VIEWS} if "fixed_light" in kept else None,
-        bad=None if bad is None else tuple(BadScore.from_json(result.figures["score"]) for result in bad),
+        bad=None if bad is None else tuple(decode(BadScore, result.figures["score"], "score") for result in bad),
     )
 
 
 def _goal_scores(result: TaskResult) -> tuple[FrameScore, ...]:
-    return tuple(FrameScore.from_json(score) for score in result.figures["scores"])
+    return tuple(decode(FrameScore, score, "score") for score in result.figures["scores"])
 
 
 def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
@@ -154,11 +157,11 @@ def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
     folder = config.folder
     for key in ("first", "fixed_light", *(f"views_{views}" for views in VIEWS)):
         if key in kept:
-            scores = [FrameScore.from_json(result.figures["score"]) for result in kept[key]]
+            scores = [decode(FrameScore, result.figures["score"], "score") for result in kept[key]]
             found = [frame_failure(f"task {n}", score, kept[key][n].shown) for n, score in enumerate(scores)]
             write_gallery(folder / f"failures_{key}.png", found)
     if "track" in kept:
-        tracks = [TrackScore.from_json(result.figures["score"]) for result in kept["track"]]
+        tracks = [decode(TrackScore, result.figures["score"], "score") for result in kept["track"]]
         found = [track_failure(f"task {n}", score, kept["track"][n].shown) for n, score in enumerate(tracks)]
         write_gallery(folder / "failures_track.png", found)
     if "goal" in kept:
@@ -168,6 +171,6 @@ def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
                 found.append(frame_failure(f"task {n}, goal with {m + 1} moved", score, (shown,)))
         write_gallery(folder / "failures_goal.png", found)
     if "bad" in kept:
-        bad = [BadScore.from_json(result.figures["score"]) for result in kept["bad"]]
+        bad = [decode(BadScore, result.figures["score"], "score") for result in kept["bad"]]
         found = [bad_failure(f"bad case {n}", score, kept["bad"][n].shown) for n, score in enumerate(bad)]
         write_gallery(folder / "failures_bad.png", found)

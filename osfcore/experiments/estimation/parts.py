@@ -39,6 +39,7 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.image_file import to_uint8
+from osfcore.io.json_codec import decode, encode
 from osfcore.io.state_file import estimated_from_json, estimated_to_json
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
@@ -133,7 +134,7 @@ class TaskRunner:
         cache = TaskCache(self._config.folder / "track")
         kept = cache.read(_file(number), given)
         if kept is None:
-            kept = self._tracked(draw, state_of(first), FrameScore.from_json(first.figures["score"]), effort)
+            kept = self._tracked(draw, state_of(first), decode(FrameScore, first.figures["score"], "score"), effort)
             cache.write(_file(number), given, kept)
         return kept
 
@@ -176,7 +177,7 @@ class TaskRunner:
             steps = estimate_first(models, frame.observation, np.random.default_rng([draw.seed, 4]), effort)
             score, estimate = self._timed(steps, frame)
             state = None if estimate is None else estimated_to_json(estimate)
-            figures = {"score": score.to_json(), "state": state}
+            figures = {"score": encode(score), "state": state}
             shown = self._compared(frame.observation, None if estimate is None else estimate.state)
             kept = TaskResult(figures, shown)
             cache.write(_file(number), given, kept)
@@ -188,7 +189,7 @@ class TaskRunner:
             score = TrackScore(
                 draw.names, (False,) * len(draw.names), (), (), (), (), (), pushes.moved_m, first.refused
             )
-            return TaskResult({"score": score.to_json()}, self._compared(pushes.frames[-1].observation, None))
+            return TaskResult({"score": encode(score)}, self._compared(pushes.frames[-1].observation, None))
         models, assets, expected, rng = (
             self._models,
             self._meshes(draw.names),
@@ -220,7 +221,7 @@ class TaskRunner:
         lost = [step for step in score.lost_at if step is not None]
         step = min(lost, default=len(states) - 1)  # where it went wrong, or how it ended
         shown = self._compared(pushes.frames[step].observation, states[step])
-        return TaskResult({"score": score.to_json(), "shown_step": step, "redrawn": pushes.redrawn}, shown)
+        return TaskResult({"score": encode(score), "shown_step": step, "redrawn": pushes.redrawn}, shown)
 
     def _goals(self, draw: Draw, prior: SceneState | None, effort: GoalImageConfig) -> TaskResult:
         scores, shown, moved, models = [], [], [], self._models
@@ -230,7 +231,7 @@ class TaskRunner:
                 score = refused_frame(draw.names, "The first frame was refused.", 0.0)
             else:
                 score, estimate = self._timed(estimate_goal(models, frame.observation, prior, effort), frame)
-            scores.append(score.to_json())
+            scores.append(encode(score))
             moved.append(list(goal.moved))
             shown += self._compared(frame.observation, None if estimate is None else estimate.state)
         return TaskResult({"scores": scores, "moved": moved}, tuple(shown))
@@ -253,7 +254,7 @@ class TaskRunner:
         score = BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
         if estimate is not None:
             score = replace(self._judged(estimate, case), seconds=seconds)
-        return TaskResult({"score": score.to_json()}, shown)
+        return TaskResult({"score": encode(score)}, shown)
 
     def _judged(self, estimate: EstimatedState, case: BadCase) -> BadScore:
         """Errors of objects that are there; an answer that names one that is not there is wrong."""

@@ -8,8 +8,7 @@ wrong in what follows: nothing is put right by the truth.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -89,21 +88,6 @@ class FrameScore:
         """All objects are."""
         return not self.refused and all(score.is_right for score in self.objects)
 
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> FrameScore:
-        """What `asdict` made plain."""
-        objects = tuple(
-            ObjectScore(**{**row, **{key: tuple(row[key]) for key in ("position_ratios", "rotation_ratios")}})
-            for row in data["objects"]
-        )
-        return FrameScore(
-            **{**data, "names": tuple(data["names"]), "objects": objects, "light_ratios": tuple(data["light_ratios"])}
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain numbers."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, slots=True)
 class TrackScore:
@@ -130,18 +114,6 @@ class TrackScore:
     seconds: tuple[float, ...]
     moved_m: tuple[float, ...]
     refused: str = ""
-
-    @staticmethod
-    def from_json(data: Mapping[str, Any]) -> TrackScore:
-        """What `asdict` made plain."""
-        nested = ("position_mm", "rotation_deg", "absent", "doubted")
-        flat = ("names", "right_at_start", "seconds", "moved_m")
-        rows: dict[str, Any] = {key: tuple(tuple(row) for row in data[key]) for key in nested}
-        return TrackScore(**rows, **{key: tuple(data[key]) for key in flat}, refused=data["refused"])
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain numbers."""
-        return asdict(self)
 
     @property
     def lost_at(self) -> tuple[int | None, ...]:

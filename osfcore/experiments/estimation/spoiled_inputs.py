@@ -7,7 +7,7 @@ come without a warning. An answer that is right in spite of everything needs non
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -69,15 +69,6 @@ class BadScore:
     def is_confidently_wrong(self) -> bool:
         """Wrong without a warning."""
         return not (self.refused or self.reason or self.is_right)
-
-    @staticmethod
-    def from_json(data: dict[str, Any]) -> BadScore:
-        """What `asdict` made plain."""
-        return BadScore(**{**data, **{key: tuple(data[key]) for key in ("position_mm", "rotation_deg")}})
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain numbers."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

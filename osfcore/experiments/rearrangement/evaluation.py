@@ -31,6 +31,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8
+from osfcore.io.json_codec import encode
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.planning.mppi import PlanSettings
@@ -223,7 +224,7 @@ class _Runner:
     ) -> TaskResult:
         symmetries = {name: self._assets.info(name).symmetry for name in task.start.names}
         score, nothing = (score_of(task, state, symmetries) for state in (ended.state, task.start))
-        told = {"score": score.to_json(), "noaction": nothing.to_json(), "moved": list(task.moved), **figures}
+        told = {"score": encode(score), "noaction": encode(nothing), "moved": list(task.moved), **figures}
         label = f"{number}: {score.moved_mm:.0f} mm"
         result = TaskResult(told, (Comparison(label, to_uint8(ended.goal), to_uint8(ended.image)),))
         self._cache(kind).write(f"{number:04d}", self._circumstances(kind), result)

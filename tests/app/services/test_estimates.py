@@ -279,7 +279,7 @@ def test_the_errors_are_against_the_scene_as_it_was_seen(estimates, runner):
     done = runner.jobs.finish(job, estimate=moved)
     errors = estimates.simulation_errors(done)
     assert [error["position_mm"] for error in errors["objects"]] == pytest.approx([5, 0])
-    assert estimates.result(done)["trusted"] is True
+    assert estimates.result(done).trusted
 
 
 def test_images_are_of_cameras_and_steps_that_exist(estimates, runner):

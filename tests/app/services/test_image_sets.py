@@ -154,7 +154,6 @@ def test_uploads_at_the_same_time_do_not_overrun_the_limit(sets, archive, tmp_pa
         {"file_name": ["a"]},
         {"id": "other"},
         {"id": ["a"]},
-        {"further": 1},
     ],
 )
 def test_a_set_whose_facts_are_damaged_does_not_hide_the_others(sets, archive, tmp_path, change):

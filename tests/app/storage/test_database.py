@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from app.processes.scene_messages import SceneRecord
-from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, DataDirectoryInUse, Store, state_to_json
+from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, DataDirectoryInUse, Store
 from osfcore.errors import CorruptFile
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
+from osfcore.io.scene_file import state_to_json
 
 
 @pytest.fixture

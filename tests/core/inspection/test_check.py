@@ -194,7 +194,7 @@ def test_states_are_told_from_scenes(tmp_path):
         assert (report.kind, report.summary) == ("state", words)
         assert dict(report.facts) == {"objects": 1, "trusted": not reason, "reason": reason}
     path.write_text(path.read_text().replace('"doubt": "', '"doubt": 3, "x": "'))
-    with pytest.raises(CorruptFile, match="doubt of a is 3"):
+    with pytest.raises(CorruptFile, match="doubt of object a is 3"):
         check_path(path)
 
 

@@ -7,11 +7,8 @@ import pytest
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.io.files import (
     MAX_JSON_BYTES,
-    as_mapping,
-    entry_of,
     folder_at_once,
     is_text,
-    list_of,
     read_json,
     reading_png,
     write_atomically,
@@ -79,18 +76,6 @@ def test_what_a_parser_says_is_told_with_the_file_once(tmp_path):
         read_json(path, refuse_another)
     with pytest.raises(CorruptFile, match="No such file"):
         read_json(tmp_path / "b.json", refuse)
-
-
-def test_shapes_of_json_are_checked():
-    assert as_mapping({}, "it") == {}
-    assert entry_of({"a": None}, "a", "it") is None
-    assert list_of({"a": [1]}, "a", "it") == [1]
-    with pytest.raises(InvalidInput, match="it is \\[\\], but it must be a JSON object"):
-        as_mapping([], "it")
-    with pytest.raises(InvalidInput, match="'a' of it is missing"):
-        entry_of({}, "a", "it")
-    with pytest.raises(InvalidInput, match="a is {}, but it must be a list"):
-        list_of({"a": {}}, "a", "it")
 
 
 def test_halves_of_characters_are_no_text():

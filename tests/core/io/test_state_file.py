@@ -89,19 +89,31 @@ def test_a_plain_scene_is_a_trusted_state_without_uncertainty(tmp_path):
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
-        (("objects", 0, "uncertainty"), 3, "uncertainty of 006_mustard_bottle is 3, but it must be a JSON object"),
-        (("objects", 1, "uncertainty", "position_std_m"), -1, "position_std_m of 035_power_drill is -1"),
-        (("objects", 1, "uncertainty", "position_std_m"), True, "position_std_m of 035_power_drill is True"),
-        (("objects", 1, "uncertainty", "rotation_std_rad"), float("nan"), "rotation_std_rad of 035_power_drill is nan"),
-        (("objects", 1, "uncertainty", "rotation_std_rad"), 10**400, "rotation_std_rad of 035_power_drill is 1000"),
-        (("objects", 0, "doubt"), None, "doubt of 006_mustard_bottle is None, but it must be a text"),
-        (("objects", 0, "position"), [0, 0], "position of 006_mustard_bottle"),
+        (
+            ("objects", 0, "uncertainty"),
+            3,
+            "uncertainty of object 006_mustard_bottle is 3, but it must be a JSON object",
+        ),
+        (("objects", 1, "uncertainty", "position_std_m"), -1, "position_std_m of object 035_power_drill is -1"),
+        (("objects", 1, "uncertainty", "position_std_m"), True, "position_std_m of object 035_power_drill is True"),
+        (
+            ("objects", 1, "uncertainty", "rotation_std_rad"),
+            float("nan"),
+            "rotation_std_rad of object 035_power_drill is nan",
+        ),
+        (
+            ("objects", 1, "uncertainty", "rotation_std_rad"),
+            10**400,
+            "rotation_std_rad of object 035_power_drill is 1000",
+        ),
+        (("objects", 0, "doubt"), None, "doubt of object 006_mustard_bottle is None, but it must be a text"),
+        (("objects", 0, "position"), [0, 0], "position of object 006_mustard_bottle"),
         (("light", "uncertainty", "direction_std_rad"), "1", "direction_std_rad of light is '1'"),
         (("light", "position"), [0, 0, -1], "light"),
         (("trusted",), "yes", "trusted is 'yes', but it must be true or false"),
         (("trusted",), True, "reason is 'it hides', but it must be empty where trusted is true"),
         (("reason",), "", "reason is '', but it must be .*a sentence where it is false"),
-        (("reason",), 7, "reason of state is 7"),
+        (("reason",), 7, "reason is 7"),
     ],
 )
 def test_mistakes_are_told_with_their_place(tmp_path, path, value, words):

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from app.api.schemas.common import CameraOut, LightIn, SceneIn, SceneOut
+from app.api.schemas.common import LightIn, SceneIn, SceneOut
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
+from osfcore.io.scene_file import CameraJson
 from tests.app.storage.test_database import record
 
 
@@ -21,7 +22,7 @@ def test_a_scene_says_what_the_record_says():
 
 def test_cameras_project_as_the_core_does():
     camera = goal_camera(64)
-    out = CameraOut.of(camera)
+    out = CameraJson.of(camera)
     point = np.array([0.1, -0.05, 0.02, 1.0])
     pixel = np.array(out.K) @ (np.linalg.inv(np.array(out.T_world_camera)) @ point)[:3]
     assert np.allclose(pixel[:2] / pixel[2], camera.project(point[:3]))

@@ -6,6 +6,7 @@ from osfcore.experiments.estimation.scores import FrameScore, TrackScore
 from osfcore.experiments.estimation.spoiled_inputs import KINDS, BadScore
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import rotate
+from osfcore.io.json_codec import decode
 from tests.core.experiments.oracle import SHIFT_M, Oracle
 from tests.core.experiments.quick import quick
 from tests.core.experiments.solids import SOLIDS
@@ -28,14 +29,14 @@ def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_
     config = quick(tmp_path, objects=1, names=SOLIDS[:1], steps=1, size=32)
     runner = TaskRunner(config, SOLIDS[:1], solids, library)
     first = runner.first(0)
-    score = FrameScore.from_json(first.figures["score"])
+    score = decode(FrameScore, first.figures["score"], "score")
     assert not score.refused
     assert score.seconds > 0
     assert state_of(first).names == SOLIDS[:1]
-    assert len(TrackScore.from_json(runner.track(0, first).figures["score"]).position_mm) == 1
+    assert len(decode(TrackScore, runner.track(0, first).figures["score"], "score").position_mm) == 1
     (goal,) = runner.goal(0, first).figures["scores"]
     assert not goal["refused"]
-    assert FrameScore.from_json(runner.fixed_light(0).figures["score"]).light_ratios == ()
+    assert decode(FrameScore, runner.fixed_light(0).figures["score"], "score").light_ratios == ()
     assert [comparison.label for comparison in first.shown] == [f"camera {n}" for n in range(4)]
     assert np.abs(first.shown[0].ours.astype(int) - first.shown[0].truth).mean() < 20
 
@@ -43,7 +44,7 @@ def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_
 def test_tracks_and_goals_begin_with_estimates_and_never_with_the_truth(runner, oracle):
     first = runner.first(0)
     start = state_of(first)
-    track = TrackScore.from_json(runner.track(0, first).figures["score"])
+    track = decode(TrackScore, runner.track(0, first).figures["score"], "score")
     assert [what for what, _ in oracle.asked] == ["first search 4", "next", "next"]
     before, after = oracle.given
     np.testing.assert_array_equal(before.poses.position, start.poses.position)
@@ -80,7 +81,7 @@ def test_ablations_see_fewer_cameras_or_hold_the_light(runner, oracle):
 
 @pytest.mark.slow
 def test_bad_cases_are_judged_by_what_is_there(runner, oracle):
-    scores = {kind: BadScore.from_json(runner.bad(n).figures["score"]) for n, kind in enumerate(KINDS)}
+    scores = {kind: decode(BadScore, runner.bad(n).figures["score"], "score") for n, kind in enumerate(KINDS)}
     assert [scores[kind].kind for kind in KINDS] == list(KINDS)
     assert not scores["wrong name"].is_right
     assert len(scores["wrong name"].position_mm) == 1  # the other name is not there
@@ -95,7 +96,7 @@ def test_bad_cases_are_judged_by_what_is_there(runner, oracle):
 
 def test_a_refused_bad_case_says_so(runner, oracle):
     oracle.refuses = 1
-    score = BadScore.from_json(runner.bad(0).figures["score"])
+    score = decode(BadScore, runner.bad(0).figures["score"], "score")
     assert "masks" in score.refused
     assert not score.is_confidently_wrong
 

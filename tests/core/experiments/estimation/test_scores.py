@@ -26,6 +26,7 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import SceneState
+from osfcore.io.json_codec import decode, encode
 from tests.core.experiments.scores import frame, score, track
 
 BOX, CAN = "003_cracker_box", "005_tomato_soup_can"
@@ -91,17 +92,17 @@ def test_light_errors_are_angles_across_the_true_direction(truth, assets):
 def test_boundless_and_vanishing_deviations_stay_plain_numbers(truth, assets):
     for std in (0.0, np.inf):
         found = score_frame(believed(truth, (0.003, 0, 0), std=std), truth, assets, 0.0)
-        json.dumps(found.to_json(), allow_nan=False)
+        json.dumps(encode(found), allow_nan=False)
         assert found.objects[0].position_ratios[0] == (0 if std else 1e6)
 
 
 def test_scores_survive_json(truth, assets):
     found = score_frame(believed(truth, (0.003, 0, 0), doubts=("why", ""), reason="why"), truth, assets, 1.5)
-    assert FrameScore.from_json(json.loads(json.dumps(found.to_json()))) == found
+    assert decode(FrameScore, json.loads(json.dumps(encode(found))), "score") == found
     refused = refused_frame(NAMES, "no masks", 0.1)
-    assert FrameScore.from_json(json.loads(json.dumps(refused.to_json()))) == refused
+    assert decode(FrameScore, json.loads(json.dumps(encode(refused))), "score") == refused
     kept = track([1.0, 40.0], [1.0, 2.0])
-    assert TrackScore.from_json(json.loads(json.dumps(kept.to_json()))) == kept
+    assert decode(TrackScore, json.loads(json.dumps(encode(kept))), "score") == kept
 
 
 @given(st.integers(0, 2**32 - 1))

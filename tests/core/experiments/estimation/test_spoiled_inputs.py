@@ -7,6 +7,7 @@ from osfcore.experiments.estimation.spoiled_inputs import FIRST_SCENE, KINDS, Ba
 from osfcore.experiments.estimation.tasks import first_frame
 from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.geometry.cameras import default_cameras
+from osfcore.io.json_codec import decode, encode
 from tests.core.experiments.solids import SOLIDS
 
 
@@ -110,4 +111,4 @@ def test_cases_are_refused_or_flagged_or_believed():
     assert (found["bad_right"], found["bad_confident_wrong"]) == (2, 1)
     assert set(found["bad_by_kind"]) == set(KINDS[:2])
     assert found["bad_by_kind"][KINDS[0]]["confident_wrong"] == 1
-    assert [BadScore.from_json(json.loads(json.dumps(score.to_json()))) for score in scores] == scores
+    assert [decode(BadScore, json.loads(json.dumps(encode(score))), "score") for score in scores] == scores
