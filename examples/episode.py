@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from osfcore import AssetLibrary, Episode, FieldLibrary, GoalImage, Tabletop, goal_camera, knowledge_of
+from osfcore import AssetLibrary, Episode, FieldLibrary, GoalImage, Tabletop, goal_camera, load_scene_models
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.world.goal_layouts import random_goal
 from osfcore.world.scene_request import SceneRequest
@@ -27,9 +27,9 @@ def main(objects: Path, steps: int = 20) -> None:
     random_goal(world, seed=1, moved=1)
     goal = GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
     world.restore(start)
-    knowledge = knowledge_of(NAMES, FieldLibrary(None), assets, None)
+    models = load_scene_models(NAMES, FieldLibrary(None), assets, None)
     settings = EpisodeSettings(steps=steps, despite_doubts=True)
-    for event in Episode(world, knowledge, goal, settings, rng).run():
+    for event in Episode(world, models, goal, settings, rng).run():
         if type(event).__name__ not in ("Looking", "Planning"):
             print(type(event).__name__, getattr(event, "text", ""))
     world.close()

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
-    from osfcore.control.knowledge import Knowledge, knowledge_of
+    from osfcore.control.scene_models import SceneModels, load_scene_models
     from osfcore.dynamics.push_models import load_push_model
     from osfcore.dynamics.rollout import PushModel
     from osfcore.errors import OsfError
@@ -60,7 +60,7 @@ _HOMES = {
     "FieldLibrary": "fields.field_library",
     "GoalImage": "control.goal",
     "KiloOSF": "fields.kiloosf",
-    "Knowledge": "control.knowledge",
+    "SceneModels": "control.scene_models",
     "Light": "geometry.light",
     "ObjectModels": "estimation.objective.object_models",
     "Observation": "geometry.states",
@@ -77,7 +77,7 @@ _HOMES = {
     "estimate_goal": "estimation.goal_image",
     "estimate_next": "estimation.tracking",
     "goal_camera": "geometry.cameras",
-    "knowledge_of": "control.knowledge",
+    "load_scene_models": "control.scene_models",
     "load_push_model": "dynamics.push_models",
 }
 __all__ = [
@@ -87,7 +87,6 @@ __all__ = [
     "FieldLibrary",
     "GoalImage",
     "KiloOSF",
-    "Knowledge",
     "Light",
     "MPPIPlanner",
     "ObjectModels",
@@ -96,6 +95,7 @@ __all__ = [
     "Pose",
     "PushModel",
     "SceneBatch",
+    "SceneModels",
     "SceneRenderer",
     "SceneState",
     "Tabletop",
@@ -104,8 +104,8 @@ __all__ = [
     "estimate_goal",
     "estimate_next",
     "goal_camera",
-    "knowledge_of",
     "load_push_model",
+    "load_scene_models",
 ]
 
 

@@ -28,15 +28,13 @@ from app.api.routes import (
     events,
     fields,
     goals,
-    health,
     jobs,
-    metrics,
     objects,
     predictions,
     presets,
     scenes,
+    status,
 )
-from app.api.routes import settings as settings_routes
 from app.api.schemas.common import FrameEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
@@ -66,8 +64,8 @@ _DESCRIPTION = (
 )
 
 _ROUTES = (
-    health, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs, settings_routes,
-    driver, metrics, events,
+    status, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs,
+    driver, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
@@ -78,7 +76,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     app = FastAPI(
         title="OSF manipulation",
-        version=health.VERSION,
+        version=status.VERSION,
         description=_DESCRIPTION,
         openapi_url="/api/openapi.json",
         docs_url=None,  # the default pages load scripts from elsewhere

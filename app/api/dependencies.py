@@ -11,8 +11,8 @@ from fastapi import Depends
 from starlette.requests import HTTPConnection
 
 from app.api.schemas.common import SceneOut
+from app.processes.messages.scene_messages import SceneRecord
 from app.processes.process_client import ProcessClient
-from app.processes.scene_messages import SceneRecord
 from app.services.driver import Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates

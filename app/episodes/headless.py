@@ -12,8 +12,8 @@ from app.episodes.file_names import RECORDING_FILE
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import EpisodeOrder, SimulatedTable, given
 from osfcore.control.closed_loop import Episode
-from osfcore.control.events import Acted, Event, GoalFound, Looking, Noticed, Planning, Stepped
-from osfcore.control.knowledge import knowledge_of
+from osfcore.control.events import ActionExecuted, Event, GoalFound, Looking, Noticed, Planning, Stepped
+from osfcore.control.scene_models import load_scene_models
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -57,15 +57,17 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
     begin = given(order)
     try:
         assets = AssetLibrary(order.data_dir / "objects")
-        knowledge = knowledge_of(begin.world.names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
+        models = load_scene_models(
+            begin.world.names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device
+        )
         symmetries = {name: assets.info(name).symmetry for name in begin.world.names}
         about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries)
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = np.random.default_rng([order.seed, 1])
         done, note = 0, ""
-        for event in Episode(begin.world, knowledge, begin.goal, order.settings, rng).run():
+        for event in Episode(begin.world, models, begin.goal, order.settings, rng).run():
             record.take(event)
-            done = event.number if isinstance(event, Acted) else done
+            done = event.number if isinstance(event, ActionExecuted) else done
             note = note_of(event) or note
             yield EpisodeStep(done, total, note, event)
         yield EpisodeStep(done, total, "Writing video and recording")
@@ -88,7 +90,7 @@ def note_of(event: Event) -> str | None:
             return "Knows where everything should be"
         case Stepped() | Planning():
             return "Planning pushes"
-        case Acted():
+        case ActionExecuted():
             return "Pushing"
         case Noticed():
             return event.text
@@ -103,7 +105,7 @@ def stage_of(event: Event) -> str | None:
             return event.look
         case Stepped() | Planning():
             return "plan"
-        case Acted():
+        case ActionExecuted():
             return "act"
         case _:
             return None

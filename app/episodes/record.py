@@ -16,7 +16,7 @@ from jaxtyping import Float
 from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
 from app.episodes.frames import TILE_PX, frame, read_frames, write_video
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Acted, Event, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_atomically, write_json
@@ -100,13 +100,13 @@ class EpisodeRecord:
             case GoalFound():
                 self._goal = event
                 write_png(self._folder / GOAL_FILE, to_uint8(event.image))
-            case Acted():
+            case ActionExecuted():
                 self._actions.append(event.action.tolist())
                 self.states.append(self._table.truth())
             case Noticed():
                 self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
             case Stepped():
-                self._steps.append(self._told(event))
+                self._steps.append(self._step_entry(event))
                 self._draw(event)
             case Finished():
                 self._end = event
@@ -131,12 +131,12 @@ class EpisodeRecord:
         self._write_csv()
         return report
 
-    def _told(self, event: Stepped) -> dict[str, Any]:
+    def _step_entry(self, event: Stepped) -> dict[str, Any]:
         """A step as the report has it; lengths in mm, angles in degrees."""
         assert self._goal is not None
         truth, estimate = self._table.truth(), event.estimate
         off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
-        told = {
+        entry = {
             "step": event.number,
             "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
             "image_cost": event.image_cost,
@@ -148,8 +148,8 @@ class EpisodeRecord:
             "truth": state_to_json(truth),
         }
         if self._about.goal is not None:
-            told["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._about.goal))
-        return told
+            entry["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._about.goal))
+        return entry
 
     def _draw(self, event: Stepped) -> None:
         assert self._goal is not None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import viser
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.storage.database import now_utc
 from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.geometry.states import SceneState

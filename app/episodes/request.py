@@ -113,10 +113,10 @@ def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
             raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
         return Given(world, goal, None, ())
     start, camera = world.truth(), goal_camera()
-    found = random_goal(world, order.seed, order.moved)
+    task = random_goal(world, order.seed, order.moved)
     image = world.render((camera,), with_pusher=False).images[0]
     world.restore(start)
-    return Given(world, GoalImage(camera, image), *found)
+    return Given(world, GoalImage(camera, image), *task)
 
 
 def read_goal(path: Path, camera: Camera) -> GoalImage:
@@ -133,7 +133,7 @@ def read_goal(path: Path, camera: Camera) -> GoalImage:
         if width * camera.height != height * camera.width:
             allowed = f"in proportion {camera.width}:{camera.height}, as the goal camera sees"
             raise InvalidInput(f"size of {path.name} [px]", f"{width} x {height}", allowed)
-        seen = camera.resized(width, height)
+        resized = camera.resized(width, height)
         if image.mode not in _MODES:
             raise CorruptFile(path, "it is no image of 8 bits a channel")
-        return GoalImage(seen, np.asarray(image.convert("RGB"), np.float32) / 255)
+        return GoalImage(resized, np.asarray(image.convert("RGB"), np.float32) / 255)

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from app.processes.job_messages import CancelJob, ChangeJob, PauseJob, ResumeJob, SceneCommand, StepJob
+from app.processes.messages.job_messages import CancelJob, ChangeJob, PauseJob, ResumeJob, SceneCommand, StepJob
+from app.processes.messages.scene_messages import Act, ObserveScene, TakeView
 from app.processes.process_server import Answer
-from app.processes.scene_messages import Act, ObserveScene, TakeView
 from osfcore.objects.asset_library import AssetLibrary
 
 

@@ -12,7 +12,7 @@ from app.jobs.clock import JobClock
 from app.jobs.job import Job
 from app.jobs.outcomes import JobDied, Outcome
 from app.jobs.worker import job_main
-from app.processes.job_messages import CancelJob, JobCancelled, RunJob
+from app.processes.messages.job_messages import CancelJob, JobCancelled, RunJob
 from app.processes.process_client import ProcessClient, ProcessUnavailable
 from osfcore.errors import OsfError
 

@@ -97,11 +97,11 @@ class JobTable:
         return replace(job, position=1 + [other.id for other in self.queue()].index(job.id))
 
     def _keep(self, job: Job) -> None:
-        told = self._with_position(job)
+        shown = self._with_position(job)
         number = 0
         try:
             self._store.save_job(job.id, self._numbers[job.id], job_fields(job))
-            number = self._store.add_event(job_fields(told))
+            number = self._store.add_event(job_fields(shown))
         except OsfError as error:  # a full disk must not stop the jobs
             _log.error("job %s: %s", job.id, error)
-        self._publish(JobChanged(number, told))
+        self._publish(JobChanged(number, shown))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.job import Job, ended
-from app.processes.job_messages import JobCancelled
+from app.processes.messages.job_messages import JobCancelled
 from osfcore.errors import OsfError
 
 RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."

@@ -18,7 +18,7 @@ from app.jobs.job import INPUTS, Job, JobChanged, JobView, State, WrongJobState,
 from app.jobs.job_process import JobProcess
 from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, Outcome, after
-from app.processes.job_messages import (
+from app.processes.messages.job_messages import (
     ChangeJob,
     JobCancelled,
     JobRests,
@@ -28,8 +28,8 @@ from app.processes.job_messages import (
     SceneCommand,
     StepJob,
 )
+from app.processes.messages.scene_messages import Command
 from app.processes.process_server import Answer
-from app.processes.scene_messages import Command
 from app.storage.database import CannotStore, Store, now_utc
 from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
@@ -174,17 +174,17 @@ class Jobs:
             WrongJobState: if it has finished.
         """
         with self._changed:
-            found = self.get(job)
-            if found.is_finished:
-                raise WrongJobState(found, "cancelled")
-            if found.state == "queued":
+            known = self.get(job)
+            if known.is_finished:
+                raise WrongJobState(known, "cancelled")
+            if known.state == "queued":
                 shutil.rmtree(self.folder(job), ignore_errors=True)
-                self._forget_workshop(found)
+                self._forget_workshop(known)
                 self._table.set(ended(self._table[job], "cancelled", note="Cancelled"))
                 self._table.publish_queue()
                 return self.get(job)
             if self._run is not None:
-                self._run.cancel(0.0 if found.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
+                self._run.cancel(0.0 if known.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
             self._changed.wait_for(lambda: self._table[job].is_finished, wait_s)
             return self.get(job)
 
@@ -223,18 +223,18 @@ class Jobs:
             WrongJobState: if it neither runs nor pauses.
         """
         with self._changed:
-            found = self.get(job)
-            if found.state not in ("running", "paused") or self._run is None or self._run.is_cancelled:
-                raise WrongJobState(found, "changed")
+            known = self.get(job)
+            if known.state not in ("running", "paused") or self._run is None or self._run.is_cancelled:
+                raise WrongJobState(known, "changed")
             self._run.order(ChangeJob(params))
-            self._table.set(replace(self._table[job], params={**found.params, **params}))
+            self._table.set(replace(self._table[job], params={**known.params, **params}))
             return self.get(job)
 
     def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
         with self._changed:
-            found = self.get(job)
-            if found.state != before or self._run is None or self._run.is_cancelled:
-                raise WrongJobState(found, "paused" if after == "paused" else "resumed")
+            known = self.get(job)
+            if known.state != before or self._run is None or self._run.is_cancelled:
+                raise WrongJobState(known, "paused" if after == "paused" else "resumed")
             self._run.order(order)
             self._run.clock.switch(is_running=after == "running")
             self._table.set(replace(self._table[job], state=after, eta_s=None))

@@ -12,7 +12,7 @@ from typing import Any
 
 from app.jobs.context import JobContext, JobControl
 from app.processes.child_process import end_own_group, import_quietly, own_group
-from app.processes.job_messages import JobCancelled, JobRests, JobStep, RunJob
+from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep, RunJob
 from app.processes.process_server import ProcessServer
 
 STEP_INTERVAL_S = 0.1

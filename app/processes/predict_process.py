@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.processes.neural_messages import Order, Predicted, PredictPushes
+from app.processes.messages.neural_messages import Order, Predicted, PredictPushes
 from app.processes.process_server import IsOvertaken, ProcessServer
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
@@ -64,11 +64,11 @@ class PushPredictor:
     def _model(self, names: tuple[str, ...]) -> PushModel:
         from osfcore.dynamics.push_models import load_push_model, network_path
 
-        wanted = tuple(sorted(names))
-        stamps = [_stamp(self._fields.folder(name) / FIELD_FILE) for name in wanted]
-        key = (wanted, *stamps, _stamp(network_path(self._data_dir)))
+        chosen = tuple(sorted(names))
+        stamps = [_stamp(self._fields.folder(name) / FIELD_FILE) for name in chosen]
+        key = (chosen, *stamps, _stamp(network_path(self._data_dir)))
         if key not in self._models:
-            self._models[key] = load_push_model(self._data_dir, self._fields, wanted)
+            self._models[key] = load_push_model(self._data_dir, self._fields, chosen)
             while len(self._models) > _MOST_MODELS:
                 self._models.popitem(last=False)
         self._models.move_to_end(key)
@@ -78,7 +78,7 @@ class PushPredictor:
 def _stamp(path: Path) -> object:
     """Changes when a file is written again or deleted; what ships with the program has none here and stays."""
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except OSError:
         return None
-    return found.st_mtime_ns, found.st_size
+    return status.st_mtime_ns, status.st_size

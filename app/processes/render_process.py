@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.processes.neural_messages import CompareView, Comparison, DrawnView, DrawView, Order
+from app.processes.messages.neural_messages import CompareView, Comparison, DrawnView, DrawView, Order
 from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.render_cameras import bands
 from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME, FieldLibrary
@@ -112,7 +112,7 @@ class NeuralRenderer:
     def _stamp(self, name: str) -> object:
         """Changes when a field is trained, trained again or deleted; those that ship with the program stay."""
         try:
-            found = (self._fields.folder(name) / FIELD_FILE).stat()
+            status = (self._fields.folder(name) / FIELD_FILE).stat()
         except OSError:
             return None
-        return found.st_mtime_ns, found.st_size
+        return status.st_mtime_ns, status.st_size

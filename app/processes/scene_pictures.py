@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.processes.scene_messages import TakeImage, TakeMask
+from app.processes.messages.scene_messages import TakeImage, TakeMask
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera, image_side
 from osfcore.inspection.mask_tint import tint_masks

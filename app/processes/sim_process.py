@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.processes.child_process import import_quietly
-from app.processes.process_server import IsOvertaken, ProcessServer
-from app.processes.scene_messages import (
+from app.processes.messages.scene_messages import (
     Act,
     AdoptScene,
     Command,
@@ -39,6 +38,7 @@ from app.processes.scene_messages import (
     TakeView,
     WatchFrames,
 )
+from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.scene_pictures import image_png, mask_png
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
@@ -293,8 +293,8 @@ class Simulation:
 
         record, world = self._record(command.id), self._world(command.id)
         cameras = (goal_camera(record.image_size),) if command.goal else default_cameras(record.image_size)
-        seen = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
-        write_observation(command.folder, seen)
+        observation = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
+        write_observation(command.folder, observation)
         return replace(record, state=world.truth())
 
     def _compose(self, command: ComposeGoal) -> ComposedGoal:
@@ -324,13 +324,13 @@ class Simulation:
         self._frames_due = False
         record = self._records[self._shown]
         try:
-            seen = self._world(record.id).render(default_cameras(min(record.image_size, MAX_FRAME_SIDE)))
+            observation = self._world(record.id).render(default_cameras(min(record.image_size, MAX_FRAME_SIDE)))
         except OsfError as error:
             _log.warning("no live images of scene %s: %s", record.id, error)
             return
-        images = to_uint8(seen.images)
+        images = to_uint8(observation.images)
         jpegs = tuple(encode_jpeg(image) for image in images)
-        names = tuple(camera.name for camera in seen.cameras)
+        names = tuple(camera.name for camera in observation.cameras)
         self._send(FramesTaken(record.id, record.revision, names, images, jpegs))
         self._last_frames = time.monotonic()
         self._last_lag_s = self._last_frames - start

@@ -12,23 +12,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from starlette.concurrency import run_in_threadpool
 
 from app.jobs.job import Job
-from app.jobs.kinds.estimates import OBSERVATION, PRIOR, STATE, STEPS, TRUTH, Mode, guess_of, read_steps
-from app.processes.neural_messages import CompareView
-from app.services.estimate_errors import errors_of
+from app.jobs.kinds.estimates import OBSERVATION, PRIOR, STATE, STEPS, TRUTH, Mode, read_steps, state_of_step
+from app.processes.messages.neural_messages import CompareView
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.runner import Runner
 from app.storage.uploads import Examiner, save
 from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import SceneState
 from osfcore.io.files import read_json, write_json
 from osfcore.io.json_codec import decode
 from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson
 from osfcore.io.scene_file import read_scene, state_to_json
 from osfcore.io.state_file import EstimateJson, read_estimated, write_estimated
+from osfcore.objects.asset_library import AssetLibrary
 
 KIND = "estimate"
 _ARCHIVE = "observation.zip"
@@ -127,12 +129,12 @@ class Estimates:
         prior = None if asked.mode == "first" else self._prior(asked, names, scene)
         with self._runner.jobs.new_inputs() as folder:
             is_goal = asked.mode == "goal"
-            seen = self._runner.observe(scene, folder / OBSERVATION, goal=is_goal, masks=asked.mode == "first")
-            write_json(folder / TRUTH, state_to_json(seen.state))
+            observation = self._runner.observe(scene, folder / OBSERVATION, goal=is_goal, masks=asked.mode == "first")
+            write_json(folder / TRUTH, state_to_json(observation.state))
             if prior is not None:
                 write_estimated(folder / PRIOR, prior)
             cameras = _observation(folder / OBSERVATION).cameras
-            of = {"scene": scene, "revision": seen.revision, "file_name": None}
+            of = {"scene": scene, "revision": observation.revision, "file_name": None}
             return self._submit(asked, of, names, tuple(camera.name for camera in cameras), folder)
 
     async def of_upload(self, asked: Asked, chunks: AsyncIterator[bytes], file_name: str) -> Job:
@@ -148,19 +150,19 @@ class Estimates:
         check_seed(asked.seed)
         with self._runner.jobs.new_inputs() as folder:
             await save(chunks, folder / _ARCHIVE)
-            found = await self._examiner.examine(folder)
-            return await run_in_threadpool(self._of_examined, asked, found, folder, file_name)
+            uploaded = await self._examiner.examine(folder)
+            return await run_in_threadpool(self._of_examined, asked, uploaded, folder, file_name)
 
-    def _of_examined(self, asked: Asked, found: Uploaded, folder: Path, file_name: str) -> Job:
+    def _of_examined(self, asked: Asked, uploaded: Uploaded, folder: Path, file_name: str) -> Job:
         known = self._fields.names()
-        for name in found.names:
+        for name in uploaded.names:
             if name not in known:
                 raise UnknownName("field", name, known)
-        _check_fits(asked.mode, found)
-        if asked.mode != "first" and not (found.has_prior and asked.prior is None):
-            write_estimated(folder / PRIOR, self._prior(asked, found.names, None))
+        _check_fits(asked.mode, uploaded)
+        if asked.mode != "first" and not (uploaded.has_prior and asked.prior is None):
+            write_estimated(folder / PRIOR, self._prior(asked, uploaded.names, None))
         of = {"scene": None, "revision": None, "file_name": file_name}
-        return self._submit(asked, of, found.names, found.cameras, folder)
+        return self._submit(asked, of, uploaded.names, uploaded.cameras, folder)
 
     def _submit(
         self, asked: Asked, of: dict[str, Any], names: tuple[str, ...], cameras: tuple[str, ...], folder: Path
@@ -240,8 +242,8 @@ class Estimates:
             raise NoImages(job.id, "its first step has not been made yet")
         if step is not None and not 1 <= step <= len(steps):
             raise UnknownName("step", str(step), [f"1 to {len(steps)}"])
-        guess = guess_of(steps[-1 if step is None else step - 1])
-        return CompareView(uuid.uuid4().hex, guess, camera, image.read_bytes())
+        state = state_of_step(steps[-1 if step is None else step - 1])
+        return CompareView(uuid.uuid4().hex, state, camera, image.read_bytes())
 
     def _observed(self, job: Job, view: int) -> tuple[Camera, Path]:
         names = job.params["cameras"]
@@ -268,18 +270,24 @@ def examine(folder: Path) -> Uploaded:
 
     place = unpack_observation(folder / _ARCHIVE, folder / OBSERVATION)
     (folder / _ARCHIVE).unlink()
-    seen = read_observation(place)
-    unseen = () if seen.masks is None else tuple(n for i, n in enumerate(seen.names) if not seen.masks[:, i].any())
+    observation = read_observation(place)
+    unseen = (
+        ()
+        if observation.masks is None
+        else tuple(n for i, n in enumerate(observation.names) if not observation.masks[:, i].any())
+    )
     has_prior = (place / PRIOR).is_file()
     if has_prior:
         prior = read_estimated(place / PRIOR)
-        if set(prior.state.names) != set(seen.names):
-            raise InvalidInput("objects of prior.json", ", ".join(prior.state.names), ", ".join(seen.names))
+        if set(prior.state.names) != set(observation.names):
+            raise InvalidInput("objects of prior.json", ", ".join(prior.state.names), ", ".join(observation.names))
         try:
             (place / PRIOR).rename(folder / PRIOR)
         except OSError as error:
             raise CannotWrite(folder, error.strerror or str(error)) from error
-    return Uploaded(seen.names, tuple(c.name for c in seen.cameras), seen.masks is not None, unseen, has_prior)
+    return Uploaded(
+        observation.names, tuple(c.name for c in observation.cameras), observation.masks is not None, unseen, has_prior
+    )
 
 
 def _names(folder: Path) -> dict[str, str]:
@@ -291,15 +299,36 @@ def _names(folder: Path) -> dict[str, str]:
     }
 
 
-def _check_fits(mode: Mode, found: Uploaded) -> None:
+def _check_fits(mode: Mode, uploaded: Uploaded) -> None:
     """Refuse at once what the estimator would refuse."""
-    if mode == "first" and not found.has_masks:
+    if mode == "first" and not uploaded.has_masks:
         raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
-    if mode == "first" and found.unseen:
-        raise InvalidInput(f"mask of {found.unseen[0]}", "empty in every view", "not empty in at least one view")
-    if mode == "goal" and len(found.cameras) != 1:
-        raise InvalidInput("number of views of a goal", len(found.cameras), "1")
+    if mode == "first" and uploaded.unseen:
+        raise InvalidInput(f"mask of {uploaded.unseen[0]}", "empty in every view", "not empty in at least one view")
+    if mode == "goal" and len(uploaded.cameras) != 1:
+        raise InvalidInput("number of views of a goal", len(uploaded.cameras), "1")
 
 
 def _observation(folder: Path) -> ObservationJson:
     return read_json(folder / OBSERVATION_FILE, lambda data: decode(ObservationJson, data, "observation"))
+
+
+def errors_of(estimate: SceneState, truth: SceneState, library: AssetLibrary) -> dict[str, Any]:
+    """Distances of positions [mm], angles between orientations that look different [deg], and of the light [deg].
+
+    Args:
+        estimate: the estimate.
+        truth: of the same objects.
+        library: knows which rotations of an object look alike.
+    """
+    from osfcore.metrics.pose_errors import rotation_error
+
+    objects = []
+    for name in estimate.names:
+        ours, true = estimate.pose(name), truth.pose(name)
+        turn = rotation_error(library.info(name).symmetry, ours.quaternion, true.quaternion)
+        shift_mm = 1000 * float(np.linalg.norm(ours.position - true.position))
+        objects.append({"name": name, "position_mm": shift_mm, "rotation_deg": float(np.rad2deg(turn))})
+    a, b = estimate.light.direction, truth.light.direction
+    light = float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+    return {"objects": objects, "light_deg": light}

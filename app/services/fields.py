@@ -39,11 +39,11 @@ class FieldCatalogue:
 
     def all(self) -> tuple[FieldInfo, ...]:
         """All fields that can be told about, sorted by name."""
-        found = []
+        infos = []
         for name in self._library.names():
             with contextlib.suppress(OsfError, OSError):  # one that is being deleted must not hide the others
-                found.append(self._library.info(name))
-        return tuple(found)
+                infos.append(self._library.info(name))
+        return tuple(infos)
 
     def names(self) -> tuple[str, ...]:
         """Objects with a field."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from app.processes.scene_messages import ComposedGoal, ComposeGoal
+from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal
 from app.services.runner import Runner
 from app.storage.database import now_utc
 from app.storage.goal_store import GoalRecord, GoalStore, Poses, Source
@@ -212,12 +212,12 @@ class Goals:
         """
         with self._drafting:
             draft = self._require_draft()
-            wanted = dict(draft.poses)
+            placed = dict(draft.poses)
             for name, pose in poses:
-                if name not in wanted:
-                    raise UnknownName("object of the draft", name, wanted)
-                wanted[name] = pose
-            laid = tuple(wanted.items())
+                if name not in placed:
+                    raise UnknownName("object of the draft", name, placed)
+                placed[name] = pose
+            laid = tuple(placed.items())
             number = self._next_revision()
             try:
                 made = self._runner.compose(ComposeGoal(draft.scene, laid, size=GOAL_SIDE))

@@ -152,8 +152,8 @@ class ImageSets:
         folder = self._root / f"{_TEMPORARY_PREFIX}{set_id}"
         try:
             await save(chunks, folder / _ARCHIVE)
-            found = await self._examiner.examine(folder)
-            record = SetRecord(set_id, file_name, now_utc(), found.train, found.test, found.summary)
+            examined = await self._examiner.examine(folder)
+            record = SetRecord(set_id, file_name, now_utc(), examined.train, examined.test, examined.summary)
             await run_in_threadpool(self._keep, folder, record)
         finally:
             await run_in_threadpool(shutil.rmtree, folder, True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.services.goals import Goals
 from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord
@@ -82,15 +82,15 @@ def preset(name: str) -> Preset:
     raise UnknownName("preset", name[:80], [one.id for one in PRESETS])
 
 
-def set_up(wanted: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, GoalRecord]:
+def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, GoalRecord]:
     """Make a preset's table, which is then shown, and its goal.
 
     Raises:
         OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
     """
-    scene = runner.create_scene(names=wanted.objects, seed=wanted.seed, light=wanted.light)
+    scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light)
     try:
-        goal = goals.draw(scene.id, wanted.goal_seed, wanted.moved, wanted.title, wanted.goal_light)
+        goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light)
     except OsfError:
         runner.delete_scene(scene.id)
         raise

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from app.services.estimate_errors import errors_of
+from app.services.estimates import errors_of
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
@@ -114,5 +114,5 @@ def outcomes(
     columns = [errors_of(predicted, before, library)["objects"]]
     if after is not None:
         columns += [errors_of(after, before, library)["objects"], errors_of(predicted, after, library)["objects"]]
-    found = [{entry["name"]: (entry["position_mm"], entry["rotation_deg"]) for entry in column} for column in columns]
-    return tuple(Outcome(name, *(value for column in found for value in column[name])) for name in rollouts.names)
+    errors = [{entry["name"]: (entry["position_mm"], entry["rotation_deg"]) for entry in column} for column in columns]
+    return tuple(Outcome(name, *(value for column in errors for value in column[name])) for name in rollouts.names)

@@ -9,7 +9,7 @@ from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobView, SetInUse, TrainingAlready, check_params
 from app.jobs.registry import Jobs
-from app.processes.scene_messages import Act, Command
+from app.processes.messages.scene_messages import Act, Command
 from app.services.event_hub import Notice
 from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes

@@ -7,7 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 
-from app.processes.scene_messages import TakeImage, TakeMask
+from app.processes.messages.scene_messages import TakeImage, TakeMask
 
 ImageKey = tuple[int, TakeImage | TakeMask]  # revision of the scene, and what is asked for
 
@@ -40,9 +40,9 @@ class SceneImages:
             OsfError: if the image cannot be made.
         """
         key = (self._revision_of(command.id), command)
-        found = self._kept.get(key)
-        if found is not None:
-            return found
+        images = self._kept.get(key)
+        if images is not None:
+            return images
         making = self._in_the_making.get(key)
         if making is None:
             making = asyncio.ensure_future(self._make(key))

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.processes.process_client import ProcessClient, Status
-from app.processes.scene_messages import (
+from app.processes.messages.scene_messages import (
     Act,
     AdoptScene,
     Command,
@@ -30,6 +29,7 @@ from app.processes.scene_messages import (
     TakeMask,
     WatchFrames,
 )
+from app.processes.process_client import ProcessClient, Status
 from app.processes.sim_process import simulation_main
 from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.scene_images import SceneImages

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from osfcore.errors import CorruptFile, OsfError
 from osfcore.geometry.states import SceneState
 from osfcore.io.json_codec import decode, encode

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from app.processes.scene_messages import FramesTaken, SceneChanged, SceneRecord
+from app.processes.messages.scene_messages import FramesTaken, SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
 from osfcore.geometry.states import SceneState
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import viser
 
 from app.jobs.job import JobChanged
+from app.processes.messages.scene_messages import SceneRecord
 from app.processes.process_client import ProcessClient
-from app.processes.scene_messages import SceneRecord
 from app.services.estimates import Estimates
 from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals

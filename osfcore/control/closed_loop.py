@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import (
-    Acted,
+    ActionExecuted,
     Event,
     Finished,
     GoalFound,
@@ -31,10 +31,10 @@ from osfcore.control.events import (
     Planning,
     Stepped,
 )
-from osfcore.control.goal import GoalImage, alike, settled, unmoved
-from osfcore.control.knowledge import Knowledge
+from osfcore.control.goal import GoalImage, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
 from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, offsets
 from osfcore.control.relocalization import relocalize
+from osfcore.control.scene_models import SceneModels
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
 from osfcore.estimation.first_frame import estimate_first
@@ -67,7 +67,7 @@ class Episode:
 
     Args:
         world: cameras and pusher.
-        knowledge: of the objects.
+        models: of the objects.
         goal: an image, or poses.
         settings: may be replaced while the episode runs.
         rng: draws everything.
@@ -79,15 +79,15 @@ class Episode:
     def __init__(
         self,
         world: World,
-        knowledge: Knowledge,
+        models: SceneModels,
         goal: GoalImage | PoseGoal,
         settings: EpisodeSettings,
         rng: np.random.Generator,
         start: EstimatedState | None = None,
     ) -> None:
         self.settings = settings
-        self._world, self._knowledge, self._wanted, self._rng = world, knowledge, goal, rng
-        self._planner = MPPIPlanner(knowledge.dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
+        self._world, self._models, self._target, self._rng = world, models, goal, rng
+        self._planner = MPPIPlanner(models.dynamics.rollout, PushProposals(models.shapes), settings.plan)
         self._start = start
         self._number = 0
         self._progress = ProgressMonitor()
@@ -133,21 +133,23 @@ class Episode:
         self._check_objects(observation.names)
         yield Observed(0, observation)
         if self._start is None:
-            self._estimate = yield from self._looked("first", estimate_first(
-                self._knowledge.models, observation, self._rng))  # fmt: skip
+            self._estimate = yield from self._run_estimator("first", estimate_first(
+                self._models.appearance, observation, self._rng))  # fmt: skip
         else:
             self._estimate = self._start
         self._estimate = _with_pusher(self._estimate, observation.pusher)
-        self._usual = expected_residuals(self._knowledge.models, observation, self._estimate.state)
+        self._usual = expected_residuals(self._models.appearance, observation, self._estimate.state)
         self._weak = frozenset(_doubted(self._estimate))
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
 
     def _check_objects(self, names: tuple[str, ...]) -> None:
-        if isinstance(self._wanted, PoseGoal) and set(self._wanted.names) != set(names):
-            raise InvalidInput("objects of the goal", ", ".join(self._wanted.names), ", ".join(names))
+        if isinstance(self._target, PoseGoal) and set(self._target.names) != set(names):
+            raise InvalidInput("objects of the goal", ", ".join(self._target.names), ", ".join(names))
 
-    def _looked(self, look: Look, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # returns the EstimatedState
+    def _run_estimator(
+        self, look: Look, steps: Iterator[EstimateStep]
+    ) -> Iterator[Event]:  # returns the EstimatedState
         estimate = None
         for step in self._timed(look if look in ("first", "goal") else "estimate", steps):
             estimate = step.estimate
@@ -160,9 +162,9 @@ class Episode:
         yield Observed(self._number, observation)
         before = self._estimate
         expected = before.state if self._expected is None else self._expected
-        models = self._knowledge.models
+        models = self._models.appearance
         steps = estimate_next(models, observation, expected, self._rng, usual=self._usual)
-        self._estimate = _with_pusher((yield from self._looked("next", steps)), observation.pusher)
+        self._estimate = _with_pusher((yield from self._run_estimator("next", steps)), observation.pusher)
         yield from self._noticed_changes(before, expected)
         yield from self._find_lost()
         self._expected = None
@@ -192,8 +194,8 @@ class Episode:
             yield from self._retreat()
         observation = self._world.observe()
         yield Observed(self._number, observation)
-        steps = relocalize(self._knowledge.models, observation, self._estimate, self._rng)
-        self._estimate = _with_pusher((yield from self._looked("search", steps)), observation.pusher)
+        steps = relocalize(self._models.appearance, observation, self._estimate, self._rng)
+        self._estimate = _with_pusher((yield from self._run_estimator("search", steps)), observation.pusher)
         self._planner.reset()
         self._before = None
         if self._estimate.trusted:
@@ -211,19 +213,19 @@ class Episode:
     # The goal
 
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
-        wanted, state, found, doubts = self._wanted, self._estimate.state, None, ""
-        if isinstance(wanted, GoalImage):
-            steps = estimate_goal(self._knowledge.models, wanted.observed(state.names), state)
-            found = yield from self._looked("goal", steps)
-            found = unmoved(self._knowledge.models, wanted, found, state)
-            goal, light, camera, image = _poses_of(found.state), found.state.light, wanted.camera, wanted.image
-            doubts = found.reason
+        target, state, estimate, doubts = self._target, self._estimate.state, None, ""
+        if isinstance(target, GoalImage):
+            steps = estimate_goal(self._models.appearance, target.observed(state.names), state)
+            estimate = yield from self._run_estimator("goal", steps)
+            estimate = prefer_current_poses(self._models.appearance, target, estimate, state)
+            goal, light, camera, image = _poses_of(estimate.state), estimate.state.light, target.camera, target.image
+            doubts = estimate.reason
         else:
-            goal, light, camera = wanted, state.light, goal_camera()
-            image = self._rendered(replace(state, poses=_in_order(wanted, state.names)), camera, light)
-        self._goal = settled(goal, state, self._knowledge.symmetries)
+            goal, light, camera = target, state.light, goal_camera()
+            image = self._rendered(replace(state, poses=_in_order(target, state.names)), camera, light)
+        self._goal = snap_near_goals(goal, state, self._models.symmetries)
         self._light, self._camera, self._image = light, camera, image
-        yield GoalFound(self._goal, image, camera, found)
+        yield GoalFound(self._goal, image, camera, estimate)
         if doubts:
             yield self._noticed("goal", f"The goal image is not explained well: {doubts}.")
             if not self.settings.despite_doubts:
@@ -238,7 +240,7 @@ class Episode:
         left = self.settings.steps - self._number
         plan = self.settings.plan
         self._planner.settings = replace(plan, horizon=min(plan.horizon, left))
-        self._goal = alike(self._goal, self._estimate.state, self._knowledge.symmetries)
+        self._goal = nearest_symmetric_goal(self._goal, self._estimate.state, self._models.symmetries)
         rounds = self._planner.plan(self._estimate.state, self._goal, self._cost(), self._rng, self._before)
         for one in self._timed("plan", rounds):
             yield Planning(self._number, one)
@@ -246,28 +248,28 @@ class Episode:
     def _cost(self) -> Cost:
         if self.settings.cost == "pose":
             return PoseCost(self._goal)
-        return ImageCost(self._knowledge.models.together, self._camera, self._image, self._light)
+        return ImageCost(self._models.appearance.together, self._camera, self._image, self._light)
 
     def _act(self) -> Iterator[Event]:
         actions = self._planner.nominal(min(self.settings.replan_every, self.settings.steps - self._number))
         state = self._estimate.state
-        futures = self._knowledge.dynamics.rollout(state, actions[None], self._before)
+        futures = self._models.dynamics.rollout(state, actions[None], self._before)
         for action in actions:
             yield self._execute(action)
         self._planner.shift(len(actions))
         self._before = state if len(actions) == 1 else _future(futures, len(actions) - 1, state)
         self._expected = _future(futures, len(actions), state)
 
-    def _execute(self, action: Float[np.ndarray, "3"]) -> Acted:
-        with self._watched("act"):
+    def _execute(self, action: Float[np.ndarray, "3"]) -> ActionExecuted:
+        with self._measure_time("act"):
             self._world.act(action)
         self._number += 1
-        return Acted(self._number, action)
+        return ActionExecuted(self._number, action)
 
     # Time: what whoever drives this takes between two events does not count
 
     @contextmanager
-    def _watched(self, stage: str) -> Iterator[None]:
+    def _measure_time(self, stage: str) -> Iterator[None]:
         began = time.perf_counter()
         try:
             yield
@@ -276,7 +278,7 @@ class Episode:
 
     def _timed(self, stage: str, steps: Iterator[StepT]) -> Iterator[StepT]:
         while True:
-            with self._watched(stage):
+            with self._measure_time(stage):
                 step = next(steps, None)
             if step is None:
                 return
@@ -295,7 +297,7 @@ class Episode:
 
     def _stepped(self) -> Stepped:
         estimate = self._estimate
-        self._goal = alike(self._goal, estimate.state, self._knowledge.symmetries)
+        self._goal = nearest_symmetric_goal(self._goal, estimate.state, self._models.symmetries)
         far, turned = offsets(self._goal, estimate.state)
         rendered = self._rendered(estimate.state, self._camera, self._light)
         cost = float(((rendered - self._image) ** 2).mean())
@@ -305,7 +307,7 @@ class Episode:
     def _rendered(self, state: SceneState, camera: Camera, light: Light) -> Float[np.ndarray, "h w 3"]:
         """The scene without the pusher, as the goal image would show it."""
         batch = SceneBatch.of(replace(state, light=light, pusher=None))
-        return self._knowledge.models.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
+        return self._models.appearance.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
 
     def _noticed(self, matter: str, text: str, names: tuple[str, ...] = ()) -> Noticed:
         return Noticed(self._number, matter, text, names)  # pyright: ignore[reportArgumentType]

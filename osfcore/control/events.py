@@ -68,7 +68,7 @@ class GoalFound:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Planning:
-    """A round of planning is done; the last one before `Acted` holds the plan.
+    """A round of planning is done; the last one before `ActionExecuted` holds the plan.
 
     Attributes:
         number: actions executed so far.
@@ -80,7 +80,7 @@ class Planning:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Acted:
+class ActionExecuted:
     """An action was executed.
 
     Attributes:
@@ -151,4 +151,4 @@ class Finished:
     state: SceneState
 
 
-Event = Observed | Looking | GoalFound | Planning | Acted | Stepped | Noticed | Finished
+Event = Observed | Looking | GoalFound | Planning | ActionExecuted | Stepped | Noticed | Finished

@@ -54,7 +54,9 @@ class GoalImage:
         return Observation((self.camera,), self.image[None], names, None, None, 0.0)
 
 
-def unmoved(models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now: SceneState) -> EstimatedState:
+def prefer_current_poses(
+    models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now: SceneState
+) -> EstimatedState:
     """The estimate of a goal image, with objects where they are now if the image shows nothing against it.
 
     What hides behind something, or lies beyond the image's border, would else be taken to wherever it hid best.
@@ -66,20 +68,20 @@ def unmoved(models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now
         now: the scene.
     """
     views = views_of(goal.observed(estimate.state.names), FINE_SIDE, samples=2)
-    guess = SceneParameters.of(estimate.state, None)
-    least, doubts = loss_of(models, views, guess), list(estimate.doubts)
+    params = SceneParameters.of(estimate.state, None)
+    least, doubts = loss_of(models, views, params), list(estimate.doubts)
     for n, name in enumerate(estimate.state.names):
-        here = with_pose(guess, n, now.pose(name))
+        here = with_pose(params, n, now.pose(name))
         loss = loss_of(models, views, here)
         if loss <= _NO_WORSE * least:
-            guess, least, doubts[n] = here, min(loss, least), ""
-    reasons = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
-    return replace(estimate, state=guess.state(), doubts=tuple(doubts), reason="; ".join(reasons))
+            params, least, doubts[n] = here, min(loss, least), ""
+    reasons = [f"{name}: {doubt}" for name, doubt in zip(params.names, doubts, strict=True) if doubt]
+    return replace(estimate, state=params.state(), doubts=tuple(doubts), reason="; ".join(reasons))
 
 
-def settled(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
+def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
     """The goal, with objects that are there already (but for what estimates err) left exactly where they are."""
-    goal = alike(goal, state, symmetries)
+    goal = nearest_symmetric_goal(goal, state, symmetries)
     stay = {}
     for name in state.names:
         here, there = state.pose(name), goal.pose(name)
@@ -89,7 +91,7 @@ def settled(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry
     return goal.replaced(stay)
 
 
-def alike(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
+def nearest_symmetric_goal(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
     """The goal with each orientation replaced by its nearest symmetric one (`Symmetry`) to the object's own."""
     turned = {}
     for name, symmetry in symmetries.items():

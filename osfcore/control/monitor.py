@@ -20,8 +20,8 @@ _REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perh
 
 def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     """How far each object is from where it should be: on the table's plane [m], and turned [rad]."""
-    wanted = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
-    turned = rotation_angle(state.poses.quaternion, wanted)
+    target = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
+    turned = rotation_angle(state.poses.quaternion, target)
     return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
 
 

@@ -34,15 +34,15 @@ def relocalize(
         observation.cameras[view : view + 1], observation.images[view : view + 1], observation.names, None, None,
         observation.time_s,
     )  # fmt: skip
-    seen = None
+    first_frame = None
     for step in estimate_goal(models, alone, state):
-        seen = step.estimate
+        first_frame = step.estimate
         yield replace(step, estimate=None)
-    assert seen is not None, "the last step brings the estimate"
-    expected = replace(_with_poses_of(state, seen.state, lost), pusher=observation.pusher)
+    assert first_frame is not None, "the last step brings the estimate"
+    expected = replace(_with_poses_of(state, first_frame.state, lost), pusher=observation.pusher)
     for step in estimate_next(models, observation, expected, rng):
-        found = step.estimate
-        is_worse = found is not None and sum(map(bool, found.doubts)) > len(lost)
+        update = step.estimate
+        is_worse = update is not None and sum(map(bool, update.doubts)) > len(lost)
         yield replace(step, estimate=last) if is_worse else step
 
 

@@ -45,7 +45,7 @@ class Inputs(NamedTuple):
         receiver: object at the end of each edge.
         sender: object at the beginning of each edge between objects.
         frame: rotation from the world to each object's frame.
-        guess: how the pusher would make each object slide without inertia: x, y, turn, in units of the answer.
+        quasistatic: how the pusher would make each object slide without inertia: x, y, turn, in units of the answer.
     """
 
     nodes: Float[Tensor, "A F"]
@@ -53,23 +53,23 @@ class Inputs(NamedTuple):
     receiver: Int[Tensor, "E"]
     sender: Int[Tensor, "S"]
     frame: Float[Tensor, "A 3 3"]
-    guess: Float[Tensor, "A 3"]
+    quasistatic: Float[Tensor, "A 3"]
 
 
 def inputs(table: ShapeTable, graph: Graph) -> Inputs:
     """All that the network needs."""
     turn = rotations.facing(_directions(graph))
-    guess = _give_way(graph, graph.pusher.after, turn)
+    quasistatic = _quasistatic_sliding(graph, graph.pusher.after, turn)
     pushed = graph.touched.nonzero()[:, 0]
     edges = torch.cat([_from_pusher(graph, pushed, turn), _between(graph, turn)])
-    nodes = _nodes(table, graph, turn, guess)
-    return Inputs(nodes, edges, torch.cat([pushed, graph.receiver]), graph.sender, turn @ graph.frame, guess)
+    nodes = _nodes(table, graph, turn, quasistatic)
+    return Inputs(nodes, edges, torch.cat([pushed, graph.receiver]), graph.sender, turn @ graph.frame, quasistatic)
 
 
-def corrections(seen: Inputs) -> Float[Tensor, "A 6"]:
+def corrections(features: Inputs) -> Float[Tensor, "A 6"]:
     """What the network's answer is added to: the sliding that is guessed, as displacement and rotation vector."""
-    flat = torch.zeros_like(seen.guess)
-    return torch.cat([seen.guess[:, :2], flat, seen.guess[:, 2:]], dim=1)
+    flat = torch.zeros_like(features.quasistatic)
+    return torch.cat([features.quasistatic[:, :2], flat, features.quasistatic[:, 2:]], dim=1)
 
 
 def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
@@ -85,7 +85,7 @@ def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
     return torch.where(graph.touched[:, None], -graph.pusher.after.normal, direction)
 
 
-def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Tensor, "A 3"]:
+def _quasistatic_sliding(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Tensor, "A 3"]:
     """Sliding at a contact, so far that the pusher's last position is free."""
     centre = graph.centre[:, :2]
     depth = (-graph.pusher.after.distance).clamp(min=0)
@@ -96,7 +96,7 @@ def _give_way(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Ten
     return torch.cat([along / SHIFT_M, way[:, 2:] / TURN_RAD], dim=1)
 
 
-def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, guess: Tensor) -> Float[Tensor, "A F"]:
+def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, quasistatic: Tensor) -> Float[Tensor, "A F"]:
     """Extents in 34 directions, height over the table, motion, the pusher's motion, how it would slide, its foot."""
     slanted = functional.pad(_fan_of(_SLANTED, turn), (0, 1))
     vertical = slanted.new_tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
@@ -109,7 +109,7 @@ def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, guess: Tensor) -> Floa
     linear, angular, shift = (turn @ motion).unbind(2)
     lengths = torch.cat([extents, _MAGNIFIED * height], dim=1) / LENGTH_M
     motions = [linear / SHIFT_M, angular / TURN_RAD, shift[:, :2] / SHIFT_M]
-    return torch.cat([lengths, *motions, guess, _foot(table, graph, turn)], dim=1)
+    return torch.cat([lengths, *motions, quasistatic, _foot(table, graph, turn)], dim=1)
 
 
 def _foot(table: ShapeTable, graph: Graph, turn: Tensor) -> Float[Tensor, "A 25"]:
@@ -135,7 +135,7 @@ def _from_pusher(graph: Graph, pushed: Tensor, turn: Tensor) -> Tensor:
     return _edge(
         turn[pushed],
         is_pusher=1.0,
-        slide=_give_way(graph, graph.pusher.before, turn)[pushed],
+        slide=_quasistatic_sliding(graph, graph.pusher.before, turn)[pushed],
         away=-centre,
         motion=(shift, torch.zeros_like(shift)),
         gaps=(before.distance, halfway.distance, after.distance),

@@ -14,7 +14,7 @@ from osfcore.dynamics.motion import Motion, going_on, lowest_point
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
-from osfcore.dynamics.unroll import unroll
+from osfcore.dynamics.substep import unroll
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.poses import rotate

@@ -126,8 +126,8 @@ class _FirstFrameEstimator:
                 yield self._ranking_step("orientations", f"{name}: under this light", starts, light)
         starts = [found.distinct(self._config.starts) for found in starts]
         starts = yield from self._search_each(better, starts, light)
-        guess = yield from self._search_jointly(self._initial_guess(starts, light))
-        at = yield from self._refine(guess)
+        params = yield from self._search_jointly(self._initial_guess(starts, light))
+        at = yield from self._refine(params)
         at = yield from self._compare_orientations(at, starts)
         yield self._finish(at)
 
@@ -164,32 +164,32 @@ class _FirstFrameEstimator:
             refined.append(found.distinct(_HYPOTHESES))
         return refined
 
-    def _search_jointly(self, guess: SceneParameters) -> Iterator[EstimateStep]:  # returns the guess
+    def _search_jointly(self, params: SceneParameters) -> Iterator[EstimateStep]:  # returns the guess
         """CMA-ES over all poses and the light by the photometric loss of whole images (eq. 6)."""
         config = self._config
         spread = {"search": _LIGHT_RAD, "cma": 0.6, "overhead": 0.0}[config.light]
         scales = np.array([*([SHIFT_M / 2] * 3 + [TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
         search = CMAES(scales, config.joint_population, self._rng)
-        best, least = guess, np.inf
+        best, least = params, np.inf
         for _ in range(config.joint_generations):
-            batch = guess.perturbed(np.concatenate([np.zeros((1, guess.size)), search.ask()]))
+            batch = params.perturbed(np.concatenate([np.zeros((1, params.size)), search.ask()]))
             losses = photometric_loss(residuals(self._models, self._middle, batch))
             search.tell(losses[1:])
             k = int(np.argmin(losses))
             if losses[k] < least:
                 least = float(losses[k])
                 found = batch.positions[k], batch.quaternions[k], batch.lights[k]
-                best = replace(guess, positions=found[0], quaternions=found[1], light=found[2])
+                best = replace(params, positions=found[0], quaternions=found[1], light=found[2])
             poses = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(self._names))]
             note = "All objects and the light"
             yield self._reporter.step("together", note, best, poses, [], search.sigma, batch.lights, least)
         return best
 
-    def _refine(self, guess: SceneParameters) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+    def _refine(self, params: SceneParameters) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Gauss-Newton over all poses and the light, coarse to fine."""
         config = self._config
         light = None if config.light == "overhead" else self._middle
-        at = GaussNewtonState.at(guess)
+        at = GaussNewtonState.at(params)
         rounds = (self._middle, config.coarse_iterations), (self._fine, config.fine_iterations)
         for views, iterations in rounds:
             for step in gauss_newton(self._models, views, at, iterations=iterations, light=light):
@@ -202,7 +202,7 @@ class _FirstFrameEstimator:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Replace each object's orientation by any hypothesis under which the whole images fit better."""
         for n, found in enumerate(starts):
-            others = Pose.joined(Pose(found.positions, found.quaternions), yaw_hypotheses(self._models, at.guess, n))
+            others = Pose.joined(Pose(found.positions, found.quaternions), yaw_hypotheses(self._models, at.params, n))
             at, self._rivals[n] = compare_orientations(
                 self._models, self._coarse, self._middle, self._fine, at, n, others
             )
@@ -210,9 +210,9 @@ class _FirstFrameEstimator:
         return at
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        fit = evaluate_fit(self._models, self._fine, at.guess)
+        fit = evaluate_fit(self._models, self._fine, at.params)
         estimate = estimate_with_uncertainty(
-            at.guess, at.normals, fit, self._rivals, light_held=self._config.light == "overhead"
+            at.params, at.normals, fit, self._rivals, light_held=self._config.light == "overhead"
         )
         return self._reporter.finish(at, estimate)
 
@@ -226,9 +226,9 @@ class _FirstFrameEstimator:
         return SceneParameters(self._names, positions, quaternions, light, self._pusher)
 
     def _ranking_step(self, stage: Stage, note: str, starts: list[RankedPoses], light: np.ndarray) -> EstimateStep:
-        guess = self._initial_guess(starts, light)
+        params = self._initial_guess(starts, light)
         shown = [Pose(s.positions[:_SHOWN], s.quaternions[:_SHOWN]) for s in starts]
-        return self._reporter.step(stage, note, guess, shown, [float(s.losses[0]) for s in starts])
+        return self._reporter.step(stage, note, params, shown, [float(s.losses[0]) for s in starts])
 
 
 def _visible_part(views: ObservedViews, number: int) -> ObjectView:

@@ -108,8 +108,8 @@ class _GoalImageEstimator:
         for n, name in enumerate(self._names):
             matches.append(self._match_prior_orientation(n))
             yield self._step("orientations", f"{name}: where it may be", self._initial_guess(matches), matches)
-        guess = yield from self._assemble(self._initial_guess(matches), matches)
-        at = yield from self._refine(guess, matches)
+        params = yield from self._assemble(self._initial_guess(matches), matches)
+        at = yield from self._refine(params, matches)
         at = yield from self._reassign(at, matches)
         bad = self._doubtful_objects(at)
         if bad:
@@ -132,15 +132,15 @@ class _GoalImageEstimator:
         Under the estimated light the table's brightness is known, so grey objects differ from its shadows.
         """
         self._reporter.total += len(bad) + 1 + self._refinement
-        guess = without_objects(at.guess, bad)
-        behind = scene_errors(self._models, self._slide, guess)
+        params = without_objects(at.params, bad)
+        behind = scene_errors(self._models, self._slide, params)
         for n in bad:
             matches[n] = self._match_prior_orientation(n, behind)
-            yield self._step("orientations", f"{self._names[n]}: in what is unexplained", at.guess, matches)
+            yield self._step("orientations", f"{self._names[n]}: in what is unexplained", at.params, matches)
         for _ in range(_ROUNDS):
-            guess = reassign_poses(self._models, self._coarse, guess, matches)
-        yield self._step("together", "Doubted objects seen elsewhere", guess, matches)
-        at = yield from self._accept_if_better(at, guess, matches)
+            params = reassign_poses(self._models, self._coarse, params, matches)
+        yield self._step("together", "Doubted objects seen elsewhere", params, matches)
+        at = yield from self._accept_if_better(at, params, matches)
         return (yield from self._reassign(at, matches))
 
     def _widen_hypotheses(
@@ -148,20 +148,20 @@ class _GoalImageEstimator:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Match templates of doubted objects in all of their resting orientations."""
         self._reporter.total += len(bad) + self._pass
-        behind = scene_errors(self._models, self._coarse, without_objects(at.guess, bad))
+        behind = scene_errors(self._models, self._coarse, without_objects(at.params, bad))
         for n in bad:
             matches[n] = self._match_any_orientation(n, behind)
-            yield self._step("orientations", f"{self._names[n]}: lying in any way", at.guess, matches)
-        guess = yield from self._assemble(at.guess, matches)
-        at = yield from self._accept_if_better(at, guess, matches)
+            yield self._step("orientations", f"{self._names[n]}: lying in any way", at.params, matches)
+        params = yield from self._assemble(at.params, matches)
+        at = yield from self._accept_if_better(at, params, matches)
         return (yield from self._reassign(at, matches))
 
     def _accept_if_better(
-        self, at: GaussNewtonState, guess: SceneParameters, matches: list[TemplateMatches]
+        self, at: GaussNewtonState, params: SceneParameters, matches: list[TemplateMatches]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Refine another guess; keep the result if its loss is lower."""
         rivals = dict(self._rivals)
-        other = yield from self._refine(guess, matches)
+        other = yield from self._refine(params, matches)
         if other.losses[-1] < at.losses[-1]:
             return other
         self._rivals = rivals
@@ -193,19 +193,19 @@ class _GoalImageEstimator:
         return SceneParameters(self._names, positions, quaternions, self._prior.light.direction, None)
 
     def _assemble(
-        self, guess: SceneParameters, matches: list[TemplateMatches]
+        self, params: SceneParameters, matches: list[TemplateMatches]
     ) -> Iterator[EstimateStep]:  # returns the guess
         """The combination of matches with the lowest photometric loss."""
-        for step in assemble_scene(self._models, self._rough, self._coarse, guess, matches):
-            guess, loss = step
-            yield self._step("together", "Which matches explain the image together", guess, matches, loss=loss)
-        return guess
+        for step in assemble_scene(self._models, self._rough, self._coarse, params, matches):
+            params, loss = step
+            yield self._step("together", "Which matches explain the image together", params, matches, loss=loss)
+        return params
 
     def _refine(
-        self, guess: SceneParameters, matches: list[TemplateMatches]
+        self, params: SceneParameters, matches: list[TemplateMatches]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Gauss-Newton over positions and yaw on the table, then over whole poses."""
-        at = GaussNewtonState.at(guess)
+        at = GaussNewtonState.at(params)
         for views, numbers, iterations in (
             (self._middle, PLANAR_PARAMETERS, self._config.planar_iterations),
             (self._fine, PLANAR_PARAMETERS, _FINE_PLANAR),
@@ -216,9 +216,9 @@ class _GoalImageEstimator:
                 at = step
                 yield self._reporter.refinement("On the table", at)
         for _ in range(_COMPARISONS):
-            before = at.guess.quaternions
+            before = at.params.quaternions
             at = yield from self._compare_orientations(at, matches)
-            if rotation_angle(before, at.guess.quaternions).max() < _TURNED_RAD:
+            if rotation_angle(before, at.params.quaternions).max() < _TURNED_RAD:
                 break  # no object was turned, so the others' losses have not changed
         return at
 
@@ -229,12 +229,12 @@ class _GoalImageEstimator:
 
         Gauss-Newton may have drawn an object into another's shadow or behind it, a local minimum.
         """
-        guess = reassign_poses(self._models, self._coarse, at.guess, matches)
-        if guess is at.guess:
+        params = reassign_poses(self._models, self._coarse, at.params, matches)
+        if params is at.params:
             return at
         self._reporter.total += 1 + self._refinement
-        yield self._step("together", "Objects seen elsewhere", guess, matches)
-        return (yield from self._accept_if_better(at, guess, matches))
+        yield self._step("together", "Objects seen elsewhere", params, matches)
+        return (yield from self._accept_if_better(at, params, matches))
 
     def _compare_orientations(
         self, at: GaussNewtonState, matches: list[TemplateMatches]
@@ -244,13 +244,13 @@ class _GoalImageEstimator:
         A wrong orientation also shifts the position, so matches nearby are tried as well.
         """
         for n, name in enumerate(self._names):
-            beside = matches[n].within(at.guess.positions[n], _BESIDE_M)
-            others = Pose.joined(yaw_hypotheses(self._models, at.guess, n), beside.poses)
+            beside = matches[n].within(at.params.positions[n], _BESIDE_M)
+            others = Pose.joined(yaw_hypotheses(self._models, at.params, n), beside.poses)
             at, self._rivals[n] = compare_orientations(
                 self._models, self._middle, self._fine, self._fine, at, n, others
             )
             yield self._reporter.refinement(f"{name}: the other way round", at)
-        at = replace(at, dampings=GaussNewtonState.at(at.guess).dampings)
+        at = replace(at, dampings=GaussNewtonState.at(at.params).dampings)
         sweeps = self._config.free_iterations
         for step in gauss_newton(
             self._models, self._fine, at, iterations=sweeps, light=self._middle, until_settled=True
@@ -265,16 +265,16 @@ class _GoalImageEstimator:
 
     def _with_uncertainty(self, at: GaussNewtonState, rivals: dict[int, float]) -> EstimatedState:
         """The estimate with its uncertainty; heights are checked, since one view hardly shows depth."""
-        fit, poses = evaluate_fit(self._models, self._fine, at.guess), at.guess.state().poses
+        fit, poses = evaluate_fit(self._models, self._fine, at.params), at.params.state().poses
         lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
-        return estimate_with_uncertainty(at.guess, at.normals, fit, rivals, lowest=lowest)
+        return estimate_with_uncertainty(at.params, at.normals, fit, rivals, lowest=lowest)
 
     def _step(
         self,
         stage: Stage,
         note: str,
-        guess: SceneParameters,
+        params: SceneParameters,
         matches: list[TemplateMatches],
         loss: float = float("nan"),
     ) -> EstimateStep:
-        return self._reporter.step(stage, note, guess, [found.poses[:_SHOWN] for found in matches], loss=loss)
+        return self._reporter.step(stage, note, params, [found.poses[:_SHOWN] for found in matches], loss=loss)

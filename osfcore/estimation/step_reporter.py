@@ -30,7 +30,7 @@ class StepReporter:
         self,
         stage: Stage,
         note: str,
-        guess: SceneParameters,
+        params: SceneParameters,
         tried: Sequence[Pose] = (),
         losses: Sequence[float] = (),
         sigma: float = 1.0,
@@ -42,7 +42,7 @@ class StepReporter:
         Args:
             stage: which part of the method is at work.
             note: what it does, for a person.
-            guess: the best scene so far.
+            params: the best scene so far.
             tried: poses of each object; shown if there are some of every object, as many as of the fewest.
             losses: of each object.
             sigma: the search's overall step.
@@ -51,18 +51,18 @@ class StepReporter:
         """
         self.done = min(self.done + 1, self.total)
         candidates = None
-        if tried and len(tried) == len(guess.names):
+        if tried and len(tried) == len(params.names):
             count = min(len(poses.position) for poses in tried)
             candidates = Pose(
                 np.stack([poses.position[:count] for poses in tried], 1),
                 np.stack([poses.quaternion[:count] for poses in tried], 1),
             )
         progress = Progress(self.done, self.total, note)
-        return EstimateStep(progress, stage, guess.state(), candidates, lights, sigma, tuple(losses), loss)
+        return EstimateStep(progress, stage, params.state(), candidates, lights, sigma, tuple(losses), loss)
 
     def refinement(self, note: str, at: GaussNewtonState) -> EstimateStep:
         """The next step, of Gauss-Newton."""
-        return self.step("polish", note, at.guess, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
+        return self.step("polish", note, at.params, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
 
     def finish(self, at: GaussNewtonState, estimate: EstimatedState) -> EstimateStep:
         """The last step, with the result."""

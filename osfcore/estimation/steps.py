@@ -23,7 +23,7 @@ class EstimateStep:
     Attributes:
         progress: how far the work is.
         stage: which part of the method is at work.
-        guess: the best scene so far.
+        state: the best scene so far.
         candidates: poses that were tried, C for each of N objects; (C, N) batches.
         lights: directions toward the light that were tried, C x 3; None while it is held.
         sigma: the search's overall step, 1 when a stage begins.
@@ -34,7 +34,7 @@ class EstimateStep:
 
     progress: Progress
     stage: Stage
-    guess: SceneState
+    state: SceneState
     candidates: Pose | None = None
     lights: Float[np.ndarray, "C 3"] | None = None
     sigma: float = 1.0

@@ -143,7 +143,7 @@ class _Tracker:
     ) -> None:
         self._allowed = allowed
         self._models, self._rng, self._config = models, rng, config
-        self._guess = SceneParameters.of(expected, observation.pusher)
+        self._initial = SceneParameters.of(expected, observation.pusher)
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._fine = views_of(observation, FINE_SIDE, samples=2)
         self._sharp = views_of(observation, FINE_SIDE)
@@ -151,49 +151,49 @@ class _Tracker:
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._push = _pusher_motion(expected.pusher, observation.pusher)
         self._rivals: dict[int, float] = {}
-        self._looked: tuple[SceneParameters, FitQuality] | None = None
+        self._last_fit: tuple[SceneParameters, FitQuality] | None = None
         self._reporter = StepReporter(4)
 
     def steps(self) -> Iterator[EstimateStep]:
-        at = GaussNewtonState.at(self._guess)
-        before = self._fit_at_half_size(at.guess)
+        at = GaussNewtonState.at(self._initial)
+        before = self._fit_at_half_size(at.params)
         if before.surroundings > self._config.lamp_above:
             at = yield from self._search_light(at)
-            before = self._fit_at_half_size(at.guess)
+            before = self._fit_at_half_size(at.params)
         misfit = object_residuals(before) > np.maximum(self._config.stays_below, self._allowed)
         if misfit.any():
             at = yield from self._refine(at, misfit, self._coarse, 1)
-            misfit &= self._poorly_fitted(at.guess)
+            misfit &= self._poorly_fitted(at.params)
         moved = misfit
         for look in (self._try_pushes, self._search):
             if misfit.any():
                 at = yield from look(at, misfit)
                 at = yield from self._refine_coarse_to_fine(at, misfit)
-                misfit = misfit & self._poorly_fitted(at.guess)
+                misfit = misfit & self._poorly_fitted(at.params)
         if misfit.any():
             at = yield from self._recover(at, misfit)
             at = yield from self._refine(at, misfit, self._middle, self._config.fine_sweeps)
-            misfit = misfit & self._poorly_fitted(at.guess)
+            misfit = misfit & self._poorly_fitted(at.params)
         at = yield from self._refine(at, ~moved, self._middle, 1)
         at = yield from self._refine_finely(at, moved & ~misfit)
         yield self._finish(at)
 
-    def _fit_at_half_size(self, guess: SceneParameters) -> FitQuality:
+    def _fit_at_half_size(self, params: SceneParameters) -> FitQuality:
         """How well a guess explains the images of half resolution."""
-        return evaluate_fit(self._models, self._middle, guess)
+        return evaluate_fit(self._models, self._middle, params)
 
-    def _poorly_fitted(self, guess: SceneParameters) -> Bool[np.ndarray, "N"]:
+    def _poorly_fitted(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
         """Which objects have a residual above what is allowed."""
-        return object_residuals(self._fit_at_half_size(guess)) > np.maximum(self._config.fits_below, self._allowed)
+        return object_residuals(self._fit_at_half_size(params)) > np.maximum(self._config.fits_below, self._allowed)
 
     def _search_light(self, at: GaussNewtonState) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Search the light with the objects where they were expected; keep it if the loss falls far enough."""
-        if light_loss_ratio(self._models, self._rough, at.guess) > self._config.lamp_hint:
+        if light_loss_ratio(self._models, self._rough, at.params) > self._config.lamp_hint:
             return at  # objects that moved are no reason to search on
-        guess = replace(at.guess, light=search_light(self._models, self._rough, self._coarse, at.guess))
-        here, there = (loss_of(self._models, self._coarse, one) for one in (at.guess, guess))
+        params = replace(at.params, light=search_light(self._models, self._rough, self._coarse, at.params))
+        here, there = (loss_of(self._models, self._coarse, one) for one in (at.params, params))
         if there < self._config.lamp_gain * here:
-            at = replace(at, guess=guess)
+            at = replace(at, params=params)
         yield self._step("light", "Shading and shadows", at)
         return at
 
@@ -213,7 +213,7 @@ class _Tracker:
         e = self._config
         for views, sweeps in ((self._rough, e.rough_sweeps), (self._coarse, e.sweeps), (self._middle, e.fine_sweeps)):
             at = replace(
-                at, dampings=GaussNewtonState.at(at.guess).dampings
+                at, dampings=GaussNewtonState.at(at.params).dampings
             )  # old ones tell nothing of where it is now
             at = yield from self._refine(at, moving, views, sweeps)
         return at
@@ -223,14 +223,14 @@ class _Tracker:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Take the best of the motions that the push may have caused, for all objects together, then for each alone."""
         numbers = np.flatnonzero(misfit).tolist()
-        at = replace(at, guess=self._best_joint_push(at.guess, numbers))
+        at = replace(at, params=self._best_joint_push(at.params, numbers))
         for n in numbers:
-            views = crop_to_object(self._coarse, self._models, at.guess, n, reach=self._config.reach)
-            tried = push_hypotheses(self._models, at.guess, n, self._push)
-            losses = pose_losses(self._models, views, at.guess, n, tried)
-            at = replace(at, guess=with_pose(at.guess, n, tried[int(losses.argmin())]))
-            at = replace(at, guess=self._best_rolling_pose(at.guess, n))
-            yield self._step("together", f"{at.guess.names[n]}: where it was pushed", at)
+            views = crop_to_object(self._coarse, self._models, at.params, n, reach=self._config.reach)
+            tried = push_hypotheses(self._models, at.params, n, self._push)
+            losses = pose_losses(self._models, views, at.params, n, tried)
+            at = replace(at, params=with_pose(at.params, n, tried[int(losses.argmin())]))
+            at = replace(at, params=self._best_rolling_pose(at.params, n))
+            yield self._step("together", f"{at.params.names[n]}: where it was pushed", at)
         return at
 
     def _search(
@@ -238,30 +238,30 @@ class _Tracker:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """CMA-ES over the pose of each poorly fitted object."""
         for n in np.flatnonzero(misfit).tolist():
-            views = crop_to_object(self._coarse, self._models, at.guess, n, reach=self._config.reach)
+            views = crop_to_object(self._coarse, self._models, at.params, n, reach=self._config.reach)
             at = yield from self._search_object(at, n, views)
         return at
 
-    def _best_joint_push(self, guess: SceneParameters, numbers: list[int]) -> SceneParameters:
+    def _best_joint_push(self, params: SceneParameters, numbers: list[int]) -> SceneParameters:
         """The guess with objects moved by the shares of the push that give the lowest photometric loss."""
-        positions = joint_push_hypotheses(guess, numbers, self._push)
-        batch = replace(guess.perturbed(np.zeros((len(positions), guess.size))), positions=positions)
+        positions = joint_push_hypotheses(params, numbers, self._push)
+        batch = replace(params.perturbed(np.zeros((len(positions), params.size))), positions=positions)
         best = int(photometric_loss(residuals(self._models, self._coarse, batch)).argmin())
-        return replace(guess, positions=positions[best])
+        return replace(params, positions=positions[best])
 
-    def _best_rolling_pose(self, guess: SceneParameters, n: int) -> SceneParameters:
+    def _best_rolling_pose(self, params: SceneParameters, n: int) -> SceneParameters:
         """The guess with an object turned by the rolling angle of the lowest loss; how far it slipped is unknown."""
-        tried = rolling_hypotheses(self._models, guess, n, self._push)
+        tried = rolling_hypotheses(self._models, params, n, self._push)
         if len(tried.position) == 1:
-            return guess
-        losses = pose_losses(self._models, crop_to_object(self._middle, self._models, guess, n), guess, n, tried)
-        return with_pose(guess, n, tried[int(losses.argmin())])
+            return params
+        losses = pose_losses(self._models, crop_to_object(self._middle, self._models, params, n), params, n, tried)
+        return with_pose(params, n, tried[int(losses.argmin())])
 
     def _search_object(
         self, at: GaussNewtonState, n: int, views: ObservedViews
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """CMA over one object's pose."""
-        e, start = self._config, at.guess
+        e, start = self._config, at.params
         spread = np.array([e.shift, e.shift, e.shift / 3, e.turn / 2, e.turn / 2, e.turn])
         search = CMAES(spread, e.population, self._rng)
         best, least = start, np.inf
@@ -274,50 +274,52 @@ class _Tracker:
             k = int(np.argmin(losses))
             if losses[k] < least:
                 least, best = float(losses[k]), start.updated(changes[k])
-            step = self._step("together", f"{start.names[n]}: where it went", replace(at, guess=best))
+            step = self._step("together", f"{start.names[n]}: where it went", replace(at, params=best))
             yield replace(step, candidates=Pose(batch.positions, batch.quaternions), sigma=search.sigma, loss=least)
-        return replace(at, guess=best)
+        return replace(at, params=best)
 
     def _recover(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Try all resting orientations of poorly fitted objects, at their present and at their expected position."""
         for n in np.flatnonzero(misfit).tolist():
-            others = Pose.joined(*(resting_hypotheses(self._models, guess, n) for guess in (at.guess, self._guess)))
+            others = Pose.joined(
+                *(resting_hypotheses(self._models, params, n) for params in (at.params, self._initial))
+            )
             at = self._compare_orientations(at, n, others)
-            yield self._step("together", f"{at.guess.names[n]}: lying in another way", at)
+            yield self._step("together", f"{at.params.names[n]}: lying in another way", at)
         return at
 
     def _refine_finely(
         self, at: GaussNewtonState, moved: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Refine what does not fit in fine images; compare orientations of what still does not, or has moved."""
-        bad = self._poorly_fitted_finely(at.guess)
+        bad = self._poorly_fitted_finely(at.params)
         if bad.any():
             at = yield from self._refine(at, bad, self._fine, self._config.closest_sweeps)
-            bad &= self._poorly_fitted_finely(at.guess)
+            bad &= self._poorly_fitted_finely(at.params)
         for n in np.flatnonzero(bad | moved).tolist():
-            others = yaw_hypotheses(self._models, at.guess, n)
-            if bad[n] or self._may_be_turned(at.guess, n, others):
-                others = Pose.joined(others, resting_hypotheses(self._models, at.guess, n))
+            others = yaw_hypotheses(self._models, at.params, n)
+            if bad[n] or self._may_be_turned(at.params, n, others):
+                others = Pose.joined(others, resting_hypotheses(self._models, at.params, n))
                 at = self._compare_orientations(at, n, others)
-                yield self._step("together", f"{at.guess.names[n]}: the other way round", at)
+                yield self._step("together", f"{at.params.names[n]}: the other way round", at)
         return at
 
-    def _poorly_fitted_finely(self, guess: SceneParameters) -> Bool[np.ndarray, "N"]:
-        return object_residuals(self._fit_finely(guess)) > np.maximum(self._config.fits_finely_below, self._allowed)
+    def _poorly_fitted_finely(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
+        return object_residuals(self._fit_finely(params)) > np.maximum(self._config.fits_finely_below, self._allowed)
 
-    def _fit_finely(self, guess: SceneParameters) -> FitQuality:
+    def _fit_finely(self, params: SceneParameters) -> FitQuality:
         """The fit in fine images; rendered again only for another guess."""
-        if self._looked is None or self._looked[0] is not guess:
-            self._looked = guess, evaluate_fit(self._models, self._fine, guess)
-        return self._looked[1]
+        if self._last_fit is None or self._last_fit[0] is not params:
+            self._last_fit = params, evaluate_fit(self._models, self._fine, params)
+        return self._last_fit[1]
 
-    def _may_be_turned(self, guess: SceneParameters, n: int, others: Pose) -> bool:
+    def _may_be_turned(self, params: SceneParameters, n: int, others: Pose) -> bool:
         """Whether the loss of some other yaw is within a factor of the present one's."""
-        tried = Pose.joined(guess.state().poses[n][None], others)
+        tried = Pose.joined(params.state().poses[n][None], others)
         here, *there = pose_losses(
-            self._models, crop_to_silhouette(self._sharp, self._models, guess, n), guess, n, tried
+            self._models, crop_to_silhouette(self._sharp, self._models, params, n), params, n, tried
         )
         return min(there) < self._config.turned_within * here
 
@@ -327,13 +329,13 @@ class _Tracker:
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
         estimate = estimate_with_uncertainty(
-            at.guess, at.normals, self._fit_finely(at.guess), self._rivals, light_held=True
+            at.params, at.normals, self._fit_finely(at.params), self._rivals, light_held=True
         )
         return self._reporter.finish(at, estimate)
 
     def _step(self, stage: Stage, note: str, at: GaussNewtonState) -> EstimateStep:
         losses = at.losses[:-1].tolist()
-        return self._reporter.step(stage, note, at.guess, losses=losses, loss=float(at.losses[-1]))
+        return self._reporter.step(stage, note, at.params, losses=losses, loss=float(at.losses[-1]))
 
 
 def _pusher_motion(

@@ -50,17 +50,17 @@ class FitQuality:
     spread: float
 
 
-def evaluate_fit(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> FitQuality:
+def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> FitQuality:
     """Compare a guess with the images."""
-    batch: SceneBatch = guess.perturbed(np.zeros((1, guess.size)))
+    batch: SceneBatch = params.perturbed(np.zeros((1, params.size)))
     rendered = models.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
     assert rendered.opacity is not None
     opacity = rendered.opacity[0].astype(float)
     squares = ((rendered.rgb[0] - views.images) ** 2).mean(axis=-1, dtype=float)
     pixels = opacity.sum(axis=(2, 3))
     residuals = np.sqrt((opacity * squares[:, None]).sum(axis=(2, 3)) / np.maximum(pixels, 1e-6))
-    elsewhere = 1 - opacity.sum(axis=1).clip(0, 1) if len(guess.names) else np.ones_like(squares)
-    overlap = np.ones(len(guess.names))
+    elsewhere = 1 - opacity.sum(axis=1).clip(0, 1) if len(params.names) else np.ones_like(squares)
+    overlap = np.ones(len(params.names))
     if views.masks is not None:
         both = np.minimum(opacity, views.masks).sum(axis=(0, 2, 3))
         either = np.maximum(opacity, views.masks).sum(axis=(0, 2, 3))
@@ -76,7 +76,7 @@ def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
 
 
 def estimate_with_uncertainty(
-    guess: SceneParameters,
+    params: SceneParameters,
     normals: Sequence[np.ndarray],
     fit: FitQuality,
     rivals: dict[int, float],
@@ -87,7 +87,7 @@ def estimate_with_uncertainty(
     """A guess with its uncertainty and the doubts about it.
 
     Args:
-        guess: what was found.
+        params: what was found.
         normals: Gauss-Newton's matrices there, one for each object and one for the light.
         fit: of the guess.
         rivals: by object, the best loss of a different orientation over the loss of the one chosen.
@@ -97,7 +97,7 @@ def estimate_with_uncertainty(
     Returns:
         The estimate.
     """
-    count = len(guess.names)
+    count = len(params.names)
     deviations = _deviations(normals, fit.spread, count)
     poses = deviations[: POSE * count].reshape(count, 2, 3)
     position = _POSITION_FACTOR * np.sqrt((poses[:, 0] ** 2).mean(axis=1))
@@ -108,8 +108,8 @@ def estimate_with_uncertainty(
         _reason_for_doubt(fit, n, position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
         for n in range(count)
     )
-    doubtful = [f"{name}: {doubt}" for name, doubt in zip(guess.names, doubts, strict=True) if doubt]
-    return EstimatedState(guess.state(), position, rotation, light, doubts, "; ".join(doubtful))
+    doubtful = [f"{name}: {doubt}" for name, doubt in zip(params.names, doubts, strict=True) if doubt]
+    return EstimatedState(params.state(), position, rotation, light, doubts, "; ".join(doubtful))
 
 
 def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.ndarray:

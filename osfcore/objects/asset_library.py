@@ -29,7 +29,7 @@ from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.objects.download import remove_old, told_as_fetch_failed
+from osfcore.objects.download import raising_fetch_failed, remove_old
 
 FORMAT_VERSION = 1
 _FACTS, _ARRAYS, _TEXTURE, _VIEWER = "object.json", "arrays.npz", "texture.png", "viewer.glb"
@@ -152,7 +152,7 @@ class AssetLibrary:
         from osfcore.objects.viewer_mesh import viewer_glb
 
         glb = viewer_glb(asset.mesh)
-        with told_as_fetch_failed(asset.info.name, self.root):
+        with raising_fetch_failed(asset.info.name, self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             remove_old(self.root, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
             with self._temporary(asset.info.name) as folder:

@@ -29,7 +29,7 @@ _TEMPORARY_LIFE_S = 3600  # older folders were left by a killed process
 
 
 @contextlib.contextmanager
-def told_as_fetch_failed(what: str, place: Path) -> Iterator[None]:
+def raising_fetch_failed(what: str, place: Path) -> Iterator[None]:
     """Tell a full disk, or a place that cannot be written, in one sentence.
 
     Raises:
@@ -48,7 +48,7 @@ def temporary_folder(parent: Path, what: str) -> Iterator[Path]:
     Raises:
         FetchFailed: if it cannot be made.
     """
-    with told_as_fetch_failed(what, parent):
+    with raising_fetch_failed(what, parent):
         parent.mkdir(parents=True, exist_ok=True)
         remove_old(parent, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
         folder = Path(tempfile.mkdtemp(prefix=_TEMPORARY_PREFIX, dir=parent))
@@ -99,14 +99,14 @@ def _save(answer: http.client.HTTPResponse, path: Path, max_bytes: int, address:
     size = 0
     part = path.with_name(path.name + ".part")
     try:
-        with told_as_fetch_failed(address, path.parent):
+        with raising_fetch_failed(address, path.parent):
             file = part.open("wb")
         with file:
             while chunk := answer.read(_CHUNK_BYTES):
                 size += len(chunk)
                 if size > max_bytes:
                     raise FetchFailed(address, f"it is larger than {max_bytes / 1e6:.0f} MB")
-                with told_as_fetch_failed(address, path.parent):
+                with raising_fetch_failed(address, path.parent):
                     file.write(chunk)
         if expected is not None and size != int(expected):
             raise ConnectionError(f"{size} of {expected} bytes arrived")

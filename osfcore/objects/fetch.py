@@ -13,7 +13,7 @@ from osfcore.errors import CorruptFile, InvalidInput, UnknownName, WorkerDied
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, Symmetry, TexturedMesh
 from osfcore.objects.asset_library import AssetLibrary, check_name
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.objects.download import temporary_folder, told_as_fetch_failed
+from osfcore.objects.download import raising_fetch_failed, temporary_folder
 from osfcore.progress import Progress
 
 if TYPE_CHECKING:
@@ -53,19 +53,19 @@ def fetch(
     for name in names:
         if name not in CATALOGUE:
             raise UnknownName("object in the catalogue", name, CATALOGUE)
-    wanted = list(dict.fromkeys(names or source.names()))
-    missing = [name for name in wanted if force or not library.has(name)]
-    total = len(wanted) + 1
-    here = len(wanted) - len(missing)
+    chosen = list(dict.fromkeys(names or source.names()))
+    missing = [name for name in chosen if force or not library.has(name)]
+    total = len(chosen) + 1
+    here = len(chosen) - len(missing)
     if not missing:
-        yield Progress(total, total, f"All {len(wanted)} objects are here already")
+        yield Progress(total, total, f"All {len(chosen)} objects are here already")
         return
     yield Progress(here, total, f"Preparing {source.label}")
     for step in source.prepare():
         yield Progress(here, total, step.note)
     with temporary_folder(library.root, "objects") as folder:
         yield from _converted(missing, source, library, executor, folder, here + 1, total)
-    yield Progress(total, total, f"{len(wanted)} objects ready")
+    yield Progress(total, total, f"{len(chosen)} objects ready")
 
 
 def _converted(
@@ -85,7 +85,7 @@ def _converted(
             note = f"{{}} {label} ({done + len(running)} of {objects})"
             yield Progress(done, total, note.format("Getting"))
             place = folder / name
-            with told_as_fetch_failed(name, folder):
+            with raising_fetch_failed(name, folder):
                 place.mkdir()
             files = source.files(name, place)
             yield Progress(done, total, note.format("Converting"))

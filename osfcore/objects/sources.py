@@ -16,7 +16,7 @@ from typing import Protocol
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName
 from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
-from osfcore.objects.download import download, pip_download, temporary_folder, told_as_fetch_failed, unpack
+from osfcore.objects.download import download, pip_download, raising_fetch_failed, temporary_folder, unpack
 from osfcore.progress import Progress
 
 _LAYOUTS = ("{name}/google_16k/textured.obj", "{name}/textured.obj")
@@ -123,7 +123,7 @@ class WheelSource:
         digest = _sha256(path)
         if digest != self.SHA256:
             raise FetchFailed(self.label, f"its SHA-256 is {digest} instead of {self.SHA256}")
-        with told_as_fetch_failed(self.label, self._cache):
+        with raising_fetch_failed(self.label, self._cache):
             self._cache.mkdir(parents=True, exist_ok=True)
             path.replace(self.wheel)
 
@@ -133,7 +133,7 @@ class WheelSource:
             raise UnknownName(f"object in {self.label}", name, DEFAULT_NAMES)
         mesh, texture = folder / f"{name}.msh", folder / f"{name}.png"
         try:
-            with told_as_fetch_failed(name, folder), zipfile.ZipFile(self.wheel) as wheel:
+            with raising_fetch_failed(name, folder), zipfile.ZipFile(self.wheel) as wheel:
                 mesh.write_bytes(wheel.read(f"{self.FOLDER}/meshes/{name}.msh"))
                 texture.write_bytes(wheel.read(f"{self.FOLDER}/textures/{name}.png"))
         except (zipfile.BadZipFile, zlib.error, KeyError) as error:
@@ -167,11 +167,11 @@ class FolderSource:
         Raises:
             InvalidInput: if it holds none.
         """
-        found = tuple(name for name in CATALOGUE if self._find(name))
-        if not found:
+        available = tuple(name for name in CATALOGUE if self._find(name))
+        if not available:
             allowed = "a folder with NAME/google_16k/textured.obj in it, NAME such as 006_mustard_bottle"
             raise InvalidInput("source", self._folder, allowed)
-        return found
+        return available
 
     def prepare(self) -> Iterator[Progress]:
         """Nothing is needed."""
@@ -180,10 +180,10 @@ class FolderSource:
     def files(self, name: str, folder: Path) -> MeshFiles:
         """The mesh where it lies."""
         del folder  # nothing has to be copied
-        found = self._find(name)
-        if found is None:
+        path = self._find(name)
+        if path is None:
             raise UnknownName(f"object in {self._folder}", name, (n for n in CATALOGUE if self._find(n)))
-        return MeshFiles(found)
+        return MeshFiles(path)
 
     def _find(self, name: str) -> Path | None:
         paths = (self._folder / layout.format(name=name) for layout in _LAYOUTS)
@@ -236,11 +236,11 @@ class UrlSource:
             except CorruptFile:
                 archive.unlink(missing_ok=True)  # the next try asks the server again
                 raise
-            found = next((p for lay in _LAYOUTS if (p := folder / lay.format(name=name)).is_file()), None)
-            if found is None:
+            path = next((p for lay in _LAYOUTS if (p := folder / lay.format(name=name)).is_file()), None)
+            if path is None:
                 archive.unlink(missing_ok=True)
                 raise CorruptFile(archive.name, f"it holds no {name}/google_16k/textured.obj")
-            return MeshFiles(found)
+            return MeshFiles(path)
         for layout in _LAYOUTS:
             address = f"{self._base}/{layout.format(name=name)}"
             if download(address, folder / "textured.obj"):

@@ -34,14 +34,14 @@ class Pushes:
 
 def outline_points(outlines: Sequence[Float[np.ndarray, "K 2"]]) -> Float[np.ndarray, "n 2"]:
     """Points at most 5 mm apart all along the outlines of an object's convex parts [m]."""
-    found = []
+    pushes = []
     for outline in outlines:
         closed = np.vstack([outline, outline[:1]])
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
         at = np.linspace(0, length[-1], max(int(np.ceil(length[-1] / _APART_M)), 1), endpoint=False)
         between = np.stack([np.interp(at, length, closed[:, axis]) for axis in range(2)], axis=1)
-        found += [outline, between]
-    return np.concatenate(found)
+        pushes += [outline, between]
+    return np.concatenate(pushes)
 
 
 def straight_pushes(

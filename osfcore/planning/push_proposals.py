@@ -62,8 +62,8 @@ class PushProposals:
         orders = _orders(off, rng)
         chains = _PushSequences(state, here, there, offsets, horizon, rng)
         each = -(-count // len(orders))
-        found = [actions for order in orders for actions in chains.draw(order, each)]
-        return np.array(found[:count]).reshape(-1, horizon, 3)
+        proposals = [actions for order in orders for actions in chains.draw(order, each)]
+        return np.array(proposals[:count]).reshape(-1, horizon, 3)
 
     def _outlines(self, name: str, pose: Pose) -> Outlines:
         return list(part_outlines(self._tables[name], 0, pose).astype(float))

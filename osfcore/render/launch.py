@@ -104,12 +104,12 @@ def launch(
     directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
     base = np.zeros((len(different), *shape[1:], 3), np.float32), np.zeros((len(different), *shape[1:]), np.float32)
     scene = _scene(pack, numbers, rotations, positions, batch.lights, lenses)
-    wanted = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
+    mask = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
     with ONE_AT_A_TIME:
         if table is not None:  # the empty table, once per light
             render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
         render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows,
-                     Outlines(outline, shadow_outline), rules, wanted, rgb, opacity, distance)  # fmt: skip
+                     Outlines(outline, shadow_outline), rules, mask, rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,

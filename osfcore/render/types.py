@@ -66,10 +66,10 @@ class SceneBatch:
     def __post_init__(self) -> None:
         """Check shapes and numbers."""
         count, scenes = len(self.names), len(self.lights)
-        wanted = {"positions": (scenes, count, 3), "quaternions": (scenes, count, 4), "lights": (scenes, 3)}
+        shapes = {"positions": (scenes, count, 3), "quaternions": (scenes, count, 4), "lights": (scenes, 3)}
         if self.pusher is not None:
-            wanted["pusher"] = (scenes, 3)
-        for name, shape in wanted.items():
+            shapes["pusher"] = (scenes, 3)
+        for name, shape in shapes.items():
             array = getattr(self, name)
             if array.shape != shape:
                 raise InvalidInput(f"{name} of a batch", f"shape {array.shape}", f"finite numbers of shape {shape}")

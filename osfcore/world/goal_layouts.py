@@ -71,9 +71,9 @@ def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneSta
         rng = np.random.default_rng([seed, attempt])
         count = int(rng.integers(1, len(start.names) + 1)) if moved is None else moved
         world.restore(start)
-        found = draw_goal(world, count, rng)
-        if found is not None:
-            return found
+        goal = draw_goal(world, count, rng)
+        if goal is not None:
+            return goal
     raise NoRoom(start.names, _GOALS)
 
 

@@ -49,8 +49,8 @@ class SimulatedPushes:
             InvalidInput: if actions are beyond their limits.
         """
         actions = check_actions(actions)
-        told = [self._follow(state, sequence) for sequence in actions]
-        positions, quaternions, pusher = (np.stack(parts) for parts in zip(*told, strict=True))
+        futures = [self._follow(state, sequence) for sequence in actions]
+        positions, quaternions, pusher = (np.stack(parts) for parts in zip(*futures, strict=True))
         return Rollouts(state.names, positions, quaternions, pusher)
 
     def _follow(

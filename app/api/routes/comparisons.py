@@ -9,9 +9,9 @@ from fastapi import APIRouter, Query, Response
 from app.api.dependencies import Services, ServicesDep
 from app.api.routes import PNG, problems
 from app.api.routes.scenes import CameraName, SceneId, SizeQuery, view_of
-from app.processes.neural_messages import CompareView, Comparison
+from app.processes.messages.neural_messages import CompareView, Comparison
+from app.processes.messages.scene_messages import SceneRecord, TakeImage
 from app.processes.render_cameras import scene_camera
-from app.processes.scene_messages import SceneRecord, TakeImage
 from app.services.fields import MissingFields
 from osfcore.errors import OsfError
 from osfcore.geometry.states import SceneState

@@ -38,12 +38,12 @@ _FILE = {
 }
 
 
-def _found(services: ServicesDep, episode: Annotated[str, Path(description="Identifier of an episode.")]) -> Job:
+def _known_job(services: ServicesDep, episode: Annotated[str, Path(description="Identifier of an episode.")]) -> Job:
     with named_in_path():
         return services.episodes.get(episode)
 
 
-FoundDep = Annotated[Job, Depends(_found)]
+FoundDep = Annotated[Job, Depends(_known_job)]
 
 
 @router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429, 507))

@@ -38,12 +38,12 @@ router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
 View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")]
 
 
-def _found(services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]) -> Job:
+def _known_job(services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]) -> Job:
     with named_in_path():
         return services.estimates.get(estimate)
 
 
-FoundDep = Annotated[Job, Depends(_found)]
+FoundDep = Annotated[Job, Depends(_known_job)]
 
 
 @router.post(
@@ -77,8 +77,8 @@ async def create(
         except ClientDisconnect:
             raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
     else:
-        wanted = await _wanted(request, kind, services.settings.max_body_bytes)
-        job = await asyncio.to_thread(services.estimates.of_scene, wanted.asked(), wanted.scene)
+        request_body = await _body(request, kind, services.settings.max_body_bytes)
+        job = await asyncio.to_thread(services.estimates.of_scene, request_body.asked(), request_body.scene)
     response.headers["Location"] = f"{UPLOAD_PATH}/{job.id}"
     return await asyncio.to_thread(_out, services.estimates, job)
 
@@ -133,7 +133,7 @@ def _out(estimates: Estimates, job: Job) -> EstimateOut:
     return EstimateOut.of_job(job, estimates.steps(job), estimates.result(job), estimates.simulation_errors(job))
 
 
-async def _wanted(request: Request, kind: str, max_bytes: int) -> EstimateIn:
+async def _body(request: Request, kind: str, max_bytes: int) -> EstimateIn:
     """The JSON of a request; nothing at all asks for the defaults."""
     body = await whole_body(request, max_bytes)
     if not body and not kind:

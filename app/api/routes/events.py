@@ -21,7 +21,7 @@ from app.api.schemas.common import FrameEvent, NoticeEvent
 from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
 from app.jobs.job import Job, JobChanged, job_from_fields
-from app.processes.scene_messages import FramesTaken, SceneChanged
+from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged

@@ -80,13 +80,13 @@ def overlay(services: ServicesDep, set_id: SetId) -> FileResponse:
 @router.get("/{name}", responses=problems(404))
 def get(services: ServicesDep, name: FieldName) -> FieldOut:
     """Tell what is known of one field."""
-    return _out(services, _found(services, name))
+    return _out(services, _known_field(services, name))
 
 
 @router.delete("/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507))
 def delete(services: ServicesDep, name: FieldName) -> None:
     """Delete a field that was trained here; a shipped one of the same name then counts again."""
-    _found(services, name)
+    _known_field(services, name)
     services.fields.remove(name)
 
 
@@ -103,7 +103,7 @@ def _out(services: Services, info: FieldInfo) -> FieldOut:
     )
 
 
-def _found(services: Services, name: str) -> FieldInfo:
+def _known_field(services: Services, name: str) -> FieldInfo:
     with named_in_path():
         return services.fields.get(name)
 

@@ -35,12 +35,12 @@ _BODY = {
 router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems())
 
 
-def _found(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
+def _known_goal(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
     with named_in_path():
         return services.goals.get(goal)
 
 
-FoundDep = Annotated[GoalRecord, Depends(_found)]
+FoundDep = Annotated[GoalRecord, Depends(_known_goal)]
 
 
 @router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409, 415, 503, 507), openapi_extra=_BODY)
@@ -93,10 +93,10 @@ def begin(services: ServicesDep, body: DraftIn) -> DraftOut:
 @router.get("/draft", responses=problems(404))
 def draft(services: ServicesDep) -> DraftOut:
     """Tell what is being composed."""
-    found = services.goals.draft
-    if found is None:
+    draft = services.goals.draft
+    if draft is None:
         raise NotFound(str(NoDraft()))
-    return _draft_out(services, found)
+    return _draft_out(services, draft)
 
 
 @router.patch("/draft", responses=problems(404, 409, 503))

@@ -40,36 +40,36 @@ async def list_all(services: ServicesDep) -> JobList:
 @router.get("/{job}", responses=problems(404))
 async def get(services: ServicesDep, job: JobId) -> JobOut:
     """Tell how a job is."""
-    return JobOut.of(_found(services, job))
+    return JobOut.of(_known_job(services, job))
 
 
 @router.delete("/{job}", responses=problems(404, 409))
 def cancel(services: ServicesDep, job: JobId) -> JobOut:
     """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
-    _found(services, job)
+    _known_job(services, job)
     return JobOut.of(services.runner.jobs.cancel(job))
 
 
 @router.post("/{job}/pause", responses=problems(404, 409))
 def pause(services: ServicesDep, job: JobId) -> JobOut:
     """Let a running job rest after its current step. It keeps its turn."""
-    _found(services, job)
+    _known_job(services, job)
     return JobOut.of(services.runner.jobs.pause(job))
 
 
 @router.post("/{job}/resume", responses=problems(404, 409))
 def resume(services: ServicesDep, job: JobId) -> JobOut:
     """Let a paused job go on."""
-    _found(services, job)
+    _known_job(services, job)
     return JobOut.of(services.runner.jobs.resume(job))
 
 
 @router.get("/{job}/files/{name}", response_class=FileResponse, responses={**problems(404), **_FILE})
 def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
     """Download what a job has made."""
-    found = _found(services, job)
+    known_job = _known_job(services, job)
     with named_in_path():
-        path = services.runner.jobs.folder(job) / check_file_name(found, name)
+        path = services.runner.jobs.folder(job) / check_file_name(known_job, name)
     if not path.is_file():
         raise NotFound(f"{name} of job {job} has been removed from the data directory.")
     return FileResponse(path, filename=name, media_type="application/octet-stream")
@@ -78,13 +78,13 @@ def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
 @router.get("/{job}/preview.png", response_class=FileResponse, responses={**problems(404), **PNG})
 def preview(services: ServicesDep, job: JobId) -> FileResponse:
     """Show one unseen image of a field in training: the truth, the field's, and their difference times four."""
-    _found(services, job)
+    _known_job(services, job)
     path = services.runner.jobs.folder(job) / PREVIEW
     if not path.is_file():
         raise NotFound(f"Job {job} has no preview; training a field makes one, some seconds after it has begun.")
     return FileResponse(path, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
-def _found(services: Services, job: str) -> Job:
+def _known_job(services: Services, job: str) -> Job:
     with named_in_path():
         return services.runner.jobs.get(job)

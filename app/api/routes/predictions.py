@@ -11,8 +11,8 @@ from fastapi import APIRouter, Response
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.predictions import PredictionIn, PredictionOut
-from app.processes.neural_messages import Predicted
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.neural_messages import Predicted
+from app.processes.messages.scene_messages import SceneRecord
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.rollouts import check_actions
 from osfcore.geometry.states import SceneState
@@ -66,10 +66,10 @@ def _check_known(state: SceneState, known: tuple[str, ...]) -> None:
 
 
 def _json(answer: Predicted, record: SceneRecord | None) -> bytes:
-    told = {
+    body = {
         **rollouts_to_json(answer.rollouts),
         "took_s": round(answer.took_s, 6),
         "scene": None if record is None else record.id,
         "revision": None if record is None else record.revision,
     }
-    return json.dumps(told, allow_nan=False, separators=(",", ":")).encode()
+    return json.dumps(body, allow_nan=False, separators=(",", ":")).encode()

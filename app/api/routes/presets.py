@@ -61,8 +61,8 @@ def list_all(services: ServicesDep) -> PresetList:
 def make(services: ServicesDep, preset_id: str = Path(description="Identifier of a preset.")) -> PresetMade:
     """Make a preset's scene, which is then shown, and its goal image."""
     with named_in_path():
-        wanted = preset(preset_id)
-    scene, goal = set_up(wanted, services.runner, services.goals)
+        chosen = preset(preset_id)
+    scene, goal = set_up(chosen, services.runner, services.goals)
     return PresetMade(scene=services.scene_out(scene), goal=GoalOut.of(goal))
 
 

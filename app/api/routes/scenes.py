@@ -8,7 +8,7 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
-from app.processes.scene_messages import SceneRecord, TakeImage, TakeMask
+from app.processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS
 
@@ -44,34 +44,34 @@ async def list_all(services: ServicesDep) -> SceneList:
 @router.get("/{scene}", responses=problems(404))
 async def get(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Tell how a scene is now."""
-    return services.scene_out(found(services, scene))
+    return services.scene_out(record_of(services, scene))
 
 
 @router.delete("/{scene}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409))
 def delete(services: ServicesDep, scene: SceneId) -> None:
     """Forget a scene."""
-    found(services, scene)
+    record_of(services, scene)
     services.runner.delete_scene(scene)
 
 
 @router.post("/{scene}/activate", responses=problems(404))
 def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Show a scene in viewer and page."""
-    found(services, scene)
+    record_of(services, scene)
     return services.scene_out(services.runner.activate(scene))
 
 
 @router.post("/{scene}/reset", responses=problems(404, 409))
 def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Put a scene back to how it was created."""
-    found(services, scene)
+    record_of(services, scene)
     return services.scene_out(services.runner.reset_scene(scene))
 
 
 @router.patch("/{scene}", responses=problems(404, 409))
 def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
     """Move light and objects by hand, all or nothing."""
-    found(services, scene)
+    record_of(services, scene)
     record = services.runner.edit_scene(
         scene,
         light=None if body.light is None else body.light.light(),
@@ -83,7 +83,7 @@ def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
 @router.post("/{scene}/actions", responses=problems(404, 409))
 def act(services: ServicesDep, scene: SceneId, body: ActionsIn) -> SceneOut:
     """Push: hold each velocity for 0.2 s of simulated time."""
-    found(services, scene)
+    record_of(services, scene)
     return services.scene_out(services.runner.act(scene, body.actions))
 
 
@@ -120,12 +120,12 @@ async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
     try:
         png = await services.runner.image(command)
     except OsfError:
-        found(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the simulation says
+        record_of(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the simulation says
         raise
     return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
 
 
-def found(services: Services, scene: str) -> SceneRecord:
+def record_of(services: Services, scene: str) -> SceneRecord:
     """A scene that a path names.
 
     Raises:
@@ -141,7 +141,7 @@ def view_of(services: Services, scene: str, camera: str) -> SceneRecord:
     Raises:
         NotFound: if there is no such scene or camera.
     """
-    record = found(services, scene)
+    record = record_of(services, scene)
     if camera not in _CAMERAS:
         raise NotFound(str(UnknownName("camera", camera, _CAMERAS)))
     return record

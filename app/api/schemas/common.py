@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.services.scenes import MAX_SEED
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.light import Light

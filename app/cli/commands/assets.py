@@ -69,11 +69,11 @@ class AssetsFetch:
 
         library = _library(self.data_dir)
         source = source_from(self.source, self.data_dir / "cache")
-        wanted = self.names or source.names()
-        is_work = any(self.force or not library.has(name) for name in wanted)
+        chosen = self.names or source.names()
+        is_work = any(self.force or not library.has(name) for name in chosen)
         with worker_pool(self.workers if is_work else 1) as executor:
-            follow(fetch(wanted, source, library, executor, force=self.force))
-        return {"objects": list(wanted), "available": list(library.names()), "data_dir": str(self.data_dir)}
+            follow(fetch(chosen, source, library, executor, force=self.force))
+        return {"objects": list(chosen), "available": list(library.names()), "data_dir": str(self.data_dir)}
 
 
 @dataclass(frozen=True)

@@ -198,8 +198,8 @@ def _show_fields(result: dict[str, Any]) -> None:
     console.print(table)
     if result["scenes"]:
         shares = {"whole": "scene_psnr_mean", "objects": "scene_psnr_object_mean", "shadow": "scene_psnr_shadow_mean"}
-        told = [f"{what} {result[key]:.2f} dB" for what, key in shares.items() if result[key] is not None]
-        console.print(f"{result['scenes']} scenes: {', '.join(told)}", highlight=False)
+        parts = [f"{what} {result[key]:.2f} dB" for what, key in shares.items() if result[key] is not None]
+        console.print(f"{result['scenes']} scenes: {', '.join(parts)}", highlight=False)
 
 
 def _show_estimate(folder: Path, result: dict[str, Any]) -> None:
@@ -246,16 +246,16 @@ def _show_dynamics(folder: Path, result: dict[str, Any]) -> None:
     for horizon in (1, 4, 10, 30):
         mm, deg = result[f"median_mm_{horizon}"], result[f"median_deg_{horizon}"]
         others = [_number(result[f"{who}_mm_{horizon}"]) for who in ("constant", "analytic")]
-        told = f"constant pose {others[0]}, quasi-static {others[1]} mm"
-        print(f"  after {horizon}: median {_number(mm)} mm, {_number(deg)} deg ({told})")
+        parts = f"constant pose {others[0]}, quasi-static {others[1]} mm"
+        print(f"  after {horizon}: median {_number(mm)} mm, {_number(deg)} deg ({parts})")
     print(f"  what does not move drifts by {_number(result['still_drift_mm_30'], 2)} mm in 30 steps")
     for count, row in result["by_objects"].items():
         print(f"{count} objects: {_number(row['median_mm_4'])} mm, {_number(row['median_deg_4'])} deg after 4 steps")
     if result["unseen_objects"]:
-        told = (
+        parts = (
             f"{_number(result['unseen_objects_mm_4'])} mm; having seen them {_number(result['seen_objects_mm_4'])} mm"
         )
-        print(f"Objects never seen ({', '.join(result['unseen_objects'])}): {told}")
+        print(f"Objects never seen ({', '.join(result['unseen_objects'])}): {parts}")
     print(f"{result['rollout_steps_per_s']} steps of scenes a second. Pictures and figures: {folder}")
 
 

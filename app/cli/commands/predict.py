@@ -108,8 +108,8 @@ class Predict:
         fields = {name: library.load(name) for name in state.names}
         renderer = SceneRenderer(fields, library.load_table(), device=str(pick_device(self.device)))
         lacking = [name for name in state.names if not assets.has(name)]
-        wanted = VisualPrediction(state, rollouts, actions, self.sequence, camera, folder)
-        follow(show_prediction(wanted, renderer, None if lacking else assets))
+        request = VisualPrediction(state, rollouts, actions, self.sequence, camera, folder)
+        follow(show_prediction(request, renderer, None if lacking else assets))
         if lacking:
             return {"images": str(folder), "psnr": None, "lacking": lacking}
         return {"images": str(folder), "psnr": read_json(folder / PSNR_FILE, _psnr)}

@@ -81,39 +81,39 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     from app.episodes.recording import write_recording
     from app.jobs.kinds.remote_world import RemoteWorld
     from osfcore.control.closed_loop import Episode
-    from osfcore.control.knowledge import knowledge_of
+    from osfcore.control.scene_models import load_scene_models
     from osfcore.fields.field_library import FieldLibrary
 
     assert place.orders is not None, "the job's process sets it"
     settings, names = settings_of(params["settings"]), tuple(params["names"])
     yield EpisodeProgress(0, 0, "Loading fields, half a minute the first time")
-    knowledge = knowledge_of(names, FieldLibrary(place.data_dir), place.library, place.data_dir)
+    models = load_scene_models(names, FieldLibrary(place.data_dir), place.library, place.data_dir)
     world = RemoteWorld(place.orders.ask, params["scene"], place.folder)
     goal, start = params["goal"], world.truth()
-    wanted = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
-    about = About(params["seed"], settings, wanted, _moved(start, wanted), knowledge.symmetries)
+    target = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
+    about = About(params["seed"], settings, target, _moved(start, target), models.symmetries)
     record = EpisodeRecord(place.folder, world, about)
     rng = np.random.default_rng([params["seed"], 1])
-    episode = Episode(world, knowledge, _goal(goal, names, place.folder / INPUTS), settings, rng)
-    told = EpisodeProgress(0, 0, "Looking")
+    episode = Episode(world, models, _goal(goal, names, place.folder / INPUTS), settings, rng)
+    progress = EpisodeProgress(0, 0, "Looking")
     for event in episode.run():
         for change in place.orders.changes():
             episode.settings = settings_of(change["settings"])
         record.take(event)
-        told = _told(told, event, episode.settings.steps)
-        yield told
-    yield replace(told, note="Writing video and recording", view=None)
+        progress = _progress_after(progress, event, episode.settings.steps)
+        yield progress
+    yield replace(progress, note="Writing video and recording", view=None)
     record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
     world.close()
-    yield replace(told, note=told.text or told.note, view=None)
+    yield replace(progress, note=progress.text or progress.note, view=None)
 
 
-def _told(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
+def _progress_after(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
     """How far an episode is after an event."""
     from app.episodes.headless import note_of, stage_of
     from app.processes.plan_summary import sketch_of
-    from osfcore.control.events import Acted, Finished, GoalFound, Observed, Planning, Stepped
+    from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed, Planning, Stepped
 
     is_known = before.total > 0 or isinstance(event, GoalFound)
     total = total if is_known else 0
@@ -123,7 +123,7 @@ def _told(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
             return replace(then, view=None)
         case Planning(number, round_):
             return replace(then, view=sketch_of(number, round_))
-        case Acted(number):
+        case ActionExecuted(number):
             return replace(then, done=number, view=event)
         case Stepped():
             return replace(then, steps=before.steps + 1, view=event)
@@ -163,12 +163,12 @@ def _poses(data: object, names: tuple[str, ...]) -> Pose:
     return Pose(np.array([entry.position for entry in entries]), np.array([entry.quaternion for entry in entries]))
 
 
-def _moved(start: SceneState, wanted: SceneState | None) -> tuple[str, ...]:
+def _moved(start: SceneState, target: SceneState | None) -> tuple[str, ...]:
     """Objects that lie elsewhere in the goal than at the beginning."""
-    if wanted is None:
+    if target is None:
         return ()
-    shift_m = np.linalg.norm(wanted.poses.position - start.poses.position, axis=1)
-    turn_rad = np.asarray(rotation_angle(wanted.poses.quaternion, start.poses.quaternion))
+    shift_m = np.linalg.norm(target.poses.position - start.poses.position, axis=1)
+    turn_rad = np.asarray(rotation_angle(target.poses.quaternion, start.poses.quaternion))
     return tuple(
         n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > _STAYS_M or rad > _STAYS_RAD
     )

@@ -75,11 +75,11 @@ def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimati
     models = load_models(place.data_dir, observation.names)
     rng = np.random.default_rng(params["seed"])
     for number, step in enumerate(steps_of(mode, models, observation, prior, rng), 1):
-        told = _told(number, step)
-        _keep(place.folder / STEPS, told, step.guess)
+        progress = _progress_of(number, step)
+        _keep(place.folder / STEPS, progress, step.state)
         if step.estimate is not None:
             write_estimated(place.folder / STATE, step.estimate)
-        yield told
+        yield progress
 
 
 def load_models(data_dir: Path, names: tuple[str, ...]) -> ObjectModels:
@@ -128,12 +128,12 @@ def read_steps(path: Path) -> tuple[dict[str, Any], ...]:
         raise CorruptFile(path, "it is no list of an estimate's steps") from error
 
 
-def guess_of(step: dict[str, Any]) -> SceneState:
+def state_of_step(step: dict[str, Any]) -> SceneState:
     """The best scene of a step that was read."""
     return decode(StateJson, step["guess"], "guess").state()
 
 
-def _told(number: int, step: EstimateStep) -> Estimating:
+def _progress_of(number: int, step: EstimateStep) -> Estimating:
     progress = step.progress
     trusted = None if step.estimate is None else step.estimate.trusted
     losses = tuple(_number(loss) for loss in step.losses)
@@ -147,9 +147,9 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _keep(path: Path, told: Estimating, guess: SceneState) -> None:
+def _keep(path: Path, progress: Estimating, state: SceneState) -> None:
     names = ("done", "total", "note", "step", "stage", "losses", "loss")
-    line = json.dumps({**{name: getattr(told, name) for name in names}, "guess": state_to_json(guess)})
+    line = json.dumps({**{name: getattr(progress, name) for name in names}, "guess": state_to_json(state)})
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")

@@ -105,17 +105,17 @@ def _train(params: dict[str, Any], data: Path, out: Path, preview: Path, begin: 
 
     config = TrainField(data, out, minutes=params["minutes"], seed=params["seed"], hollow=params["hollow"])
     previews = 0
-    for told in train_field(config):
-        if told.preview is not None:
-            write_png(preview, told.preview)
+    for step in train_field(config):
+        if step.preview is not None:
+            write_png(preview, step.preview)
             previews += 1
-        share = told.progress.done / max(told.progress.total, 1)
+        share = step.progress.done / max(step.progress.total, 1)
         yield replace(
             begin,
             done=begin.done + round(share * (begin.total - begin.done)),
-            note=told.progress.note,
-            psnr_full=told.psnr_full,
-            psnr_mask=told.psnr_mask,
+            note=step.progress.note,
+            psnr_full=step.psnr_full,
+            psnr_mask=step.psnr_mask,
             previews=previews,
         )
 

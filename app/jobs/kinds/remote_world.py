@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from app.processes.scene_messages import Act, ObserveScene, SceneRecord, TakeView
+from app.processes.messages.scene_messages import Act, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import Observation, SceneState

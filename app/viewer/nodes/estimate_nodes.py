@@ -93,13 +93,13 @@ class EstimateNodes:
     def show(self, step: EstimateStep) -> None:
         """Draw a step in place of the one before; the last one with its verdict."""
         with self._lock, atomic(self._server):
-            if step.guess.names != self._names:
-                self._begin(step.guess.names)
+            if step.state.names != self._names:
+                self._begin(step.state.names)
             self._clear_verdicts()
             for n, name in enumerate(self._names):
-                self._show_guess(name, step.guess.poses[n], _WIRES)
+                self._show_guess(name, step.state.poses[n], _WIRES)
                 self._show_tried(name, None if step.candidates is None else step.candidates[:, n])
-            self._show_light(step.guess.light, step.lights, "guessed light")
+            self._show_light(step.state.light, step.lights, "guessed light")
             if step.estimate is not None:
                 self._judge(step.estimate)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.viewer.nodes.atomic import atomic
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera, default_cameras

@@ -14,15 +14,14 @@ import numpy as np
 import viser
 
 from app.jobs.job import Job, JobChanged, JobView
+from app.processes.messages.scene_messages import SceneChanged
 from app.processes.plan_summary import PlanSketch
-from app.processes.scene_messages import SceneChanged
 from app.services.episodes import KIND
 from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged
 from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
 from app.viewer.nodes.scene_nodes import SceneNodes
-from app.viewer.panels.panel import Panel, RunCommand
-from app.viewer.panels.status_line import status
+from app.viewer.panels.panel import Panel, RunCommand, status
 from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState

@@ -17,7 +17,7 @@ from PIL import Image
 from viser import uplot
 
 from app.jobs.job import Job, JobChanged, JobView
-from app.processes.neural_messages import Comparison, NeuralAnswer
+from app.processes.messages.neural_messages import Comparison, NeuralAnswer
 from app.processes.process_client import ProcessClient
 from app.services.estimates import KIND, Asked, Estimates
 from app.services.event_hub import CurrentScene

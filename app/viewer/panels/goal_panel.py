@@ -22,8 +22,7 @@ from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.scene_nodes import NO_TURN, Client
-from app.viewer.panels.panel import Panel, RunCommand
-from app.viewer.panels.status_line import status
+from app.viewer.panels.panel import Panel, RunCommand, status
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary

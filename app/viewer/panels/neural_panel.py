@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from app.processes.neural_messages import DrawnView, DrawView, NeuralAnswer
+from app.processes.messages.neural_messages import DrawnView, DrawView, NeuralAnswer
 from app.processes.process_client import ProcessClient
 from app.processes.render_cameras import view_camera
 from app.viewer.panels.panel import Panel

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from html import escape
 
 import viser
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.services.event_hub import CurrentScene
 from app.viewer.drawing_thread import DrawingThread
 from app.viewer.nodes.scene_nodes import Client
@@ -61,3 +62,11 @@ class Panel(ABC):
     @abstractmethod
     def _draw(self) -> None:
         """Draw the newest state. Called in the thread."""
+
+
+_STYLE = "margin:0;padding:0.2em 0.75em 0.5em;font-size:0.8em;line-height:1.35"
+
+
+def status(about: str, text: str) -> str:
+    """HTML of a sentence about something, a word; the text may hold names that users choose."""
+    return f'<p class="{about}-status" style="{_STYLE}">{escape(text)}</p>'

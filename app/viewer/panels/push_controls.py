@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.services.pushes import MAX_ACTIONS, along, straight, toward_nearest, way
 from app.viewer.nodes.waypoints import FEWEST, MOST, Waypoints
 from osfcore.geometry.states import SceneState

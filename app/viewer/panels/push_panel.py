@@ -14,19 +14,17 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.processes.neural_messages import NeuralAnswer, Predicted
-from app.processes.scene_messages import SceneChanged, SceneRecord
+from app.processes.messages.neural_messages import NeuralAnswer, Predicted
+from app.processes.messages.scene_messages import SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
 from app.services.predictions import Predictions
 from app.services.pushes import outcomes
 from app.viewer.nodes.push_nodes import PushNodes
 from app.viewer.nodes.scene_nodes import Client
-from app.viewer.panels.panel import Panel, RunCommand
+from app.viewer.panels.panel import Panel, RunCommand, status
 from app.viewer.panels.push_controls import PushControls
 from app.viewer.panels.push_player import TICK_S, PushPlayer
-from app.viewer.panels.push_prediction import PushPrediction
-from app.viewer.panels.push_report import report
-from app.viewer.panels.status_line import status
+from app.viewer.panels.push_prediction import PushPrediction, report
 from osfcore.errors import OsfError
 from osfcore.geometry.workspace import STEP_S
 from osfcore.objects.asset_library import AssetLibrary

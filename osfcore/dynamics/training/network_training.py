@@ -26,12 +26,12 @@ from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.network_weights import network_bytes
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
+from osfcore.dynamics.substep import unroll
 from osfcore.dynamics.training.holdout import has_held_out_pair, is_for_validation
 from osfcore.dynamics.training.optimizers import Optimizers
-from osfcore.dynamics.training.samples import Sample, off_track, samples
+from osfcore.dynamics.training.samples import Sample, disturbed_substeps, samples
 from osfcore.dynamics.training.validation import _ARM_M, MEASURED_WINDOW, Validation, distance, validate
 from osfcore.dynamics.training.windows import Batch, Recording, batch, record
-from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.io.files import write_atomically, write_json
@@ -146,7 +146,7 @@ class _Run:
         self._table = ShapeTable(tuple(shapes[name] for name in names), device)
         learned, kept = _episodes(config, frozenset(names))
         self._long = record(learned, shapes, LONG_WINDOW)
-        self._samples = samples(record(learned, shapes, 1), self._table, device, off_track(learned, shapes))
+        self._samples = samples(record(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
         self._validation = record(kept, shapes, MEASURED_WINDOW)
         self._used = len(learned)
         torch.manual_seed(config.seed)

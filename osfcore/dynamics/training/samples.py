@@ -183,7 +183,7 @@ def _recorded(recording: Recording) -> Iterator[Substeps]:
                         recording.centre[e, s + 1], recording.quaternion[e, s + 1])  # fmt: skip
 
 
-def off_track(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape]) -> Iterator[Substeps]:
+def disturbed_substeps(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape]) -> Iterator[Substeps]:
     """What is recorded of disturbed states of episodes with the same number of objects."""
     order = {name: number for number, name in enumerate(sorted(shapes))}
     disturbed = [(e, e.disturbed) for e in episodes if e.disturbed is not None and len(e.disturbed.step)]

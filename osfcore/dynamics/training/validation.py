@@ -12,8 +12,8 @@ from torch import Tensor
 from osfcore.dynamics.motion import Motion
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.substep import unroll
 from osfcore.dynamics.training.windows import Batch, Recording, batch
-from osfcore.dynamics.unroll import unroll
 from osfcore.geometry import torch_rotations as rotations
 
 MEASURED_WINDOW = 4

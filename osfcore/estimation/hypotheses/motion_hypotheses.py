@@ -32,19 +32,19 @@ _ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
 
 
 def joint_push_hypotheses(
-    guess: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
+    params: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "K N 3"]:
     """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's."""
     if len(numbers) <= _MAX_COMBINED:
         shares = np.array(list(product(_SHARES, repeat=len(numbers))))
     else:
         shares = np.tile(np.array(_SHARES)[:, None], (1, len(numbers)))
-    positions = np.repeat(guess.positions[None], len(shares), axis=0)
+    positions = np.repeat(params.positions[None], len(shares), axis=0)
     positions[:, list(numbers)] += shares[..., None] * push
     return positions
 
 
-def push_hypotheses(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
+def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
     """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch."""
     length = float(np.linalg.norm(push))
     step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
@@ -52,33 +52,37 @@ def push_hypotheses(models: ObjectModels, guess: SceneParameters, number: int, p
     shifts = (_ALONG[:, None, None] * step + _ACROSS[:, None] * beside).reshape(-1, 3)
     turns = yaw_quaternions(_TURNS_RAD)
     slid = [(shift, turn) for shift in shifts for turn in turns]
-    axis = _rolling_axis(models, guess, number, push)
-    rolled = [(shift, _roll_along(models, guess, number, axis, push + shift)) for shift in shifts] if axis.any() else []
-    return _combine_shifts_and_turns(models, guess, number, *map(np.array, zip(*slid, *rolled, strict=True)))
+    axis = _rolling_axis(models, params, number, push)
+    rolled = (
+        [(shift, _roll_along(models, params, number, axis, push + shift)) for shift in shifts] if axis.any() else []
+    )
+    return _combine_shifts_and_turns(models, params, number, *map(np.array, zip(*slid, *rolled, strict=True)))
 
 
-def rolling_hypotheses(models: ObjectModels, guess: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
+def rolling_hypotheses(
+    models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]
+) -> Pose:
     """Poses of one object turned about the axis about which a push rolls it, its own first; a batch.
 
     Only its own pose if no push rolls it that way.
     """
-    axis = _rolling_axis(models, guess, number, push)
+    axis = _rolling_axis(models, params, number, push)
     angles = np.arange(_ROLLS if axis.any() else 1) * 2 * np.pi / _ROLLS
     return _combine_shifts_and_turns(
-        models, guess, number, np.zeros((len(angles), 3)), quaternion_exp(angles[:, None] * axis)
+        models, params, number, np.zeros((len(angles), 3)), quaternion_exp(angles[:, None] * axis)
     )
 
 
-def resting_hypotheses(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
+def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
     """All resting orientations of an object at its guessed position; a batch."""
-    resting = models.resting(guess.names[number])
-    centre = guess.positions[number] + rotate(guess.quaternions[number], resting.centre)
+    resting = models.resting(params.names[number])
+    centre = params.positions[number] + rotate(params.quaternions[number], resting.centre)
     centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])
     return Pose(centres - rotate(resting.quaternions, resting.centre), resting.quaternions)
 
 
 def _rolling_axis(
-    models: ObjectModels, guess: SceneParameters, number: int, push: np.ndarray
+    models: ObjectModels, params: SceneParameters, number: int, push: np.ndarray
 ) -> Float[np.ndarray, "3"]:
     """Unit vector about which a push rolls a body forward, the one nearest to square to the push; zero if none.
 
@@ -87,7 +91,7 @@ def _rolling_axis(
     length = float(np.linalg.norm(push))
     if length < _MIN_PUSH_M:
         return np.zeros(3)
-    resting, now = models.resting(guess.names[number]), guess.quaternions[number]
+    resting, now = models.resting(params.names[number]), params.quaternions[number]
     lying = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
     for axis in rotate(yaw_quaternions(_OBLIQUE_RAD), np.array([-push[1], push[0], 0.0]) / length):
         rolled = quaternion_multiply(quaternion_exp(_ROLLED_RAD[:, None] * axis), now[None])
@@ -98,20 +102,20 @@ def _rolling_axis(
 
 
 def _roll_along(
-    models: ObjectModels, guess: SceneParameters, number: int, axis: np.ndarray, path: np.ndarray
+    models: ObjectModels, params: SceneParameters, number: int, axis: np.ndarray, path: np.ndarray
 ) -> Float[np.ndarray, "4"]:
     """The rotation of a body that rolls along a path without slipping, its centre as high as it is now."""
-    resting = models.resting(guess.names[number])
-    height = guess.positions[number, 2] + rotate(guess.quaternions[number], resting.centre)[2]
+    resting = models.resting(params.names[number])
+    height = params.positions[number, 2] + rotate(params.quaternions[number], resting.centre)[2]
     forward = np.array([axis[1], -axis[0], 0.0])
     return quaternion_exp(axis * (forward @ path) / max(float(height), 0.25 * resting.radius))
 
 
 def _combine_shifts_and_turns(
-    models: ObjectModels, guess: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray
+    models: ObjectModels, params: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray
 ) -> Pose:
     """One object shifted, and turned about its centre of mass."""
-    centre, now = models.resting(guess.names[number]).centre, guess.quaternions[number]
+    centre, now = models.resting(params.names[number]).centre, params.quaternions[number]
     quaternions = quaternion_multiply(turns, now[None])
-    middle = guess.positions[number] + rotate(now, centre) + shifts
+    middle = params.positions[number] + rotate(now, centre) + shifts
     return Pose(middle - rotate(quaternions, centre), quaternions)

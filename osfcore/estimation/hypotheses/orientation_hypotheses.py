@@ -24,12 +24,12 @@ _CLOSE = 1.5  # ratio to the present loss up to which a hypothesis is refined on
 _SAME_RAD = np.deg2rad(12.0)
 
 
-def yaw_hypotheses(models: ObjectModels, guess: SceneParameters, number: int) -> Pose:
+def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
     """An object turned in place about the vertical through its centre of mass, by equal steps; a batch of poses."""
     turns = yaw_quaternions(np.arange(1, _YAWS) * 2 * np.pi / _YAWS)
-    quaternions = quaternion_multiply(turns, guess.quaternions[number][None])
-    centre = models.resting(guess.names[number]).centre
-    middle = guess.positions[number] + rotate(guess.quaternions[number], centre)
+    quaternions = quaternion_multiply(turns, params.quaternions[number][None])
+    centre = models.resting(params.names[number]).centre
+    middle = params.positions[number] + rotate(params.quaternions[number], centre)
     return Pose(middle - rotate(quaternions, centre), quaternions)
 
 
@@ -56,24 +56,24 @@ def compare_orientations(
     Returns:
         The better scene, and the ratio of the worse loss to the better one; infinite without a distinct hypothesis.
     """
-    same = rotation_angle(others.quaternion, at.guess.quaternions[number]) <= _SAME_RAD
+    same = rotation_angle(others.quaternion, at.params.quaternions[number]) <= _SAME_RAD
     far = others[~same]
     if not len(far.position):
         return at, np.inf
-    own = crop_to_object(rough, models, at.guess, number)
-    far = far[np.argsort(pose_losses(models, own, at.guess, number, far))[:_RANKED_COARSE]]
-    own = crop_to_object(coarse, models, at.guess, number)
-    far = far[np.argsort(pose_losses(models, own, at.guess, number, far))]
+    own = crop_to_object(rough, models, at.params, number)
+    far = far[np.argsort(pose_losses(models, own, at.params, number, far))[:_RANKED_COARSE]]
+    own = crop_to_object(coarse, models, at.params, number)
+    far = far[np.argsort(pose_losses(models, own, at.params, number, far))]
     tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct_orientations(far)]
-    tried = sorted(tried, key=lambda one: loss_of(models, own, one.guess))[:_REFINED_COARSE]
-    tried = [_refine(models, coarse, one, number, _pose(one.guess, number), _ITERATIONS) for one in tried]
-    ends = [loss_of(models, own, refined.guess) for refined in tried]
+    tried = sorted(tried, key=lambda one: loss_of(models, own, one.params))[:_REFINED_COARSE]
+    tried = [_refine(models, coarse, one, number, _pose(one.params, number), _ITERATIONS) for one in tried]
+    ends = [loss_of(models, own, refined.params) for refined in tried]
     rival = tried[int(np.argmin(ends))]
-    if min(ends) < _CLOSE * loss_of(models, own, at.guess):
-        rival = _refine(models, fine, rival, number, _pose(rival.guess, number), _FINE_ITERATIONS)
-    own = crop_to_object(fine, models, at.guess, number)
-    here, there = (loss_of(models, own, guess) for guess in (at.guess, rival.guess))
-    angle = rotation_angle(rival.guess.quaternions[number], at.guess.quaternions[number])
+    if min(ends) < _CLOSE * loss_of(models, own, at.params):
+        rival = _refine(models, fine, rival, number, _pose(rival.params, number), _FINE_ITERATIONS)
+    own = crop_to_object(fine, models, at.params, number)
+    here, there = (loss_of(models, own, params) for params in (at.params, rival.params))
+    angle = rotation_angle(rival.params.quaternions[number], at.params.quaternions[number])
     ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
     return (replace(rival, losses=at.losses) if there < here else at), float(ratio)
 
@@ -82,7 +82,7 @@ def _refine(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, number: int, pose: Pose, iterations: int
 ) -> GaussNewtonState:
     """Gauss-Newton of one object from a pose; its normal matrix stays that of before until it moves."""
-    rival = replace(at, guess=with_pose(at.guess, number, pose), dampings=GaussNewtonState.at(at.guess).dampings)
+    rival = replace(at, params=with_pose(at.params, number, pose), dampings=GaussNewtonState.at(at.params).dampings)
     return list(gauss_newton(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
@@ -97,22 +97,22 @@ def _distinct_orientations(poses: Pose) -> list[int]:
     return kept
 
 
-def with_pose(guess: SceneParameters, number: int, pose: Pose) -> SceneParameters:
+def with_pose(params: SceneParameters, number: int, pose: Pose) -> SceneParameters:
     """A guess with one object in another pose."""
-    positions, quaternions = guess.positions.copy(), guess.quaternions.copy()
+    positions, quaternions = params.positions.copy(), params.quaternions.copy()
     positions[number], quaternions[number] = pose.position, pose.quaternion
-    return replace(guess, positions=positions, quaternions=quaternions)
+    return replace(params, positions=positions, quaternions=quaternions)
 
 
-def _pose(guess: SceneParameters, number: int) -> Pose:
-    return Pose(guess.positions[number], guess.quaternions[number])
+def _pose(params: SceneParameters, number: int) -> Pose:
+    return Pose(params.positions[number], params.quaternions[number])
 
 
 def pose_losses(
-    models: ObjectModels, views: ObservedViews, guess: SceneParameters, number: int, poses: Pose
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
 ) -> Float[np.ndarray, "K"]:
     """Loss of a scene with one object in K poses."""
-    batch = guess.perturbed(np.zeros((len(poses.position), guess.size)))
+    batch = params.perturbed(np.zeros((len(poses.position), params.size)))
     positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
     positions[:, number], quaternions[:, number] = poses.position, poses.quaternion
     return photometric_loss(residuals(models, views, replace(batch, positions=positions, quaternions=quaternions)))

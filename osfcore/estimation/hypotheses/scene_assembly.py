@@ -49,29 +49,29 @@ def assemble_scene(
 
 
 def reassign_poses(
-    models: ObjectModels, views: ObservedViews, guess: SceneParameters, matches: list[TemplateMatches]
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, matches: list[TemplateMatches]
 ) -> SceneParameters:
     """In turn each object at the match that explains whole images better than its pose does; the same if none."""
     for n, found in enumerate(matches):
-        guess, _ = best_placement(models, views, guess, n, found)
-    return guess
+        params, _ = best_placement(models, views, params, n, found)
+    return params
 
 
 def best_placement(
-    models: ObjectModels, views: ObservedViews, guess: SceneParameters, n: int, found: TemplateMatches
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
 ) -> tuple[SceneParameters, float]:
     """The guess with an object where the image is explained best, where it is or at a match; and the loss."""
-    own, losses = loss_of(models, views, guess), _losses(models, views, guess, n, found)
+    own, losses = loss_of(models, views, params), _losses(models, views, params, n, found)
     if losses.min(initial=np.inf) >= own:
-        return guess, own
-    return with_pose(guess, n, found.pose(int(losses.argmin()))), float(losses.min())
+        return params, own
+    return with_pose(params, n, found.pose(int(losses.argmin()))), float(losses.min())
 
 
 def _losses(
-    models: ObjectModels, views: ObservedViews, guess: SceneParameters, n: int, found: TemplateMatches
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
 ) -> Float[np.ndarray, "K"]:
     """Loss of the guess with an object at each of its matches."""
-    return pose_losses(models, views, guess, n, found.poses) if len(found.scores) else np.zeros(0)
+    return pose_losses(models, views, params, n, found.poses) if len(found.scores) else np.zeros(0)
 
 
 def count_of_scenes(objects: int) -> int:
@@ -79,11 +79,11 @@ def count_of_scenes(objects: int) -> int:
     return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
 
 
-def without_objects(guess: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
+def without_objects(params: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
     """The guess with some objects away."""
     for n in numbers:
-        guess = with_pose(guess, n, OUT_OF_VIEW)
-    return guess
+        params = with_pose(params, n, OUT_OF_VIEW)
+    return params
 
 
 class _SceneAssembly:
@@ -97,29 +97,29 @@ class _SceneAssembly:
         scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
         for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
             found: list[tuple[SceneParameters, float]] = []
-            for guess in scenes[:kept]:
-                found.append(self._alternated(guess, views))
+            for params in scenes[:kept]:
+                found.append(self._alternated(params, views))
                 found.sort(key=lambda pair: pair[1])
                 yield found[0]
-            scenes = [guess for guess, _ in found]
-        guess, loss = found[0]
+            scenes = [params for params, _ in found]
+        params, loss = found[0]
         for pair in combinations(range(len(self._sightings)), 2):
-            guess, loss = self._replaced(guess, loss, pair)
-            yield guess, loss
-        yield self._alternated(guess, self._coarse)
+            params, loss = self._replaced(params, loss, pair)
+            yield params, loss
+        yield self._alternated(params, self._coarse)
 
-    def _alternated(self, guess: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
+    def _alternated(self, params: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
         """In turn each object at its best match, and the light."""
         for n, found in enumerate(self._sightings):
-            guess, _ = best_placement(self._models, views, guess, n, found)
-        guess = replace(guess, light=search_light(self._models, self._rough, views, guess))
-        return guess, loss_of(self._models, views, guess)
+            params, _ = best_placement(self._models, views, params, n, found)
+        params = replace(params, light=search_light(self._models, self._rough, views, params))
+        return params, loss_of(self._models, views, params)
 
-    def _replaced(self, guess: SceneParameters, loss: float, pair: tuple[int, int]) -> tuple[SceneParameters, float]:
+    def _replaced(self, params: SceneParameters, loss: float, pair: tuple[int, int]) -> tuple[SceneParameters, float]:
         """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
-        best, least = guess, loss
+        best, least = params, loss
         first, second = pair
-        rest = without_objects(guess, pair)
+        rest = without_objects(params, pair)
         others = self._sightings[second]
         others = others.subset(self._ranking(rest, second)[:_SECOND])
         for k in self._best_places(rest, first):
@@ -129,15 +129,15 @@ class _SceneAssembly:
                 best, least = both, loss
         return best, least
 
-    def _best_places(self, guess: SceneParameters, n: int) -> list[int]:
+    def _best_places(self, params: SceneParameters, n: int) -> list[int]:
         """Numbers of the matches of an object that explain the image best, each in a place of its own."""
         positions, kept = self._sightings[n].positions, []
-        for k in self._ranking(guess, n).tolist():
+        for k in self._ranking(params, n).tolist():
             if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:
                 kept.append(k)
             if len(kept) == _PLACES:
                 break
         return kept
 
-    def _ranking(self, guess: SceneParameters, n: int) -> Int[np.ndarray, "K"]:
-        return np.argsort(_losses(self._models, self._coarse, guess, n, self._sightings[n]))
+    def _ranking(self, params: SceneParameters, n: int) -> Int[np.ndarray, "K"]:
+        return np.argsort(_losses(self._models, self._coarse, params, n, self._sightings[n]))

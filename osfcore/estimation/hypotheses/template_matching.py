@@ -72,9 +72,9 @@ def table_errors(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray
     return np.minimum((errors**2).sum(axis=-1), _MAX_TABLE_ERROR**2)
 
 
-def scene_errors(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> Float[np.ndarray, "h w"]:
+def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> Float[np.ndarray, "h w"]:
     """Squared error of the first view's pixels where a scene is thought to be known."""
-    rendered = models.together.render(guess.perturbed(np.zeros((1, guess.size))), views.cameras[:1], quality=QUALITY)
+    rendered = models.together.render(params.perturbed(np.zeros((1, params.size))), views.cameras[:1], quality=QUALITY)
     return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MAX_TABLE_ERROR**2)
 
 

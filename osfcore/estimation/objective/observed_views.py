@@ -106,14 +106,14 @@ def crop_to_masks(views: ObservedViews, number: int, *, margin: int = 3) -> Obje
 
 
 def crop_to_object(
-    views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int, *, reach: float = 0.0
+    views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int, *, reach: float = 0.0
 ) -> ObservedViews:
     """The windows around one object of a guess, and `reach` [m] more, without masks.
 
     Whole images where it shows in none of them.
     """
-    resting = models.resting(guess.names[number])
-    centre = guess.positions[number] + rotate(guess.quaternions[number], resting.centre)
+    resting = models.resting(params.names[number])
+    centre = params.positions[number] + rotate(params.quaternions[number], resting.centre)
     height, width = views.images.shape[1:3]
     boxes = []
     for view, camera in enumerate(views.cameras):
@@ -135,12 +135,12 @@ def crop_to_object(
 
 
 def crop_to_silhouette(
-    views: ObservedViews, models: ObjectModels, guess: SceneParameters, number: int
+    views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int
 ) -> ObservedViews:
     """The windows around one object of a guess, of which only pixels in or just beside its silhouette count."""
-    own = crop_to_object(views, models, guess, number)
-    alone = SceneBatch((guess.names[number],), guess.positions[None, [number]], guess.quaternions[None, [number]],
-                       guess.light[None], None)  # fmt: skip
+    own = crop_to_object(views, models, params, number)
+    alone = SceneBatch((params.names[number],), params.positions[None, [number]], params.quaternions[None, [number]],
+                       params.light[None], None)  # fmt: skip
     rendered = models.alone.render(alone, own.cameras, quality=QUALITY, outputs={"opacity"})
     assert rendered.opacity is not None
     silhouettes = (rendered.opacity[0, :, 0] > 0).astype(np.uint8)

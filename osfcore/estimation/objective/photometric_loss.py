@@ -30,6 +30,6 @@ def photometric_loss(errors: Float[np.ndarray, "B *pixels"]) -> Float[np.ndarray
     return np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER)).mean(axis=1, dtype=float)
 
 
-def loss_of(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
+def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
     """Photometric loss of one scene."""
-    return float(photometric_loss(residuals(models, views, guess.perturbed(np.zeros((1, guess.size)))))[0])
+    return float(photometric_loss(residuals(models, views, params.perturbed(np.zeros((1, params.size)))))[0])

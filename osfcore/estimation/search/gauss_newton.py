@@ -45,24 +45,24 @@ class GaussNewtonState:
     """The current iterate.
 
     Attributes:
-        guess: the best scene so far.
+        params: the best scene so far.
         losses: `photometric_loss` of each object's windows, and last that of the whole images if the light is searched.
         normals: Gauss-Newton's matrices of the summed losses, one for each object and one for the light; zero where
             nothing was searched [1 / unit^2].
         dampings: to go on with, one for each block.
     """
 
-    guess: SceneParameters
+    params: SceneParameters
     losses: Float[np.ndarray, "N+1"]
     normals: tuple[Float[np.ndarray, "P P"], ...]
     dampings: tuple[float, ...]
 
     @staticmethod
-    def at(guess: SceneParameters) -> GaussNewtonState:
+    def at(params: SceneParameters) -> GaussNewtonState:
         """Before the first iteration."""
-        count = len(guess.names)
+        count = len(params.names)
         normals = (*(np.zeros((POSE, POSE)) for _ in range(count)), np.zeros((LIGHT, LIGHT)))
-        return GaussNewtonState(guess, np.full(count + 1, np.inf), normals, (_FIRST_DAMPING,) * (count + 1))
+        return GaussNewtonState(params, np.full(count + 1, np.inf), normals, (_FIRST_DAMPING,) * (count + 1))
 
 
 def gauss_newton(
@@ -92,15 +92,15 @@ def gauss_newton(
         The iterate after each sweep.
     """
     at = start
-    moving = list(range(len(at.guess.names)) if objects is None else objects)
+    moving = list(range(len(at.params.names)) if objects is None else objects)
     before = np.inf
     for _ in range(iterations):
         for n in moving:
-            own = crop_to_silhouette(views, models, at.guess, n)
+            own = crop_to_silhouette(views, models, at.params, n)
             at = _damped_step(models, own, at, n, np.array([POSE * n + k for k in numbers]))
         if light is not None:
-            first = POSE * len(at.guess.names)
-            at = _damped_step(models, light, at, len(at.guess.names), np.arange(first, first + LIGHT))
+            first = POSE * len(at.params.names)
+            at = _damped_step(models, light, at, len(at.params.names), np.arange(first, first + LIGHT))
         yield at
         loss = float(at.losses[moving].sum())
         if until_settled and loss > _CONVERGED_RATIO * before:
@@ -112,43 +112,43 @@ def _damped_step(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, block: int, numbers: Int[np.ndarray, "n"]
 ) -> GaussNewtonState:
     """One damped step on some entries of the parameter vector (equation in the module's docstring)."""
-    guess, half = at.guess, difference_steps(len(at.guess.names))
-    probes = np.zeros((1 + 2 * len(numbers), guess.size))
+    params, half = at.params, difference_steps(len(at.params.names))
+    probes = np.zeros((1 + 2 * len(numbers), params.size))
     for row, number in enumerate(numbers):
         probes[1 + 2 * row, number], probes[2 + 2 * row, number] = half[number], -half[number]
-    errors = residuals(models, views, guess.perturbed(probes)).reshape(len(probes), -1)
+    errors = residuals(models, views, params.perturbed(probes)).reshape(len(probes), -1)
     jacobian = (errors[1::2] - errors[2::2]) / (2 * half[numbers, None].astype(np.float32))
     weights = np.minimum(1, HUBER / np.maximum(np.abs(errors[0]), _TINY))
     normal = ((jacobian * weights) @ jacobian.T).astype(float)
     gradient = jacobian @ (weights * errors[0])
     dampings = at.dampings[block] * _DAMPINGS
-    steps = np.zeros((len(dampings), guess.size))
+    steps = np.zeros((len(dampings), params.size))
     for row, (damping, scale) in enumerate(zip(dampings, _STEP_SCALES, strict=True)):
         damped = normal + np.diag(damping * np.diag(normal) + _TINY)
         steps[row, numbers] = -scale * np.linalg.solve(damped, gradient)
-    steps /= np.maximum(1, (np.abs(steps) / _max_step(len(guess.names))).max(axis=1, keepdims=True))
+    steps /= np.maximum(1, (np.abs(steps) / _max_step(len(params.names))).max(axis=1, keepdims=True))
     here = float(photometric_loss(errors[:1])[0])
-    losses = photometric_loss(residuals(models, views, guess.perturbed(steps)))
+    losses = photometric_loss(residuals(models, views, params.perturbed(steps)))
     best = int(np.argmin(losses))
     if losses[best] < here:
-        guess, here = guess.updated(steps[best]), float(losses[best])
+        params, here = params.updated(steps[best]), float(losses[best])
         damping = max(float(dampings[best]), _LEAST_DAMPING)
     else:
         damping = min(float(dampings[-1]), _MOST_DAMPING)
     whole = np.zeros_like(at.normals[block])
     own = numbers - POSE * block
     whole[np.ix_(own, own)] = normal
-    return _accept_step(at, guess, block, here, whole, damping)
+    return _accept_step(at, params, block, here, whole, damping)
 
 
 def _accept_step(
-    at: GaussNewtonState, guess: SceneParameters, block: int, loss: float, normal: np.ndarray, damping: float
+    at: GaussNewtonState, params: SceneParameters, block: int, loss: float, normal: np.ndarray, damping: float
 ) -> GaussNewtonState:
     losses = at.losses.copy()
     losses[block] = loss
     normals = (*at.normals[:block], normal, *at.normals[block + 1 :])
     dampings = (*at.dampings[:block], damping, *at.dampings[block + 1 :])
-    return GaussNewtonState(guess, losses, normals, dampings)
+    return GaussNewtonState(params, losses, normals, dampings)
 
 
 def difference_steps(count: int) -> Float[np.ndarray, "P"]:

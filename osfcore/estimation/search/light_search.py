@@ -27,7 +27,7 @@ _NEIGHBOUR_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], 
 
 
 def search_light(
-    models: ObjectModels, coarse: ObservedViews, fine: ObservedViews, guess: SceneParameters
+    models: ObjectModels, coarse: ObservedViews, fine: ObservedViews, params: SceneParameters
 ) -> Float[np.ndarray, "3"]:
     """Unit vector toward the light under which a rendering of the guessed poses fits the images best.
 
@@ -35,25 +35,25 @@ def search_light(
         models: fields.
         coarse: images to try the whole hemisphere on.
         fine: images to refine on.
-        guess: objects and pusher; its light plays no part.
+        params: objects and pusher; its light plays no part.
 
     Returns:
         The direction.
     """
     directions = hemisphere()
-    best = directions[np.argsort(_losses(models, coarse, guess, directions))[:_FIRST_SURVIVORS]]
+    best = directions[np.argsort(_losses(models, coarse, params, directions))[:_FIRST_SURVIVORS]]
     step = _FIRST_STEP_RAD
     for _ in range(_ROUNDS):
-        tried = np.concatenate([_neighbours(guess, light, step) for light in best])
-        best = tried[np.argsort(_losses(models, fine, guess, tried))[:_SURVIVORS]]
+        tried = np.concatenate([_neighbours(params, light, step) for light in best])
+        best = tried[np.argsort(_losses(models, fine, params, tried))[:_SURVIVORS]]
         step *= _SHRINKING
     return best[0]
 
 
-def light_loss_ratio(models: ObjectModels, views: ObservedViews, guess: SceneParameters) -> float:
+def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
     """Least loss on the grid over the hemisphere, divided by the loss under the guess's own light."""
-    directions = np.concatenate([guess.light[None], hemisphere()])
-    losses = _losses(models, views, guess, directions)
+    directions = np.concatenate([params.light[None], hemisphere()])
+    losses = _losses(models, views, params, directions)
     return float(losses[1:].min() / max(losses[0], 1e-12))
 
 
@@ -63,15 +63,15 @@ def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
     return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
 
 
-def _neighbours(guess: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
-    changes = np.zeros((len(_NEIGHBOUR_OFFSETS), guess.size))
+def _neighbours(params: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
+    changes = np.zeros((len(_NEIGHBOUR_OFFSETS), params.size))
     changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
-    return replace(guess, light=light).perturbed(changes).lights
+    return replace(params, light=light).perturbed(changes).lights
 
 
 def _losses(
-    models: ObjectModels, views: ObservedViews, guess: SceneParameters, lights: np.ndarray
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, lights: np.ndarray
 ) -> Float[np.ndarray, "B"]:
-    batch = replace(guess.perturbed(np.zeros((len(lights), guess.size))), lights=lights)
+    batch = replace(params.perturbed(np.zeros((len(lights), params.size))), lights=lights)
     rendered = models.together.render(batch, views.cameras, quality=QUALITY)
     return np.minimum(np.abs(rendered.rgb - views.images), _MAX_ERROR).mean(axis=(1, 2, 3, 4))

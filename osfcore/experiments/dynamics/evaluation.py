@@ -171,8 +171,8 @@ def _collect(config: EvaluateDynamics, entry: _Set, assets: AssetLibrary, execut
     if path.exists():
         return
     seed = _SEEDS + config.seed * 100 + COUNTS.index(entry.objects) * 2 + (entry.policy == "paper")
-    wanted = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)  # pyright: ignore[reportArgumentType]
-    for step in collect_pushes(wanted, assets, executor):
+    collection = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)  # pyright: ignore[reportArgumentType]
+    for step in collect_pushes(collection, assets, executor):
         yield step.note
 
 

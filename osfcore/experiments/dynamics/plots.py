@@ -46,8 +46,8 @@ def write_plots(folder: Path, report: DynamicsReport) -> None:
 def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool) -> Curve:
     values = []
     for horizon in HORIZONS:
-        found = np.concatenate([s.errors[who].of_moved(horizon, deg=deg) for s in scored])
-        values.append(np.median(found) if len(found) else np.nan)
+        errors = np.concatenate([s.errors[who].of_moved(horizon, deg=deg) for s in scored])
+        values.append(np.median(errors) if len(errors) else np.nan)
     return Curve(name, np.array(HORIZONS, float), np.array(values), dots=True)
 
 

@@ -16,7 +16,7 @@ from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.pusher_path import SUBSTEPS
 from osfcore.dynamics.recorded_states import is_on_table
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
-from osfcore.dynamics.unroll import unroll
+from osfcore.dynamics.substep import unroll
 from osfcore.experiments.rivals.quasistatic import push
 from osfcore.geometry.poses import rotate, rotation_angle
 from osfcore.io.push_file import PushEpisode

@@ -50,12 +50,12 @@ class VisualPrediction:
 
 
 def show_prediction(
-    wanted: VisualPrediction, renderer: SceneRenderer, assets: AssetLibrary | None
+    request: VisualPrediction, renderer: SceneRenderer, assets: AssetLibrary | None
 ) -> Iterator[Progress]:
     """Render each step through the fields and, where meshes are there, simulate and render it truly.
 
     Args:
-        wanted: what to show.
+        request: what to show.
         renderer: of all objects of the state.
         assets: meshes of all objects of the state; None to leave the simulator out.
 
@@ -63,48 +63,48 @@ def show_prediction(
         OverlappingObjects, InvalidInput: if the simulator cannot begin from the state.
         CannotWrite: if the disk refuses.
     """
-    states = predicted_states(wanted)
-    truth = None if assets is None else _simulated(wanted, assets)
-    columns, found = [], []
+    states = predicted_states(request)
+    truth = None if assets is None else _simulated(request, assets)
+    columns, psnrs = [], []
     for step, state in enumerate(states):
         yield Progress(step, len(states), f"Rendering step {step} of {len(states) - 1}")
-        ours = renderer.render(SceneBatch.of(state), (wanted.camera,), quality=_QUALITY).rgb[0, 0]
-        write_png(wanted.folder / f"{step:03d}.png", to_uint8(ours))
+        ours = renderer.render(SceneBatch.of(state), (request.camera,), quality=_QUALITY).rgb[0, 0]
+        write_png(request.folder / f"{step:03d}.png", to_uint8(ours))
         if truth is None:
             continue
         true = next(truth)
-        write_png(wanted.folder / f"{step:03d}_true.png", to_uint8(true))
-        found.append(round(psnr(true, ours), 3))
-        columns.append(Comparison(f"{step}: {found[-1]:.1f} dB", to_uint8(true), to_uint8(ours)))
+        write_png(request.folder / f"{step:03d}_true.png", to_uint8(true))
+        psnrs.append(round(psnr(true, ours), 3))
+        columns.append(Comparison(f"{step}: {psnrs[-1]:.1f} dB", to_uint8(true), to_uint8(ours)))
     if columns:
         stride = -(-len(columns) // _MOST_COLUMNS)
         sheet = contact_sheet(columns[::stride], per_row=_MOST_COLUMNS, truth="simulator")
-        write_png(wanted.folder / SHEET_FILE, sheet)
-        write_json(wanted.folder / PSNR_FILE, {"camera": wanted.camera.name, "psnr": found})
+        write_png(request.folder / SHEET_FILE, sheet)
+        write_json(request.folder / PSNR_FILE, {"camera": request.camera.name, "psnr": psnrs})
     yield Progress(len(states), len(states), "Everything is rendered")
 
 
-def predicted_states(wanted: VisualPrediction) -> tuple[SceneState, ...]:
+def predicted_states(request: VisualPrediction) -> tuple[SceneState, ...]:
     """The scene before the first and after each action."""
-    rollouts, k = wanted.rollouts, wanted.sequence
+    rollouts, k = request.rollouts, request.sequence
     return tuple(
         SceneState(
             rollouts.names,
             Pose(rollouts.positions[k, t], rollouts.quaternions[k, t]),
-            wanted.state.light,
+            request.state.light,
             rollouts.pusher[k, t],
         )
         for t in range(rollouts.positions.shape[1])
     )
 
 
-def _simulated(wanted: VisualPrediction, assets: AssetLibrary) -> Iterator[Float[np.ndarray, "h w 3"]]:
+def _simulated(request: VisualPrediction, assets: AssetLibrary) -> Iterator[Float[np.ndarray, "h w 3"]]:
     """What the camera would truly see."""
-    world = Tabletop(assets, cameras=(wanted.camera,))
+    world = Tabletop(assets, cameras=(request.camera,))
     try:
-        world.restore(wanted.state)
+        world.restore(request.state)
         yield world.observe().images[0]
-        for action in wanted.actions[wanted.sequence]:
+        for action in request.actions[request.sequence]:
             world.act(action)
             yield world.observe().images[0]
     finally:

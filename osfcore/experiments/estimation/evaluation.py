@@ -158,19 +158,19 @@ def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
     for key in ("first", "fixed_light", *(f"views_{views}" for views in VIEWS)):
         if key in kept:
             scores = [decode(FrameScore, result.figures["score"], "score") for result in kept[key]]
-            found = [frame_failure(f"task {n}", score, kept[key][n].shown) for n, score in enumerate(scores)]
-            write_gallery(folder / f"failures_{key}.png", found)
+            failures = [frame_failure(f"task {n}", score, kept[key][n].shown) for n, score in enumerate(scores)]
+            write_gallery(folder / f"failures_{key}.png", failures)
     if "track" in kept:
         tracks = [decode(TrackScore, result.figures["score"], "score") for result in kept["track"]]
-        found = [track_failure(f"task {n}", score, kept["track"][n].shown) for n, score in enumerate(tracks)]
-        write_gallery(folder / "failures_track.png", found)
+        failures = [track_failure(f"task {n}", score, kept["track"][n].shown) for n, score in enumerate(tracks)]
+        write_gallery(folder / "failures_track.png", failures)
     if "goal" in kept:
-        found = []
+        failures = []
         for n, result in enumerate(kept["goal"]):
             for m, (score, shown) in enumerate(zip(_goal_scores(result), result.shown, strict=True)):
-                found.append(frame_failure(f"task {n}, goal with {m + 1} moved", score, (shown,)))
-        write_gallery(folder / "failures_goal.png", found)
+                failures.append(frame_failure(f"task {n}, goal with {m + 1} moved", score, (shown,)))
+        write_gallery(folder / "failures_goal.png", failures)
     if "bad" in kept:
         bad = [decode(BadScore, result.figures["score"], "score") for result in kept["bad"]]
-        found = [bad_failure(f"bad case {n}", score, kept["bad"][n].shown) for n, score in enumerate(bad)]
-        write_gallery(folder / "failures_bad.png", found)
+        failures = [bad_failure(f"bad case {n}", score, kept["bad"][n].shown) for n, score in enumerate(bad)]
+        write_gallery(folder / "failures_bad.png", failures)

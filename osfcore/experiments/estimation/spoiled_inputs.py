@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from osfcore.experiments.estimation.tasks import Frame, first_frame, goals, opened, seen
+from osfcore.experiments.estimation.tasks import Frame, first_frame, goals, opened, take_frame
 from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
 from osfcore.geometry.cameras import SCENE_CENTRE, Camera, default_cameras, goal_camera
 from osfcore.geometry.light import Light
@@ -209,7 +209,7 @@ def _other_objects(scene: _Scene) -> BadCase:
     start, camera = scene.frame(), goal_camera(scene.cameras[0].width)
     other = replace(scene.draw, names=scene.others(), light=Light.random(scene.rng))
     with opened(other, scene.library) as world:
-        goal = seen(world, (camera,), masks=False, with_pusher=False)
+        goal = take_frame(world, (camera,), masks=False, with_pusher=False)
     shown = replace(goal.observation, names=scene.draw.names)
     return BadCase("goal of other objects", shown, goal.truth, start.observation)
 

@@ -86,7 +86,7 @@ def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) 
         NoRoom: if the objects do not fit side by side.
     """
     with opened(draw, library) as world:
-        return seen(world, cameras, masks=True)
+        return take_frame(world, cameras, masks=True)
 
 
 def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, steps: int = STEPS) -> Episode:
@@ -107,7 +107,7 @@ def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, s
                 frames = []
                 for state in states:
                     world.restore(state)
-                    frames.append(seen(world, cameras, masks=False))
+                    frames.append(take_frame(world, cameras, masks=False))
                 return Episode(tuple(frames), tuple(moved.tolist()), attempt)
     raise AssertionError("the last attempt returns")
 
@@ -120,7 +120,7 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
     Raises:
         UnknownName, MissingAssets, NoRoom: as for the first frame.
     """
-    found = []
+    goals = []
     with opened(draw, library) as world:
         start = world.truth()
         for count in range(1, len(draw.names) + 1):
@@ -131,8 +131,8 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
             moved = tuple(name for name in chosen if _moved(world, name, start.pose(name), rng))
             for _ in world.settle():
                 pass
-            found.append(Goal(seen(world, (camera,), masks=False, with_pusher=False), moved))
-    return tuple(found)
+            goals.append(Goal(take_frame(world, (camera,), masks=False, with_pusher=False), moved))
+    return tuple(goals)
 
 
 @contextmanager
@@ -152,7 +152,7 @@ def opened(draw: Draw, library: AssetLibrary) -> Iterator[Tabletop]:
         world.close()
 
 
-def seen(world: Tabletop, cameras: tuple[Camera, ...], *, masks: bool, with_pusher: bool = True) -> Frame:
+def take_frame(world: Tabletop, cameras: tuple[Camera, ...], *, masks: bool, with_pusher: bool = True) -> Frame:
     """The world as it is."""
     observation = world.render(cameras, masks=True, with_pusher=with_pusher)
     truth = world.truth() if with_pusher else replace(world.truth(), pusher=None)

@@ -19,8 +19,8 @@ import numpy as np
 
 from osfcore import control, dynamics, estimation, experiments, planning, render, world
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
-from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Stepped
-from osfcore.control.knowledge import knowledge_of
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Stepped
+from osfcore.control.scene_models import load_scene_models
 from osfcore.dynamics.push_models import network_path
 from osfcore.errors import MAX_SEED, InvalidInput, MissingAssets
 from osfcore.experiments.rearrangement.report import MpcReport, write_pictures
@@ -170,9 +170,9 @@ class _Runner:
         if kept is None:
             config = self._config
             task = self._task(number)
-            knowledge = knowledge_of(task.start.names, self._fields, self._assets, config.data_dir)
+            models = load_scene_models(task.start.names, self._fields, self._assets, config.data_dir)
             rng = np.random.default_rng([config.seed, number, 1])
-            ended = run_told_the_truth(task, self._assets, knowledge, self._told_truth, rng)
+            ended = run_told_the_truth(task, self._assets, models, self._told_truth, rng)
             kept = self._keep("oracle", number, task, ended, {})
         return kept
 
@@ -183,11 +183,11 @@ class _Runner:
         yield "preparing"
         task = self._task(number)
         config = self._config
-        knowledge = knowledge_of(task.start.names, self._fields, self._assets, config.data_dir)
+        models = load_scene_models(task.start.names, self._fields, self._assets, config.data_dir)
         settings = replace(config.settings, cost=config.cost)
         rng = np.random.default_rng([config.seed, number, 2])
         log, ended, began = _Log(task), None, time.perf_counter()
-        for event in run_from_images(task, self._assets, knowledge, settings, rng):
+        for event in run_from_images(task, self._assets, models, settings, rng):
             if isinstance(event, Ended):
                 ended = event
             elif (note := log.told(event)) is not None:
@@ -252,7 +252,7 @@ class _Log:
                     )
             case Noticed():
                 self.figures["noticed"].append([event.number, event.matter, event.text])
-            case Acted():
+            case ActionExecuted():
                 return f"action {event.number}"
             case Stepped():
                 for stage, seconds in event.seconds.items():

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import Event
-from osfcore.control.goal import GoalImage, alike
-from osfcore.control.knowledge import Knowledge
+from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
+from osfcore.control.scene_models import SceneModels
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.states import SceneState
 from osfcore.metrics.success import RearrangementTask
@@ -43,7 +43,7 @@ class Ended:
 def run_from_images(
     task: RearrangementTask,
     assets: AssetLibrary,
-    knowledge: Knowledge,
+    models: SceneModels,
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> Iterator[Event | Ended]:
@@ -52,7 +52,7 @@ def run_from_images(
     try:
         goal = _goal_image(world, task)
         world.restore(task.start)
-        yield from Episode(world, knowledge, goal, settings, rng).run()
+        yield from Episode(world, models, goal, settings, rng).run()
         yield _ended(world, goal)
     finally:
         world.close()
@@ -61,7 +61,7 @@ def run_from_images(
 def run_told_the_truth(
     task: RearrangementTask,
     assets: AssetLibrary,
-    knowledge: Knowledge,
+    models: SceneModels,
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> Ended:
@@ -70,7 +70,7 @@ def run_told_the_truth(
     try:
         image = _goal_image(world, task)
         world.restore(task.start)
-        _push_there(world, dynamics, task, knowledge, settings, rng)
+        _push_there(world, dynamics, task, models, settings, rng)
         return _ended(world, image)
     finally:
         dynamics.close()
@@ -81,15 +81,15 @@ def _push_there(
     world: Tabletop,
     dynamics: SimulatedPushes,
     task: RearrangementTask,
-    knowledge: Knowledge,
+    models: SceneModels,
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> None:
-    planner = MPPIPlanner(dynamics.rollout, PushProposals(knowledge.shapes), settings.plan)
+    planner = MPPIPlanner(dynamics.rollout, PushProposals(models.shapes), settings.plan)
     goal, number = _moved_goal(task), 0
     while number < settings.steps:
         state = world.truth()
-        goal = alike(goal, state, knowledge.symmetries)
+        goal = nearest_symmetric_goal(goal, state, models.symmetries)
         far, turned = offsets(goal, state)
         if far.max() <= settings.reached_m and turned.max() <= settings.reached_rad:
             return

@@ -247,8 +247,8 @@ def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> P
         frames=np.concatenate(frames) if config.images else None,
     )
     if config.disturb:
-        found = disturbed(episode, world.models, np.random.default_rng((config.seed, index, 2)), config.disturb)
-        episode = replace(episode, disturbed=found)
+        substeps = disturbed(episode, world.models, np.random.default_rng((config.seed, index, 2)), config.disturb)
+        episode = replace(episode, disturbed=substeps)
     save_episode(path, episode)
     return path
 

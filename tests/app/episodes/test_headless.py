@@ -9,7 +9,7 @@ from app.episodes.file_names import RECORDING_FILE, REPORT_FILE
 from app.episodes.headless import run_episode, stage_of
 from app.episodes.request import EpisodeOrder
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Observed, Planning, Stepped
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Observed, Planning, Stepped
 from osfcore.errors import CorruptFile, OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
@@ -48,13 +48,13 @@ def assert_closed(worlds):
 @pytest.fixture
 def told(monkeypatch, worlds):
     """An episode that knows the truth and goes nowhere."""
-    monkeypatch.setattr(run, "knowledge_of", lambda names, fields, assets, data_dir, device: (names, device))
+    monkeypatch.setattr(run, "load_scene_models", lambda names, fields, assets, data_dir, device: (names, device))
     asked = {}
 
     class Told:
-        def __init__(self, world, knowledge, goal, settings, rng):
+        def __init__(self, world, models, goal, settings, rng):
             self.world, self.goal = world, goal
-            asked.update(knowledge=knowledge, settings=settings, draws=rng.random(3).tolist())
+            asked.update(models=models, settings=settings, draws=rng.random(3).tolist())
 
         def run(self):
             state = self.world.truth()
@@ -66,7 +66,7 @@ def told(monkeypatch, worlds):
                 yield Looking(0, look, looked)
             yield GoalFound(PoseGoal(NAMES, state.poses), self.goal.image, self.goal.camera, None)
             yield Planning(0, None)
-            yield Acted(1, np.zeros(3))
+            yield ActionExecuted(1, np.zeros(3))
             yield Noticed(1, "lamp", "The lamp was moved.")
             yield Stepped(1, 2, estimate, np.zeros(1), np.zeros(1), 0.0, self.goal.image, {})
             yield Finished(1, "reached", "The table looks like the goal.", state)
@@ -108,7 +108,7 @@ def test_every_step_tells_what_is_being_done(order, told, worlds):
 def test_the_order_reaches_the_episode(order, told):
     list(run_episode(order))
     first = dict(told)
-    assert first["knowledge"] == (NAMES, "cpu")
+    assert first["models"] == (NAMES, "cpu")
     assert first["settings"] is order.settings
     list(run_episode(order))
     assert told["draws"] == first["draws"]
@@ -116,7 +116,7 @@ def test_the_order_reaches_the_episode(order, told):
 
 def test_who_stops_asking_ends_it(order, told, worlds):
     with contextlib.closing(run_episode(order)) as steps:
-        while not isinstance(next(steps).event, Acted):
+        while not isinstance(next(steps).event, ActionExecuted):
             pass
         assert worlds[0].truth().names == NAMES
     assert_closed(worlds)
@@ -130,7 +130,7 @@ def test_every_part_of_the_loop_has_a_name():
         assert stage_of(Looking(0, look, looked)) == look
     stepped = Stepped(0, 3, None, np.zeros(0), np.zeros(0), 0.0, np.zeros((4, 4, 3)), {})
     assert stage_of(stepped) == stage_of(Planning(0, None)) == "plan"  # what comes next is planned
-    assert stage_of(Acted(1, np.zeros(3))) == "act"
+    assert stage_of(ActionExecuted(1, np.zeros(3))) == "act"
     for event in (Noticed(1, "lamp", "It was moved."), Finished(1, "reached", "Done.", None), Observed(0, None)):
         assert stage_of(event) is None
 
@@ -139,7 +139,7 @@ def test_what_cannot_be_known_leaves_no_world_behind(order, worlds, monkeypatch)
     def broken(*_):
         raise CorruptFile("table.safetensors", "it is broken")
 
-    monkeypatch.setattr(run, "knowledge_of", broken)
+    monkeypatch.setattr(run, "load_scene_models", broken)
     with pytest.raises(CorruptFile):
         list(run_episode(order))
     assert_closed(worlds)

@@ -12,7 +12,7 @@ from app.episodes.frames import HEIGHT, WIDTH, part_of, read_frame
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import SimulatedTable
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Acted, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.errors import CannotWrite
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
@@ -59,7 +59,7 @@ class Told:
 
     def act(self, record, number):
         self.world.act(ACTION)
-        record.take(Acted(number, ACTION))
+        record.take(ActionExecuted(number, ACTION))
 
     def step(self, record, number, seconds):
         estimate = sure(shifted(self.world.truth(), BOX, 0.003))

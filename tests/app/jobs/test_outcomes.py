@@ -2,7 +2,7 @@ import pytest
 
 from app.jobs.job import Job
 from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped, after
-from app.processes.job_messages import JobCancelled
+from app.processes.messages.job_messages import JobCancelled
 from osfcore.errors import OsfError
 
 REFUSED = OsfError("It is too large.")

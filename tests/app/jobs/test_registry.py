@@ -10,8 +10,16 @@ from app.jobs.clock import JobClock
 from app.jobs.job import JobView
 from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped
 from app.jobs.registry import Jobs, QueueFull, WrongJobState
-from app.processes.job_messages import CancelJob, JobCancelled, JobRests, JobStep, PauseJob, SceneCommand, StepJob
-from app.processes.scene_messages import TakeImage
+from app.processes.messages.job_messages import (
+    CancelJob,
+    JobCancelled,
+    JobRests,
+    JobStep,
+    PauseJob,
+    SceneCommand,
+    StepJob,
+)
+from app.processes.messages.scene_messages import TakeImage
 from app.storage.database import CannotStore, Store
 from app.storage.field_files import workshop
 from osfcore.errors import UnknownName

@@ -7,7 +7,7 @@ import pytest
 from app.jobs.context import JobContext, JobControl
 from app.jobs.worker import KINDS, job_main, run_job
 from app.processes.child_process import launch
-from app.processes.job_messages import (
+from app.processes.messages.job_messages import (
     CancelJob,
     ChangeJob,
     JobCancelled,
@@ -19,10 +19,10 @@ from app.processes.job_messages import (
     SceneCommand,
     StepJob,
 )
+from app.processes.messages.scene_messages import TakeImage
 from app.processes.process_client import ProcessClient
 from app.processes.process_server import Answer, InternalError, child_main
 from app.processes.request_queue import Request
-from app.processes.scene_messages import TakeImage
 from osfcore.errors import UnknownName
 from tests.app.conftest import until
 

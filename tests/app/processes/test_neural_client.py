@@ -5,7 +5,7 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from app.processes.neural_messages import DrawnView, DrawView, Predicted, PredictPushes
+from app.processes.messages.neural_messages import DrawnView, DrawView, Predicted, PredictPushes
 from app.processes.predict_process import predictor_main
 from app.processes.process_client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessHangs, ProcessUnavailable
 from app.processes.process_server import InternalError

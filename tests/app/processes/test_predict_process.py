@@ -3,7 +3,7 @@ import shutil
 import numpy as np
 import pytest
 
-from app.processes.neural_messages import DrawView, Predicted, PredictPushes
+from app.processes.messages.neural_messages import DrawView, Predicted, PredictPushes
 from app.processes.predict_process import PushPredictor
 from osfcore.dynamics import push_models
 from osfcore.dynamics.rollout import PushModel

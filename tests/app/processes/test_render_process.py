@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.processes.neural_messages import CompareView, DrawView
+from app.processes.messages.neural_messages import CompareView, DrawView
 from app.processes.render_cameras import view_camera
 from app.processes.render_process import NeuralRenderer
 from osfcore.errors import CorruptFile, UnknownName

@@ -1,6 +1,6 @@
 import threading
 
-from app.processes.neural_messages import CompareView, DrawView
+from app.processes.messages.neural_messages import CompareView, DrawView
 from app.processes.request_queue import Request, RequestQueue
 
 

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.processes.process_server import Answer, ProcessServer, Ready
-from app.processes.request_queue import Request
-from app.processes.scene_messages import (
+from app.processes.messages.scene_messages import (
     Act,
     ComposedGoal,
     ComposeGoal,
@@ -28,6 +26,8 @@ from app.processes.scene_messages import (
     TakeView,
     WatchFrames,
 )
+from app.processes.process_server import Answer, ProcessServer, Ready
+from app.processes.request_queue import Request
 from app.processes.sim_process import Simulation
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera

@@ -11,7 +11,7 @@ import pytest
 import app.jobs.registry as jobs_module
 from app.jobs.job import Job
 from app.jobs.kinds.estimates import STATE
-from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, examine
+from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, errors_of, examine
 from app.services.fields import FieldCatalogue, MissingFields
 from app.storage.database import now_utc
 from app.storage.uploads import UploadRefused
@@ -19,7 +19,7 @@ from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.observation_file import read_observation, write_observation
 from osfcore.io.state_file import write_estimated
@@ -308,3 +308,32 @@ def test_a_result_that_was_damaged_is_told(estimates, runner):
     (runner.jobs.folder(done.id) / STATE).write_text("{}")
     with pytest.raises(CorruptFile, match=STATE):
         estimates.result(done)
+
+
+BOX, BOWL = "003_cracker_box", "024_bowl"
+QUARTER = np.array([0.5**0.5, 0, 0, 0.5**0.5])  # about z
+
+
+def state(positions, quaternions, light):
+    return SceneState((BOX, BOWL), Pose(np.array(positions), np.array(quaternions)), Light(np.array(light)), None)
+
+
+def test_errors_are_told_in_units_for_people_and_what_looks_alike_is_no_error(library):
+    lying = [[0.1, 0.2, 0.3], [0.0, 0.1, 0.0]]
+    truth = state(lying, [QUARTER, QUARTER], [0, 0, 1.0])
+    turned = [quaternion_multiply(QUARTER, QUARTER)] * 2
+    found = state(lying + np.array([[0.003, 0.004, 0], [0, 0, 0.001]]), turned, [1.0, 0, 1.0])
+    told = errors_of(found, truth, library)
+    assert [error["name"] for error in told["objects"]] == [BOX, BOWL]
+    assert [error["position_mm"] for error in told["objects"]] == pytest.approx([5, 1])
+    assert told["objects"][0]["rotation_deg"] == pytest.approx(90)
+    assert told["objects"][1]["rotation_deg"] == pytest.approx(0, abs=1e-4)  # bowls turn freely
+    assert told["light_deg"] == pytest.approx(45)
+
+
+def test_objects_are_compared_by_name(library):
+    truth = state([[0.1, 0, 0], [0, 0.1, 0]], [QUARTER, QUARTER], [0, 0, 1.0])
+    swapped = SceneState((BOWL, BOX), truth.poses[[1, 0]], truth.light, None)
+    told = errors_of(swapped, truth, library)
+    assert [error["position_mm"] for error in told["objects"]] == pytest.approx([0, 0])
+    assert told["light_deg"] == pytest.approx(0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.processes.messages.scene_messages import ComposedGoal
 from app.processes.process_client import ProcessUnavailable
 from app.processes.process_server import InternalError
-from app.processes.scene_messages import ComposedGoal
 from app.services.event_hub import Hub
 from app.services.goals import GOAL_SIDE, Draft, DraftChanged, DraftUnsound, Goals, GoalsChanged, NoDraft, NoTable
 from app.services.scenes import SceneHeld

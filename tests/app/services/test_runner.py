@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.jobs.job import JobChanged, TrainingAlready
-from app.processes.scene_messages import SceneChanged, TakeImage
+from app.processes.messages.scene_messages import SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
 from app.services.runner import Runner
 from app.services.scenes import SceneHeld, TooManyScenes

@@ -2,7 +2,7 @@ import asyncio
 
 import pytest
 
-from app.processes.scene_messages import TakeImage
+from app.processes.messages.scene_messages import TakeImage
 from app.services.scene_images import ImageCache, SceneImages
 from osfcore.errors import OsfError, UnknownName
 

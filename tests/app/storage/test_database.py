@@ -3,7 +3,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from app.processes.scene_messages import SceneRecord
+from app.processes.messages.scene_messages import SceneRecord
 from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, DataDirectoryInUse, Store
 from osfcore.errors import CorruptFile
 from osfcore.geometry.light import Light

@@ -3,7 +3,7 @@ import time
 import numpy as np
 import pytest
 
-from app.processes.scene_messages import FramesTaken, SceneChanged, SceneRecord
+from app.processes.messages.scene_messages import FramesTaken, SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
 from app.viewer.playback import Playback
 from osfcore.geometry.light import Light

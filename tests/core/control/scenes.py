@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from osfcore.control.knowledge import Knowledge
+from osfcore.control.scene_models import SceneModels
 from osfcore.dynamics.push_models import load_push_model, load_shapes
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.fields.field_library import FieldLibrary
@@ -17,12 +17,12 @@ GELATIN, CAN = NAMES = ("009_gelatin_box", "005_tomato_soup_can")
 LIGHT = Light.from_angles(0.8, 0.7)
 
 
-def knowledge() -> Knowledge:
+def models() -> SceneModels:
     """Of both objects."""
     fields = FieldLibrary(None)
-    models = ObjectModels({name: fields.load(name) for name in NAMES}, fields.load_table())
+    appearance = ObjectModels({name: fields.load(name) for name in NAMES}, fields.load_table())
     dynamics, shapes = load_push_model(None, fields, NAMES), load_shapes(None, fields, NAMES)
-    return Knowledge(models, dynamics, shapes, {name: Symmetry("none") for name in NAMES})
+    return SceneModels(appearance, dynamics, shapes, {name: Symmetry("none") for name in NAMES})
 
 
 def table(library) -> Tabletop:

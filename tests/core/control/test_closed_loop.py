@@ -7,7 +7,7 @@ import pytest
 from osfcore.control import closed_loop as module
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Acted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
 from osfcore.estimation.steps import EstimateStep
@@ -17,10 +17,10 @@ from osfcore.geometry.poses import Pose
 from osfcore.planning.mppi import PlanSettings
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.progress import Progress
-from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, knowledge, sure, table
+from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, models, sure, table
 
 SMALL = EpisodeSettings(steps=12, plan=PlanSettings(samples=48, horizon=10))
-KNOWN = knowledge()
+KNOWN = models()
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_the_table_becomes_what_was_asked_for(world, told):
     left = np.linalg.norm(goal.offsets_m(world.truth()), axis=1)
     assert left.max() < 0.02
     assert isinstance(events[-1], Finished)
-    acted = [event.number for event in events if isinstance(event, Acted)]
+    acted = [event.number for event in events if isinstance(event, ActionExecuted)]
     assert acted == list(range(1, events[-1].number + 1))
     steps = [event for event in events if isinstance(event, Stepped)]
     assert [step.number for step in steps] == [0, *acted]
@@ -82,7 +82,7 @@ def test_the_table_becomes_what_was_asked_for(world, told):
 def test_a_goal_that_is_met_ends_at_once(world, told):
     *_, last = events = list(begun(world, shifted(world)).run())
     assert (last.outcome, last.number) == ("reached", 0)
-    assert not any(isinstance(event, (Planning, Acted)) for event in events)
+    assert not any(isinstance(event, (Planning, ActionExecuted)) for event in events)
 
 
 @pytest.mark.parametrize("despite", [False, True])
@@ -92,13 +92,13 @@ def test_a_goal_image_that_is_not_explained_moves_nothing_unless_told_to(world, 
     found = sure(state, ("it differs", ""))
     step = EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=found)
     monkeypatch.setattr(module, "estimate_goal", lambda *_: iter([step]))
-    monkeypatch.setattr(module, "unmoved", lambda _models, _goal, found, _now: found)
+    monkeypatch.setattr(module, "prefer_current_poses", lambda _models, _goal, found, _now: found)
     image = GoalImage(goal_camera(), np.zeros((128, 128, 3), np.float32))
     settings = replace(SMALL, steps=1, despite_doubts=despite)
     *_, last = events = list(begun(world, image, settings).run())
     assert any(isinstance(event, Noticed) and event.matter == "goal" for event in events)
     assert last.outcome == ("out of steps" if despite else "refused")
-    assert any(isinstance(event, Acted) for event in events) == despite
+    assert any(isinstance(event, ActionExecuted) for event in events) == despite
 
 
 def test_objects_of_another_scene_are_refused_before_anything_moves(world, told):
@@ -118,7 +118,7 @@ def test_without_acting_plans_are_shown_and_nothing_moves(world, told):
             break
     events.close()
     assert sum(isinstance(event, Planning) for event in seen) == 4
-    assert not any(isinstance(event, Acted) for event in seen)
+    assert not any(isinstance(event, ActionExecuted) for event in seen)
     np.testing.assert_array_equal(world.truth().poses.position, before.poses.position)
 
 
@@ -128,7 +128,7 @@ def test_without_planning_the_last_plan_is_followed_to_its_end(world, told):
     for event in episode.run():
         if isinstance(event, Planning):
             plans.append(event.round.actions)
-        if isinstance(event, Acted):
+        if isinstance(event, ActionExecuted):
             actions.append(event.action)
             episode.settings = replace(episode.settings, planning=False)
     assert len(plans) == 2
@@ -138,14 +138,14 @@ def test_without_planning_the_last_plan_is_followed_to_its_end(world, told):
 def test_a_plan_serves_for_as_many_actions_as_asked(world, told):
     events = list(begun(world, toward_middle(world, length=0.15), replace(SMALL, steps=5, replan_every=2)).run())
     assert sum(isinstance(event, Planning) for event in events) == 2 * 3
-    assert sum(isinstance(event, Acted) for event in events) == 5
+    assert sum(isinstance(event, ActionExecuted) for event in events) == 5
 
 
 @pytest.mark.slow
 def test_settings_count_from_the_next_step_on(world, told):
     episode = begun(world, toward_middle(world, length=0.15))
     for event in episode.run():
-        if isinstance(event, Acted) and event.number == 2:
+        if isinstance(event, ActionExecuted) and event.number == 2:
             episode.settings = replace(episode.settings, steps=3)
     assert event.number == 3
 
@@ -159,7 +159,7 @@ def test_nothing_coming_nearer_is_noticed(world, told):
 def test_a_lamp_and_an_object_moved_by_hand_are_noticed(world, told):
     goal, notices = toward_middle(world), []
     for event in begun(world, goal, replace(SMALL, steps=2, planning=False)).run():
-        if isinstance(event, Acted) and event.number == 1:
+        if isinstance(event, ActionExecuted) and event.number == 1:
             world.set_light(Light.from_angles(LIGHT.direction[0] + 2.0, 0.6))
             truth = world.truth()
             far = max(NAMES, key=lambda name: np.linalg.norm((truth.pose(name).position - truth.pusher)[:2]))
@@ -180,7 +180,7 @@ def test_what_stays_doubtful_is_looked_for_once_the_pusher_made_room(world, told
     matters = [event.matter for event in seen if isinstance(event, Noticed)]
     assert matters[:2] == ["lost", "found"]
     assert looks.count("search") == 1
-    retreat = [event.action for event in seen if isinstance(event, Acted) and np.any(event.action)]
+    retreat = [event.action for event in seen if isinstance(event, ActionExecuted) and np.any(event.action)]
     assert len(retreat) == 2
 
 
@@ -197,9 +197,9 @@ def test_by_real_eyes_a_lamp_and_an_object_moved_by_hand_are_survived(world):
     light = Light.from_angles(-1.8, 0.8)
     last = None
     for event in begun(world, goal, replace(SMALL, steps=3, planning=False), start=start).run():
-        if isinstance(event, Acted) and event.number == 1:
+        if isinstance(event, ActionExecuted) and event.number == 1:
             world.set_light(light)
-        if isinstance(event, Acted) and event.number == 2:
+        if isinstance(event, ActionExecuted) and event.number == 2:
             pose = world.truth().pose(CAN)
             world.move_object(CAN, Pose(pose.position + [0.03, 0.02, 0.0], pose.quaternion))
         last = event if isinstance(event, Stepped) else last

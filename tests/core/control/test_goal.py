@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.control.goal import GoalImage, alike, settled, unmoved
+from osfcore.control.goal import GoalImage, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
@@ -13,7 +13,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, ro
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset import Symmetry
 from osfcore.planning.pose_cost import PoseGoal
-from tests.core.control.scenes import CAN, GELATIN, knowledge, sure, table
+from tests.core.control.scenes import CAN, GELATIN, models, sure, table
 
 ABOUT_Z = np.array([0.0, 0.0, 1.0])
 NONE = Symmetry("none")
@@ -35,7 +35,7 @@ def goal_of(state: SceneState) -> PoseGoal:
 
 def turn_left(symmetry: Symmetry, goal_yaw: float, yaw: float) -> float:
     state = state_of(yaw)
-    goal = alike(goal_of(state_of(goal_yaw)), state, {"a": symmetry})
+    goal = nearest_symmetric_goal(goal_of(state_of(goal_yaw)), state, {"a": symmetry})
     return float(rotation_angle(goal.pose("a").quaternion, state.pose("a").quaternion))
 
 
@@ -52,7 +52,7 @@ def test_a_body_of_revolution_keeps_the_tilt_of_its_axis(axis, other):
     state = state_of(0.0)
     here, there = quaternion_exp(np.array(axis)), quaternion_exp(np.array(other))
     state = replace(state, poses=Pose(state.poses.position, here[None]))
-    goal = alike(PoseGoal(("a",), Pose(state.poses.position, there[None])), state, {"a": ROUND})
+    goal = nearest_symmetric_goal(PoseGoal(("a",), Pose(state.poses.position, there[None])), state, {"a": ROUND})
     found = goal.pose("a").quaternion
     np.testing.assert_allclose(rotate(found, ABOUT_Z), rotate(there, ABOUT_Z), atol=1e-7)
     for turn in np.linspace(0, 2 * np.pi, 13):
@@ -64,7 +64,7 @@ def test_what_is_there_but_for_the_errors_of_estimates_stays_exactly_where_it_is
     state = state_of(0.0, 1.0, 2.0)
     wanted = state_of(0.05, 1.0, 2.4)
     wanted.poses.position[1, 1] = 0.08
-    goal = settled(goal_of(wanted), state, {})
+    goal = snap_near_goals(goal_of(wanted), state, {})
     np.testing.assert_array_equal(goal.pose("a").quaternion, state.pose("a").quaternion)
     np.testing.assert_array_equal(goal.pose("b").position, wanted.pose("b").position)
     np.testing.assert_array_equal(goal.pose("c").quaternion, wanted.pose("c").quaternion)
@@ -93,7 +93,7 @@ def test_an_object_stays_unless_the_goal_image_shows_that_it_moved(library):
     image = GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
     world.close()
     now = replace(start, poses=Pose(away + [[0.05, 0, 0], [0.12, 0, 0]], start.poses.quaternion))
-    found = unmoved(knowledge().models, image, sure(seen, ("it is hardly visible", "")), now)
+    found = prefer_current_poses(models().appearance, image, sure(seen, ("it is hardly visible", "")), now)
     np.testing.assert_array_equal(found.state.pose(GELATIN).position, now.pose(GELATIN).position)
     np.testing.assert_array_equal(found.state.pose(CAN).position, seen.pose(CAN).position)
     assert found.trusted

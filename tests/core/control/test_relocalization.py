@@ -5,7 +5,7 @@ import pytest
 
 from osfcore.control.relocalization import relocalize
 from osfcore.geometry.poses import Pose
-from tests.core.control.scenes import CAN, GELATIN, knowledge, sure, table
+from tests.core.control.scenes import CAN, GELATIN, models, sure, table
 
 
 @pytest.mark.slow
@@ -16,7 +16,7 @@ def test_what_is_lost_is_found_anywhere_on_the_table(library):
     position = truth.poses.position.copy()
     position[0, :2] += [0.15, -0.1] if position[0, 0] < 0 else [-0.15, 0.1]
     last = sure(replace(truth, poses=Pose(position, truth.poses.quaternion)), ("it was lost", ""))
-    *before, step = relocalize(knowledge().models, observation, last, np.random.default_rng(0))
+    *before, step = relocalize(models().appearance, observation, last, np.random.default_rng(0))
     assert all(one.estimate is None for one in before)
     found = step.estimate
     assert found.trusted

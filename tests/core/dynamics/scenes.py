@@ -9,7 +9,7 @@ from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes.object_shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
-from osfcore.dynamics.unroll import unroll
+from osfcore.dynamics.substep import unroll
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.states import SceneState

@@ -34,11 +34,11 @@ def test_sizes_are_as_stated(example):
     assert example.receiver.shape == (5,)
     assert example.sender.shape == (4,)
     assert example.frame.shape == (3, 3, 3)
-    assert example.guess.shape == (3, 3)
+    assert example.quasistatic.shape == (3, 3)
 
 
 def test_numbers_are_of_the_order_of_one(example):
-    for part in (example.nodes, example.edges, example.guess):
+    for part in (example.nodes, example.edges, example.quasistatic):
         assert torch.isfinite(part).all()
         assert part.abs().max() < 10
 
@@ -54,7 +54,7 @@ def test_a_pushed_object_looks_along_its_push(shapes, table):
     """Its frame's x is the contact's normal, and the guess moves it that way."""
     found = seen(table, shapes, scene(shapes, {CAN: (0.0, 0.055)}), (0.0, 0.3))
     torch.testing.assert_close(found.frame[0, 0], torch.tensor([0.0, 1.0, 0.0]), atol=0.1, rtol=0)
-    assert found.guess[0, 0] > 0
+    assert found.quasistatic[0, 0] > 0
     assert found.edges[0, 0] == 1
 
 
@@ -71,7 +71,7 @@ def test_a_scene_turned_and_shifted_gives_the_same_numbers(shapes, table, angle,
     assert torch.equal(here.sender, there.sender)
     torch.testing.assert_close(here.nodes, there.nodes, atol=1e-3, rtol=0)
     torch.testing.assert_close(here.edges, there.edges, atol=2e-3, rtol=0)
-    torch.testing.assert_close(here.guess, there.guess, atol=1e-4, rtol=0)
+    torch.testing.assert_close(here.quasistatic, there.quasistatic, atol=1e-4, rtol=0)
     torch.testing.assert_close(
         here.frame @ torch.as_tensor(turn.T, dtype=torch.float32), there.frame, atol=1e-4, rtol=0
     )
@@ -133,8 +133,8 @@ def test_a_mirrored_scene_gives_mirrored_numbers():
     nodes, edges = (torch.ones(len(part), dtype=torch.bool) for part in (original.nodes, original.edges))
     torch.testing.assert_close(mirrored(original.nodes, nodes, "node"), reflected.nodes, atol=1e-4, rtol=0)
     torch.testing.assert_close(mirrored(original.edges, edges, "edge"), reflected.edges, atol=1e-3, rtol=0)
-    slide = original.guess * torch.tensor([1.0, -1, -1])
-    torch.testing.assert_close(slide, reflected.guess, atol=1e-4, rtol=0)
+    slide = original.quasistatic * torch.tensor([1.0, -1, -1])
+    torch.testing.assert_close(slide, reflected.quasistatic, atol=1e-4, rtol=0)
 
 
 def test_motion_is_told_in_units(shapes, table):
@@ -147,4 +147,4 @@ def test_motion_is_told_in_units(shapes, table):
 def test_an_object_alone_that_moves_has_no_edges(shapes, table):
     found = seen(table, shapes, scene(shapes, {CAN: (0.2, 0.0)}), (0.0, 0.0), [[0.004, 0.0, 0.0]])
     assert found.edges.shape == (0, EDGE_FEATURES)
-    assert torch.equal(found.guess, torch.zeros(1, 3))
+    assert torch.equal(found.quasistatic, torch.zeros(1, 3))

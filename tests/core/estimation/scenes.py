@@ -45,14 +45,14 @@ def observe(models, state, cameras, *, masks=True) -> Observation:
     )  # fmt: skip
 
 
-def own_views(models, guess, cameras, quality=QUALITY) -> ObservedViews:
+def own_views(models, params, cameras, quality=QUALITY) -> ObservedViews:
     """Views that the guess explains to the last bit."""
-    batch = guess.perturbed(np.zeros((1, guess.size)))
+    batch = params.perturbed(np.zeros((1, params.size)))
     rendered = models.together.render(batch, cameras, quality=quality, outputs={"rgb", "opacity"})
-    return ObservedViews(tuple(cameras), rendered.rgb[0], rendered.opacity[0], guess.pusher, quality)
+    return ObservedViews(tuple(cameras), rendered.rgb[0], rendered.opacity[0], params.pusher, quality)
 
 
-def guess_of(state) -> SceneParameters:
+def params_of(state) -> SceneParameters:
     return SceneParameters.of(state, state.pusher)
 
 

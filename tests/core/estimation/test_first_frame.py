@@ -57,7 +57,7 @@ def test_the_stages_are_those_of_the_method(steps):
     stages = [step.stage for step in steps]
     assert tuple(s for k, s in enumerate(stages) if k == 0 or stages[k - 1] != s) == STAGES
     for step in steps:
-        assert step.guess.names == (BOX, BOTTLE)
+        assert step.state.names == (BOX, BOTTLE)
         assert len(step.losses) in (0, 1, 2)
     objects = next(step for step in steps if step.stage == "objects")
     assert objects.candidates.position.shape == (12, 2, 3)
@@ -74,9 +74,9 @@ def test_the_same_seed_gives_the_same_estimate(models, truth):
     steps, again = steps_of(models, seen, LEAST), steps_of(models, seen, LEAST)
     assert len(again) == len(steps)
     for a, b in zip(steps, again, strict=True):
-        np.testing.assert_array_equal(a.guess.poses.position, b.guess.poses.position)
-        np.testing.assert_array_equal(a.guess.poses.quaternion, b.guess.poses.quaternion)
-        np.testing.assert_array_equal(a.guess.light.direction, b.guess.light.direction)
+        np.testing.assert_array_equal(a.state.poses.position, b.state.poses.position)
+        np.testing.assert_array_equal(a.state.poses.quaternion, b.state.poses.quaternion)
+        np.testing.assert_array_equal(a.state.light.direction, b.state.light.direction)
     np.testing.assert_array_equal(again[-1].estimate.position_std, steps[-1].estimate.position_std)
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
@@ -97,7 +97,7 @@ def test_a_light_held_overhead_stays_there(models):
     state = scene({BOX: lying(models, BOX, 30, 0.0, -0.03)}, (0, 0, 1.0))
     steps = steps_of(models, observe(models, state, default_cameras(64)[:2]), replace(QUICK, light="overhead"))
     for step in steps:
-        np.testing.assert_allclose(step.guess.light.direction, [0, 0, 1], atol=1e-12)
+        np.testing.assert_allclose(step.state.light.direction, [0, 0, 1], atol=1e-12)
     estimate = steps[-1].estimate
     assert estimate.light_std == 0
     assert apart(estimate.state, state)[0][0] < 0.005

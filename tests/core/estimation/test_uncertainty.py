@@ -8,7 +8,7 @@ from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParam
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
 from osfcore.estimation.uncertainty import FitQuality, estimate_with_uncertainty, evaluate_fit, object_residuals
 from osfcore.geometry.cameras import default_cameras
-from tests.core.estimation.scenes import BOX, guess_of, own_views
+from tests.core.estimation.scenes import BOX, own_views, params_of
 
 FINE = replace(QUALITY, samples_per_side=2)
 
@@ -21,7 +21,7 @@ def views(models, truth, seen):
 
 @pytest.fixture(scope="module")
 def end(models, truth, views):
-    return list(gauss_newton(models, views, GaussNewtonState.at(guess_of(truth)), iterations=1, light=views))[-1]
+    return list(gauss_newton(models, views, GaussNewtonState.at(params_of(truth)), iterations=1, light=views))[-1]
 
 
 def fit_of(count=1, **change) -> FitQuality:
@@ -29,7 +29,7 @@ def fit_of(count=1, **change) -> FitQuality:
     return replace(plain, **change)
 
 
-def guess(count=1) -> SceneParameters:
+def params(count=1) -> SceneParameters:
     light = np.array([0, 0, 1.0])
     names = tuple(f"object{n}" for n in range(count))
     return SceneParameters(names, np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), light, None)
@@ -41,14 +41,14 @@ def normals(count=1, scale=1e6):
 
 def test_a_right_guess_is_trusted(models, views, end):
     estimate = estimate_with_uncertainty(
-        end.guess, end.normals, evaluate_fit(models, views, end.guess), {0: 3.0, 1: 2.0}
+        end.params, end.normals, evaluate_fit(models, views, end.params), {0: 3.0, 1: 2.0}
     )
     assert estimate.trusted
     assert estimate.doubts == ("", "")
     assert estimate.position_std.max() < 0.003
     assert estimate.rotation_std.max() < np.deg2rad(2)
     assert 0 < estimate.light_std < np.deg2rad(3)
-    np.testing.assert_allclose(estimate.state.poses.position, end.guess.positions)
+    np.testing.assert_allclose(estimate.state.poses.position, end.params.positions)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_a_right_guess_is_trusted(models, views, end):
     ],
 )
 def test_a_wrong_guess_is_doubted(models, views, end, change, words):
-    wrong = end.guess.updated(np.array([*change, *[0.0] * (POSE + LIGHT)]))
+    wrong = end.params.updated(np.array([*change, *[0.0] * (POSE + LIGHT)]))
     estimate = estimate_with_uncertainty(wrong, end.normals, evaluate_fit(models, views, wrong), {})
     assert words in estimate.doubts[0]
     assert not estimate.trusted
@@ -70,25 +70,25 @@ def test_a_wrong_guess_is_doubted(models, views, end, change, words):
 
 
 def test_a_wrong_light_is_doubted(models, truth, views, end):
-    wrong = end.guess.updated(np.array([*[0.0] * (2 * POSE), 1.5, 0.8]))
+    wrong = end.params.updated(np.array([*[0.0] * (2 * POSE), 1.5, 0.8]))
     assert not estimate_with_uncertainty(wrong, end.normals, evaluate_fit(models, views, wrong), {}).trusted
 
 
 def test_fit_of_the_truth_is_perfect(models, truth):
-    own = own_views(models, guess_of(truth), default_cameras(48)[:2], FINE)
-    fit = evaluate_fit(models, own, guess_of(truth))
+    own = own_views(models, params_of(truth), default_cameras(48)[:2], FINE)
+    fit = evaluate_fit(models, own, params_of(truth))
     np.testing.assert_array_equal(fit.residuals, 0)
     np.testing.assert_allclose(fit.overlap, 1)
     np.testing.assert_allclose(fit.pixels, own.masks.sum(axis=(2, 3)), rtol=1e-5)
     assert fit.surroundings == fit.spread == 0
-    assert evaluate_fit(models, replace(own, masks=None), guess_of(truth)).overlap.tolist() == [1, 1]
+    assert evaluate_fit(models, replace(own, masks=None), params_of(truth)).overlap.tolist() == [1, 1]
 
 
 def test_evidence_is_of_each_objects_pixels(models, truth):
-    own = own_views(models, guess_of(truth), default_cameras(48)[:2], FINE)
+    own = own_views(models, params_of(truth), default_cameras(48)[:2], FINE)
     darker = own.images.copy()
     darker[1][own.masks[1, 0] > 0] -= np.float32(0.2)  # the box, in one view
-    fit = evaluate_fit(models, replace(own, images=darker), guess_of(truth))
+    fit = evaluate_fit(models, replace(own, images=darker), params_of(truth))
     assert fit.residuals[1, 0] == pytest.approx(0.2, rel=1e-3)
     np.testing.assert_allclose(fit.residuals[0], 0, atol=1e-6)
     assert fit.residuals[1, 1] < 0.03  # which it touches in the image at most
@@ -98,7 +98,7 @@ def test_evidence_is_of_each_objects_pixels(models, truth):
 
 
 def test_an_empty_scene_has_fit_of_the_table_alone(models):
-    nothing = guess(0)
+    nothing = params(0)
     own = own_views(models, nothing, default_cameras(48)[:1])
     fit = evaluate_fit(models, replace(own, images=own.images + np.float32(0.1)), nothing)
     assert fit.surroundings == pytest.approx(0.1, rel=1e-4)
@@ -118,7 +118,7 @@ def test_each_doubt_is_told():
         "its pose is known to 150 mm and 6 deg only": ({}, {}, 1.0),
     }
     for words, (change, rivals, scale) in cases.items():
-        estimate = estimate_with_uncertainty(guess(), normals(1, scale), fit_of(**change), rivals)
+        estimate = estimate_with_uncertainty(params(), normals(1, scale), fit_of(**change), rivals)
         assert estimate.doubts == (words,)
         assert estimate.reason == (f"object0: {words}" if words else "")
 
@@ -126,21 +126,23 @@ def test_each_doubt_is_told():
 def test_what_cannot_stand_there_is_doubted_where_that_matters():
     words = {0.001: "", 0.02: "it would float above the table by 20 mm", -0.01: "it would sink into the table by 10 mm"}
     for height, doubt in words.items():
-        assert estimate_with_uncertainty(guess(), normals(), fit_of(), {}, lowest=np.array([height])).doubts == (doubt,)
-    assert estimate_with_uncertainty(guess(), normals(), fit_of(), {}).trusted
+        assert estimate_with_uncertainty(params(), normals(), fit_of(), {}, lowest=np.array([height])).doubts == (
+            doubt,
+        )
+    assert estimate_with_uncertainty(params(), normals(), fit_of(), {}).trusted
 
 
 def test_all_doubts_make_the_reason():
-    estimate = estimate_with_uncertainty(guess(3), normals(3), fit_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0})
+    estimate = estimate_with_uncertainty(params(3), normals(3), fit_of(3, overlap=np.array([0.1, 1.0, 0.2])), {1: 9.0})
     assert estimate.doubts[1] == ""
     assert estimate.reason == f"object0: {estimate.doubts[0]}; object2: {estimate.doubts[2]}"
 
 
 def test_deviations_are_those_of_least_squares():
     """They grow with the error of a pixel, and shrink with the root of the curvature."""
-    first = estimate_with_uncertainty(guess(), normals(), fit_of(), {})
-    noisier = estimate_with_uncertainty(guess(), normals(), fit_of(spread=4e-4), {})
-    sharper = estimate_with_uncertainty(guess(), normals(1, 1e8), fit_of(), {})
+    first = estimate_with_uncertainty(params(), normals(), fit_of(), {})
+    noisier = estimate_with_uncertainty(params(), normals(), fit_of(spread=4e-4), {})
+    sharper = estimate_with_uncertainty(params(), normals(1, 1e8), fit_of(), {})
     for name in ("position_std", "rotation_std", "light_std"):
         here = getattr(first, name)
         np.testing.assert_allclose(getattr(noisier, name), 2 * here, rtol=1e-3)
@@ -150,12 +152,12 @@ def test_deviations_are_those_of_least_squares():
 
 def test_what_nothing_tells_about_is_not_known():
     nothing = [np.zeros((POSE, POSE)), np.zeros((LIGHT, LIGHT))]
-    estimate = estimate_with_uncertainty(guess(), nothing, fit_of(), {})
+    estimate = estimate_with_uncertainty(params(), nothing, fit_of(), {})
     assert estimate.position_std[0] > 0.1
     assert "its pose is known to" in estimate.doubts[0]
     assert estimate.light_std > 0.1
-    assert estimate_with_uncertainty(guess(), nothing, fit_of(), {}, light_held=True).light_std == 0
+    assert estimate_with_uncertainty(params(), nothing, fit_of(), {}, light_held=True).light_std == 0
     flat = np.diag([1e6, 1e6, 0, 0, 0, 1e6])  # an object that was slid over the table only
-    partly = estimate_with_uncertainty(guess(), [flat, nothing[1]], fit_of(), {})
+    partly = estimate_with_uncertainty(params(), [flat, nothing[1]], fit_of(), {})
     assert np.isfinite(partly.position_std[0])
-    assert partly.position_std[0] > estimate_with_uncertainty(guess(), normals(), fit_of(), {}).position_std[0]
+    assert partly.position_std[0] > estimate_with_uncertainty(params(), normals(), fit_of(), {}).position_std[0]

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from app.api.routes.events import Mailbox
-from app.processes.scene_messages import FramesTaken, SceneChanged
+from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import Draft, DraftChanged, GoalsChanged

@@ -160,14 +160,14 @@ def runs(monkeypatch):
     """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
     made, image = [], np.full((16, 16, 3), 0.5)
 
-    def ours(task, _assets, _knowledge, settings, _rng):
+    def ours(task, _assets, _models, settings, _rng):
         made.append(settings.cost)
         yield Finished(0, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, image, image)
 
     monkeypatch.setattr(mpc, "run_from_images", ours)
     monkeypatch.setattr(mpc, "run_told_the_truth", lambda task, *_: Ended(task.goal, image, image))
-    monkeypatch.setattr(mpc, "knowledge_of", lambda *_: None)
+    monkeypatch.setattr(mpc, "load_scene_models", lambda *_: None)
     return made
 
 

@@ -11,9 +11,9 @@ from app.jobs.context import JobContext, JobControl
 from app.jobs.job import INPUTS
 from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
 from app.jobs.worker import KINDS, run_job
-from app.processes.job_messages import RunJob
+from app.processes.messages.job_messages import RunJob
 from app.processes.plan_summary import PlanSketch
-from osfcore.control.events import Acted, Looking, Observed, Planning, Stepped
+from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
@@ -83,7 +83,7 @@ def test_an_episode_pushes_what_is_on_the_scene_and_leaves_its_files(place, stag
     before = stage.world.truth()
     *steps, last = list(episode_job(params(stage), place))
     assert all(isinstance(step, EpisodeProgress) for step in steps)
-    assert [step.view.number for step in steps if isinstance(step.view, Acted)] == [1, 2, 3]
+    assert [step.view.number for step in steps if isinstance(step.view, ActionExecuted)] == [1, 2, 3]
     assert sum(step.ends_round for step in steps) == 4
     assert stage.world.time_s == pytest.approx(0.6)
     assert not np.array_equal(stage.world.truth().pusher, before.pusher)
@@ -156,7 +156,7 @@ def test_an_object_that_stays_did_not_have_to_move(place, stage, sighted, shift,
 def test_settings_may_change_on_the_way(place, stage, sighted):  # noqa: F811
     acted = 0
     for step in episode_job(params(stage), place):
-        acted += isinstance(step.view, Acted)
+        acted += isinstance(step.view, ActionExecuted)
         if acted == 1:
             place.orders.told = [{"settings": {**SMALL, "steps": 2}}]
     assert acted == 2
@@ -208,6 +208,6 @@ def test_rounds_end_where_a_step_of_the_loop_does():
     image = np.zeros((16, 16, 3))
     stepped = Stepped(1, 3, state, np.zeros(0), np.zeros(0), 0.0, image, {})
     assert EpisodeProgress(1, 3, "Looking", view=stepped).ends_round
-    assert not EpisodeProgress(1, 3, "Pushing", view=Acted(1, np.zeros(3))).ends_round
+    assert not EpisodeProgress(1, 3, "Pushing", view=ActionExecuted(1, np.zeros(3))).ends_round
     assert not EpisodeProgress(0, 3, "Loading").ends_round
     assert not EpisodeProgress(0, 3, "Loading").must_be_told

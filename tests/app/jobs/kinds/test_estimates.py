@@ -6,7 +6,7 @@ import pytest
 
 from app.jobs.context import JobContext
 from app.jobs.job import INPUTS
-from app.jobs.kinds.estimates import STATE, STEPS, estimate_job, guess_of, load_models, read_steps
+from app.jobs.kinds.estimates import STATE, STEPS, estimate_job, load_models, read_steps, state_of_step
 from osfcore.errors import CannotWrite, CorruptFile, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import default_cameras
@@ -65,12 +65,12 @@ def test_all_steps_are_told_and_kept_and_the_result_is_a_state_file(place, asked
     assert [step.losses for step in told] == [(0.5,), (), (0.1,)]
     assert [step.loss for step in told] == [None, 0.25, 0.1]  # JSON has no NaN
     assert [step.trusted for step in told] == [None, None, True]
-    assert told[1].view.guess.poses.position[0, 0] == 0.2
+    assert told[1].view.state.poses.position[0, 0] == 0.2
     kept = read_steps(place.folder / STEPS)
     assert [(k["step"], k["stage"], k["note"], k["loss"]) for k in kept] == [
         (t.step, t.stage, t.note, t.loss) for t in told
     ]
-    np.testing.assert_allclose([guess_of(k).poses.position[0, 0] for k in kept], [0.3, 0.2, 0.1])
+    np.testing.assert_allclose([state_of_step(k).poses.position[0, 0] for k in kept], [0.3, 0.2, 0.1])
     found = read_estimated(place.folder / STATE)
     np.testing.assert_allclose(found.state.poses.position, state().poses.position)
     assert not np.isfinite(found.rotation_std[0])

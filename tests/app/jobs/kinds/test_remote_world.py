@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from app.jobs.kinds.remote_world import RemoteWorld
-from app.processes.scene_messages import Act, ObserveScene, SceneRecord, TakeView
+from app.processes.messages.scene_messages import Act, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.io.observation_file import write_observation

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from app.jobs.job import Job, JobChanged, JobView, State
-from app.processes.scene_messages import SceneChanged
+from app.processes.messages.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
 from app.viewer.nodes.episode_nodes import PARTS, EpisodeNodes
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.episode_panel import DRAW_INTERVAL_S, EpisodePanel
-from osfcore.control.events import Acted, Finished, GoalFound, Noticed, Stepped
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Stepped
 from osfcore.geometry.cameras import goal_camera
 from osfcore.planning.pose_cost import PoseGoal
 from tests.app.conftest import until
@@ -109,7 +109,7 @@ def test_what_an_episode_tells_is_drawn_and_the_panel_tells_how_far_it_is(room):
     assert room.shows_plan()
     room.see(stepped(0.2))
     np.testing.assert_allclose(room.estimate(), [[0.2, 0, 0.1]], atol=1e-6)
-    room.see(Acted(3, np.zeros(3)))
+    room.see(ActionExecuted(3, np.zeros(3)))
     room.says("Pushing · at most 34 mm and 11° to go")
     assert room.gui.progress() == 25
     assert room.shows_plan()

@@ -10,7 +10,7 @@ import viser
 from PIL import Image
 
 from app.jobs.job import Job, JobChanged, JobView
-from app.processes.neural_messages import Comparison
+from app.processes.messages.neural_messages import Comparison
 from app.services.event_hub import CurrentScene
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import SceneNodes

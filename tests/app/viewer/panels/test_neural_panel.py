@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.processes.neural_messages import DrawnView
+from app.processes.messages.neural_messages import DrawnView
 from app.processes.process_client import ProcessUnavailable
 from app.viewer.panels.neural_panel import NeuralPanel
 from osfcore.geometry.cameras import Camera

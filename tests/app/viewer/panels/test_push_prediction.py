@@ -2,7 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.viewer.panels.push_prediction import PushPrediction
+from app.services.pushes import Outcome
+from app.viewer.panels.push_prediction import PushPrediction, report
 from osfcore.geometry.rollouts import Rollouts
 from tests.app.storage.test_database import record
 
@@ -31,3 +32,23 @@ def test_any_other_change_ends_it_and_old_news_do_not():
     assert new.after(record(revision=6), (), None) is None
     assert new.after(record(revision=6), (), replace(new, rollouts=replace(NOTHING))) is None
     assert new.after(record(revision=8), (), new) is None
+
+
+def test_nothing_is_no_table():
+    assert report((), {}) == ""
+
+
+def test_before_and_after():
+    before = report([Outcome("a", 12.34, 5.0)], {"a": "A box"})
+    assert "A box" in before
+    assert "12 mm<br>5.0°" in before
+    assert "Off by" not in before
+    after = report([Outcome("a", 12.34, 5.0, 9.96, 0.0, 2.4, 5.0), Outcome("b", 0, 0, 0, 0, 0, 0)], {})
+    assert "<b>2.4 mm<br>5.0°</b>" in after
+    assert "10 mm<br>0.0°" in after
+    assert "still" in after
+
+
+def test_what_users_name_is_escaped():
+    assert "<script" not in report([Outcome("<script>", 1, 1)], {})
+    assert "&lt;b&gt;" in report([Outcome("a", 1, 1)], {"a": "<b>"})

@@ -10,7 +10,7 @@ from osfcore.dynamics.propagation_network import MOTION
 from osfcore.dynamics.pusher_path import SUBSTEPS
 from osfcore.dynamics.recorded_states import substates
 from osfcore.dynamics.substep import advance
-from osfcore.dynamics.training.samples import off_track, samples
+from osfcore.dynamics.training.samples import disturbed_substeps, samples
 from osfcore.dynamics.training.windows import batch, record, turn_between
 from osfcore.geometry.poses import quaternion_conjugate, quaternion_log, quaternion_multiply
 from osfcore.io.push_file import Disturbed
@@ -99,7 +99,7 @@ def test_disturbed_states_become_graphs_like_recorded_ones(begun, shapes, table)
     """Rows that repeat the recording teach what it teaches."""
     recorded = begun[0]
     plain = samples(record([recorded], shapes, 1), table)
-    rows = list(off_track([replace(recorded, disturbed=beside(recorded)), recorded], shapes))
+    rows = list(disturbed_substeps([replace(recorded, disturbed=beside(recorded)), recorded], shapes))
     both = samples(record([recorded], shapes, 1), table, others=rows)
     assert len(rows) == 1
     assert len(plain) < len(both) <= 2 * len(plain)
@@ -116,7 +116,7 @@ def test_disturbed_states_become_graphs_like_recorded_ones(begun, shapes, table)
 
 
 def test_episodes_without_disturbed_states_add_nothing(begun, shapes):
-    assert list(off_track(begun, shapes)) == []
+    assert list(disturbed_substeps(begun, shapes)) == []
 
 
 def test_graphs_drawn_together_answer_as_they_do_alone(drawn):

@@ -7,8 +7,8 @@ import torch
 from osfcore.dynamics.push_models import load_shapes
 from osfcore.dynamics.pusher_path import SUBSTEPS
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.substep import unroll
 from osfcore.dynamics.training.windows import batch, record
-from osfcore.dynamics.unroll import unroll
 from osfcore.errors import InvalidInput
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotate

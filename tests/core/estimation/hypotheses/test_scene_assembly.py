@@ -8,7 +8,7 @@ from osfcore.estimation.hypotheses.scene_assembly import OUT_OF_VIEW, assemble_s
 from osfcore.estimation.hypotheses.template_matching import TemplateMatches
 from osfcore.estimation.objective.observed_views import views_of
 from osfcore.geometry.cameras import goal_camera
-from tests.core.estimation.scenes import apart, guess_of, observe
+from tests.core.estimation.scenes import apart, observe, params_of
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +20,8 @@ def views(models, truth):
 @pytest.fixture(scope="module")
 def empty(truth):
     """Nothing on the table, under a light that is far from the right one."""
-    guess = replace(guess_of(truth), light=np.array([0.0, -0.6, 0.8]))
-    return with_pose(with_pose(guess, 0, OUT_OF_VIEW), 1, OUT_OF_VIEW)
+    params = replace(params_of(truth), light=np.array([0.0, -0.6, 0.8]))
+    return with_pose(with_pose(params, 0, OUT_OF_VIEW), 1, OUT_OF_VIEW)
 
 
 def sightings_at(truth, *shifts) -> list[TemplateMatches]:
@@ -35,8 +35,8 @@ def sightings_at(truth, *shifts) -> list[TemplateMatches]:
 
 def test_the_right_sightings_and_the_light_are_found_together(models, truth, views, empty):
     matches = sightings_at(truth, (0.07, 0, 0), (0, 0.05, 0), (0, 0, 0), (-0.1, 0.02, 0))
-    guess, _ = list(assemble_scene(models, *views, empty, matches))[-1]
-    shift, turn, light = apart(guess, guess_of(truth))
+    params, _ = list(assemble_scene(models, *views, empty, matches))[-1]
+    shift, turn, light = apart(params, params_of(truth))
     assert shift.max() == 0
     assert turn.max() < 1e-6
     assert np.rad2deg(light) < 5
@@ -47,8 +47,8 @@ def test_one_that_stands_in_anothers_place_is_moved(models, truth, views, empty)
     matches = sightings_at(truth, (0, 0, 0), other - own)
     matches[1] = sightings_at(truth, (0, 0, 0), own - other)[1]
     swapped = with_pose(with_pose(empty, 0, matches[0].pose(1)), 1, matches[1].pose(1))
-    guess, _ = list(assemble_scene(models, *views, swapped, matches))[-1]
-    assert apart(guess, guess_of(truth))[0].max() == 0
+    params, _ = list(assemble_scene(models, *views, swapped, matches))[-1]
+    assert apart(params, params_of(truth))[0].max() == 0
 
 
 def test_losses_fall_within_each_part_and_the_count_is_known(models, truth, views, empty):
@@ -61,18 +61,18 @@ def test_losses_fall_within_each_part_and_the_count_is_known(models, truth, view
 @pytest.mark.slow
 def test_what_nobody_sighted_stays_away(models, truth, views, empty):
     matches = [sightings_at(truth, (0, 0, 0))[0], TemplateMatches(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))]
-    guess, _ = list(assemble_scene(models, *views, empty, matches))[-1]
-    np.testing.assert_array_equal(guess.positions[1], OUT_OF_VIEW.position)
-    np.testing.assert_array_equal(guess.positions[0], truth.poses.position[0])
+    params, _ = list(assemble_scene(models, *views, empty, matches))[-1]
+    np.testing.assert_array_equal(params.positions[1], OUT_OF_VIEW.position)
+    np.testing.assert_array_equal(params.positions[0], truth.poses.position[0])
 
 
 def test_what_hides_is_put_where_it_was_seen(models, truth, views):
     matches = sightings_at(truth, (0.07, 0, 0), (0, 0, 0))
-    hidden = with_pose(guess_of(truth), 1, OUT_OF_VIEW)
-    guess = reassign_poses(models, views[1], hidden, matches)
-    assert apart(guess, guess_of(truth))[0].max() == 0
+    hidden = with_pose(params_of(truth), 1, OUT_OF_VIEW)
+    params = reassign_poses(models, views[1], hidden, matches)
+    assert apart(params, params_of(truth))[0].max() == 0
 
 
 def test_what_explains_the_image_stays(models, truth, views):
-    right = guess_of(truth)
+    right = params_of(truth)
     assert reassign_poses(models, views[1], right, sightings_at(truth, (0.07, 0, 0), (0.01, 0, 0))) is right

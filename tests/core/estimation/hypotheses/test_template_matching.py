@@ -8,7 +8,7 @@ from osfcore.estimation.hypotheses.template_matching import TemplateMatches, mat
 from osfcore.estimation.objective.observed_views import views_of
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.poses import rotate, rotation_angle
-from tests.core.estimation.scenes import BOTTLE, BOX, guess_of, lying, observe, scene
+from tests.core.estimation.scenes import BOTTLE, BOX, lying, observe, params_of, scene
 
 SLOW = pytest.mark.slow
 
@@ -67,9 +67,9 @@ def test_a_bare_table_has_no_errors_in_whatever_light(models):
 
 def test_what_a_known_scene_leaves_unexplained(models, truth):
     views = image_of(models, truth, side=96)
-    names, guess = truth.names, guess_of(truth)
+    names, params = truth.names, params_of(truth)
     missing = names.index(BOX)
-    explained, unexplained = (scene_errors(models, views, g) for g in (guess, without_objects(guess, [missing])))
+    explained, unexplained = (scene_errors(models, views, g) for g in (params, without_objects(params, [missing])))
     assert explained.mean() < 0.3 * unexplained.mean()  # what is left are edges
     quaternions = truth.poses.quaternion[[missing]]
     heights = truth.poses.position[[missing], 2]

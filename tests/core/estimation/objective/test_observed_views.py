@@ -19,7 +19,7 @@ from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import Observation
 from osfcore.render.types import OUTPUTS, SceneBatch
-from tests.core.estimation.scenes import guess_of, own_views
+from tests.core.estimation.scenes import own_views, params_of
 from tests.core.render.scenes import state, view
 
 ROUNDING = 1e-4  # of a ray's direction, when a camera's corner is moved
@@ -27,14 +27,14 @@ CAMERAS = default_cameras(64)[:2]
 
 
 @pytest.fixture(scope="module")
-def guess():
+def params():
     """Above the table, which hides what of a field is below it."""
-    return guess_of(state({"block": (0.05, 0.03, 0.06), "ball": (-0.07, -0.03, 0.06)}))
+    return params_of(state({"block": (0.05, 0.03, 0.06), "ball": (-0.07, -0.03, 0.06)}))
 
 
 @pytest.fixture(scope="module")
-def views(plain, guess):
-    return own_views(plain, guess, CAMERAS)
+def views(plain, params):
+    return own_views(plain, params, CAMERAS)
 
 
 def observation(width=96, height=64, masks=True) -> Observation:
@@ -91,9 +91,9 @@ def test_no_objects_have_no_masks():
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_a_window_shows_the_pixels_of_the_whole(plain, guess, samples):
+def test_a_window_shows_the_pixels_of_the_whole(plain, params, samples):
     quality = replace(QUALITY, samples_per_side=samples)
-    batch = SceneBatch.of(guess.state())
+    batch = SceneBatch.of(params.state())
     x, y, width, height = 13, 9, 30, 24
     whole = plain.together.render(batch, CAMERAS, quality=quality, outputs=OUTPUTS)
     windows = [crop_camera(camera, x, y, width, height) for camera in CAMERAS]
@@ -112,15 +112,15 @@ def test_a_window_moves_pixels_by_its_corner(x, y):
     np.testing.assert_allclose(moved.project(points) + [x, y], CAMERAS[0].project(points), atol=1e-9)
 
 
-def test_a_part_is_the_object_and_its_surroundings_by_its_masks(plain, guess, views):
-    for number, name in enumerate(guess.names):
+def test_a_part_is_the_object_and_its_surroundings_by_its_masks(plain, params, views):
+    for number, name in enumerate(params.names):
         part = crop_to_masks(views, number, margin=4)
         height, width = part.mask.shape[1:]
         assert len({part.rgb.shape[1:3], part.valid.shape[1:], (height, width)}) == 1
         np.testing.assert_allclose(part.mask.sum(axis=(1, 2)), views.masks[:, number].sum(axis=(1, 2)), rtol=1e-3)
         assert max(height, width) < 32 < 64
-        own = SceneBatch((name,), guess.positions[None, [number]], guess.quaternions[None, [number]],
-                         guess.light[None], None)  # fmt: skip
+        own = SceneBatch((name,), params.positions[None, [number]], params.quaternions[None, [number]],
+                         params.light[None], None)  # fmt: skip
         look = plain.alone.render(own, part.cameras, quality=part.quality, outputs={"opacity"}).opacity[0, :, 0]
         for v, camera in enumerate(part.cameras):
             x, y = np.round(views.cameras[v].intrinsics[:2, 2] - camera.intrinsics[:2, 2]).astype(int)
@@ -160,33 +160,33 @@ def test_a_part_at_the_border_stays_in_the_image(views, corner):
     assert part.area.tolist() == [1, 1]
 
 
-def test_around_are_windows_that_hold_the_object(plain, guess, views):
+def test_around_are_windows_that_hold_the_object(plain, params, views):
     for number in range(2):
-        own = crop_to_object(views, plain, guess, number)
+        own = crop_to_object(views, plain, params, number)
         assert own.masks is own.only is None
         assert own.images.shape[1] == own.images.shape[2] < 64
-        batch = guess.perturbed(np.zeros((1, guess.size)))
+        batch = params.perturbed(np.zeros((1, params.size)))
         np.testing.assert_allclose(residuals(plain, own, batch), 0, atol=ROUNDING)
         shown = plain.together.render(batch, own.cameras, quality=QUALITY, outputs={"opacity"}).opacity[0, :, number]
         np.testing.assert_allclose(shown.sum(axis=(1, 2)), views.masks[:, number].sum(axis=(1, 2)), rtol=1e-3)
 
 
-def test_around_leaves_out_cameras_that_look_elsewhere(plain, guess):
+def test_around_leaves_out_cameras_that_look_elsewhere(plain, params):
     away = view((0.5, 0, 0.4), (1.0, 0, 0.5), 64)
-    both = own_views(plain, guess, [CAMERAS[0], away])
-    assert len(crop_to_object(both, plain, guess, 0).cameras) == 1
-    nowhere = own_views(plain, guess, [away])
-    own = crop_to_object(nowhere, plain, guess, 0)
+    both = own_views(plain, params, [CAMERAS[0], away])
+    assert len(crop_to_object(both, plain, params, 0).cameras) == 1
+    nowhere = own_views(plain, params, [away])
+    own = crop_to_object(nowhere, plain, params, 0)
     np.testing.assert_array_equal(own.images, nowhere.images)
     assert own.masks is None
-    assert crop_to_silhouette(nowhere, plain, guess, 0).only is None
+    assert crop_to_silhouette(nowhere, plain, params, 0).only is None
 
 
-def test_near_is_the_whole_image_inside_and_black_outside(plain, guess, views):
+def test_near_is_the_whole_image_inside_and_black_outside(plain, params, views):
     for number in range(2):
-        own, wide = crop_to_silhouette(views, plain, guess, number), crop_to_object(views, plain, guess, number)
+        own, wide = crop_to_silhouette(views, plain, params, number), crop_to_object(views, plain, params, number)
         np.testing.assert_array_equal(own.images, wide.images * own.only[..., None])
-        batch = SceneBatch.of(guess.state())
+        batch = SceneBatch.of(params.state())
         some = plain.together.render(batch, own.cameras, quality=own.quality, only=own.only).rgb[0]
         everything = plain.together.render(batch, own.cameras, quality=own.quality).rgb[0]
         np.testing.assert_array_equal(some[own.only], everything[own.only])
@@ -195,9 +195,9 @@ def test_near_is_the_whole_image_inside_and_black_outside(plain, guess, views):
         np.testing.assert_allclose(residuals(plain, own, batch), 0, atol=ROUNDING)
 
 
-def test_near_is_the_silhouette_and_three_pixels_beside_it(plain, guess, views):
-    own = crop_to_silhouette(views, plain, guess, 1)
-    batch = guess.perturbed(np.zeros((1, guess.size)))
+def test_near_is_the_silhouette_and_three_pixels_beside_it(plain, params, views):
+    own = crop_to_silhouette(views, plain, params, 1)
+    batch = params.perturbed(np.zeros((1, params.size)))
     alone = SceneBatch(("ball",), batch.positions[:, [1]], batch.quaternions[:, [1]], batch.lights, None)
     silhouette = plain.alone.render(alone, own.cameras, quality=QUALITY, outputs={"opacity"}).opacity[0, :, 0] > 0
     for only, shown in zip(own.only, silhouette, strict=True):
@@ -208,10 +208,10 @@ def test_near_is_the_silhouette_and_three_pixels_beside_it(plain, guess, views):
         assert only[max(rows.min() - 3, 0) : rows.max() + 4].any(axis=1).all()
 
 
-def test_the_light_does_not_choose_the_pixels(plain, guess, views):
-    lit = replace(guess, light=Light.from_angles(1.0, 0.3).direction)
+def test_the_light_does_not_choose_the_pixels(plain, params, views):
+    lit = replace(params, light=Light.from_angles(1.0, 0.3).direction)
     np.testing.assert_array_equal(
-        crop_to_silhouette(views, plain, guess, 0).only, crop_to_silhouette(views, plain, lit, 0).only
+        crop_to_silhouette(views, plain, params, 0).only, crop_to_silhouette(views, plain, lit, 0).only
     )
 
 

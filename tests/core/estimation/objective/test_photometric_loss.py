@@ -6,7 +6,7 @@ from scipy.special import huber
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.photometric_loss import HUBER, loss_of, photometric_loss, residuals
 from osfcore.geometry.cameras import default_cameras
-from tests.core.estimation.scenes import guess_of, own_views
+from tests.core.estimation.scenes import own_views, params_of
 from tests.core.render.scenes import state, view
 
 
@@ -23,11 +23,11 @@ def test_small_errors_count_squared_and_large_ones_linearly():
 
 
 def test_a_scene_explains_its_own_images_and_no_others(plain):
-    guess = guess_of(state({"block": (0.04, 0, 0.05), "ball": (-0.06, 0, 0.05)}))
-    views = own_views(plain, guess, [view(), view((0, 0.5, 0.4))])
-    changes = np.zeros((3, guess.size))
+    params = params_of(state({"block": (0.04, 0, 0.05), "ball": (-0.06, 0, 0.05)}))
+    views = own_views(plain, params, [view(), view((0, 0.5, 0.4))])
+    changes = np.zeros((3, params.size))
     changes[1, 0], changes[2, 0] = 0.005, 0.01
-    errors = residuals(plain, views, guess.perturbed(changes))
+    errors = residuals(plain, views, params.perturbed(changes))
     assert errors.shape == (3, 2, 32, 32, 3)
     assert errors.dtype == np.float32
     assert not errors[0].any()
@@ -36,17 +36,17 @@ def test_a_scene_explains_its_own_images_and_no_others(plain):
 
 
 def test_residuals_are_rendered_minus_observed(plain):
-    guess = guess_of(state({"ball": (0, 0, 0.05)}))
-    views = own_views(plain, guess, [view()])
+    params = params_of(state({"ball": (0, 0, 0.05)}))
+    views = own_views(plain, params, [view()])
     darker = ObservedViews(views.cameras, views.images - np.float32(0.25), None, None, views.quality)
-    errors = residuals(plain, darker, guess.perturbed(np.zeros((1, guess.size))))
+    errors = residuals(plain, darker, params.perturbed(np.zeros((1, params.size))))
     np.testing.assert_allclose(errors, 0.25, atol=1e-6)
 
 
 def test_the_loss_of_one_scene_is_that_of_a_batch_of_one(models, truth):
-    guess = guess_of(truth)
-    seen = own_views(models, guess, default_cameras(32)[:1])
-    moved = guess.updated(np.array([0.01] * 12 + [0.0, 0.0]))
-    assert loss_of(models, seen, guess) == 0
+    params = params_of(truth)
+    seen = own_views(models, params, default_cameras(32)[:1])
+    moved = params.updated(np.array([0.01] * 12 + [0.0, 0.0]))
+    assert loss_of(models, seen, params) == 0
     batch = moved.perturbed(np.zeros((1, moved.size)))
     assert loss_of(models, seen, moved) == photometric_loss(residuals(models, seen, batch))[0] > 0

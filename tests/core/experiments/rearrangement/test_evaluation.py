@@ -7,7 +7,7 @@ import pytest
 
 import osfcore.experiments.rearrangement.evaluation as module
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Acted, Finished, GoalFound, Noticed, Stepped
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Stepped
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.rearrangement.evaluation import REPORT_FILE, EvaluateMpc, evaluate_mpc
 from osfcore.experiments.rearrangement.runs import Ended
@@ -41,7 +41,7 @@ def runs(monkeypatch):
     """Runs that cost nothing: ours reach the goal, the oracle's leave everything as it is. Tells which were made."""
     made = []
 
-    def ours(task, _assets, _knowledge, settings, _rng):
+    def ours(task, _assets, _models, settings, _rng):
         made.append(("ours", task.number, settings.cost))
         one = np.full(len(task.start.names), 1e-3)
         estimate = EstimatedState(task.goal, one, one, 1e-3, ("",) * len(one), "hidden")
@@ -49,18 +49,18 @@ def runs(monkeypatch):
         yield Noticed(0, "goal", "The goal image is not explained well: hidden.")
         yield Stepped(0, 2, estimate, 0 * one, 0 * one, 0.0, PAPER, {"first": 8.0, "goal": 20.0})
         for number, plan_s in ((1, 1.0), (2, 3.0)):
-            yield Acted(number, np.zeros(3))
+            yield ActionExecuted(number, np.zeros(3))
             yield Stepped(number, 2, estimate, 0 * one, 0 * one, 0.0, PAPER, {"plan": plan_s, "estimate": 0.5})
         yield Finished(2, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, PAPER, PAPER)
 
-    def told(task, _assets, _knowledge, settings, _rng):
+    def told(task, _assets, _models, settings, _rng):
         made.append(("oracle", task.number, settings.plan.samples))
         return Ended(task.start, PAPER, PAPER)
 
     monkeypatch.setattr(module, "run_from_images", ours)
     monkeypatch.setattr(module, "run_told_the_truth", told)
-    monkeypatch.setattr(module, "knowledge_of", lambda *_: None)
+    monkeypatch.setattr(module, "load_scene_models", lambda *_: None)
     return made
 
 

@@ -6,8 +6,8 @@ import pytest
 import osfcore.control.closed_loop as episode
 import osfcore.experiments.rearrangement.runs as module
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Acted, Finished, GoalFound, Observed
-from osfcore.control.knowledge import knowledge_of
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed
+from osfcore.control.scene_models import load_scene_models
 from osfcore.errors import OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
@@ -31,8 +31,8 @@ def task(library):
 
 
 @pytest.fixture(scope="module")
-def knowledge(library):
-    return knowledge_of((NAME,), FieldLibrary(None), library, None)
+def models(library):
+    return load_scene_models((NAME,), FieldLibrary(None), library, None)
 
 
 @pytest.fixture
@@ -85,8 +85,8 @@ def pictures(library, state, cameras):
         world.close()
 
 
-def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, knowledge, eyes, worlds):
-    events = list(run_from_images(task, library, knowledge, QUICK, np.random.default_rng(0)))
+def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, models, eyes, worlds):
+    events = list(run_from_images(task, library, models, QUICK, np.random.default_rng(0)))
     first, *_, finished, ended = events
     assert isinstance(first, Observed)
     cameras = first.observation.cameras
@@ -96,7 +96,7 @@ def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, knowl
     (found,) = (event for event in events if isinstance(event, GoalFound))
     np.testing.assert_allclose(found.image, pictures(library, task.goal, (goal_camera(),))[0], atol=1e-6)
     assert isinstance(finished, Finished)
-    assert finished.number == sum(isinstance(event, Acted) for event in events) == worlds[0].acted == 2
+    assert finished.number == sum(isinstance(event, ActionExecuted) for event in events) == worlds[0].acted == 2
     assert isinstance(ended, Ended)
     assert is_closed(worlds[0])
     np.testing.assert_array_equal(ended.goal, found.image)
@@ -104,18 +104,18 @@ def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, knowl
     np.testing.assert_allclose(ended.image, pictures(library, bare, (goal_camera(),))[0], atol=1e-6)
 
 
-def test_an_episode_that_is_left_closes_its_world(task, library, knowledge, eyes, worlds):
-    events = run_from_images(task, library, knowledge, QUICK, np.random.default_rng(0))
+def test_an_episode_that_is_left_closes_its_world(task, library, models, eyes, worlds):
+    events = run_from_images(task, library, models, QUICK, np.random.default_rng(0))
     next(events)
     assert not is_closed(worlds[0])
     events.close()
     assert is_closed(worlds[0])
 
 
-def test_who_is_told_the_truth_comes_nearer(task, library, knowledge, worlds):
+def test_who_is_told_the_truth_comes_nearer(task, library, models, worlds):
     settings = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16))
-    ended = run_told_the_truth(task, library, knowledge, settings, np.random.default_rng(0))
-    before, after = (score_of(task, state, knowledge.symmetries).moved_mm for state in (task.start, ended.state))
+    ended = run_told_the_truth(task, library, models, settings, np.random.default_rng(0))
+    before, after = (score_of(task, state, models.symmetries).moved_mm for state in (task.start, ended.state))
     assert before > 70
     assert after < before / 2
     assert 0 < worlds[0].acted <= 12
@@ -124,21 +124,21 @@ def test_who_is_told_the_truth_comes_nearer(task, library, knowledge, worlds):
     assert np.abs(ended.image - ended.goal).max() > 0.01
 
 
-def test_no_more_actions_than_there_may_be(task, library, knowledge, worlds):
-    run_told_the_truth(task, library, knowledge, replace(QUICK, steps=3, replan_every=2), np.random.default_rng(0))
+def test_no_more_actions_than_there_may_be(task, library, models, worlds):
+    run_told_the_truth(task, library, models, replace(QUICK, steps=3, replan_every=2), np.random.default_rng(0))
     assert worlds[0].acted == 3
 
 
-def test_what_is_at_its_goal_is_left_alone(task, library, knowledge, worlds):
+def test_what_is_at_its_goal_is_left_alone(task, library, models, worlds):
     done = replace(task, goal=replace(task.start, pusher=None))
-    ended = run_told_the_truth(done, library, knowledge, QUICK, np.random.default_rng(0))
+    ended = run_told_the_truth(done, library, models, QUICK, np.random.default_rng(0))
     assert worlds[0].acted == 0
-    assert score_of(done, ended.state, knowledge.symmetries).moved_mm == pytest.approx(0, abs=0.01)
+    assert score_of(done, ended.state, models.symmetries).moved_mm == pytest.approx(0, abs=0.01)
     np.testing.assert_allclose(ended.image, ended.goal, atol=1e-3)
 
 
-def test_of_each_object_everything_is_known(knowledge, library):
-    assert set(knowledge.shapes) == {NAME}
-    assert knowledge.symmetries == {NAME: CATALOGUE[NAME].symmetry}
+def test_of_each_object_everything_is_known(models, library):
+    assert set(models.shapes) == {NAME}
+    assert models.symmetries == {NAME: CATALOGUE[NAME].symmetry}
     with pytest.raises(UnknownName, match="teapot"):
-        knowledge_of(("teapot",), FieldLibrary(None), library, None)
+        load_scene_models(("teapot",), FieldLibrary(None), library, None)

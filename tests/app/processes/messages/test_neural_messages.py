@@ -2,7 +2,7 @@ import pickle
 
 import numpy as np
 
-from app.processes.neural_messages import CompareView, Comparison, DrawnView, DrawView
+from app.processes.messages.neural_messages import CompareView, Comparison, DrawnView, DrawView
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose

@@ -1,9 +1,27 @@
+from importlib.metadata import version
+
 import pytest
 
 from app.api.schemas.episodes import SettingsIn
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput
 from tests.app.api.test_problems import is_problem
+from tests.app.conftest import until
+
+
+def test_health_tells_version_objects_and_stage(service, library):
+    health = until(lambda: (h := service.get("/api/health").json())["stage"] == "ready" and h)
+    assert health["version"] == version("osf-manipulation")
+    assert health["status"] == "ok"
+    assert health["objects_available"] == len(library.names())
+    assert health["uptime_s"] > 0
+
+
+def test_the_figures_are_plain_text_for_prometheus(service):
+    answer = service.get("/api/metrics")
+    assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    assert answer.text.startswith("# HELP")
+    assert "osf_uptime_seconds" in answer.text
 
 
 def test_defaults_and_bounds_are_told(service):

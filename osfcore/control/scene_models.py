@@ -16,25 +16,25 @@ from osfcore.objects.asset_library import AssetLibrary
 
 
 @dataclass(frozen=True, slots=True)
-class Knowledge:
+class SceneModels:
     """Models of the objects, loaded before the first image.
 
     Attributes:
-        models: how objects and table look.
+        appearance: how objects and table look.
         dynamics: what pushes do.
         shapes: of the objects, by name.
         symmetries: which of their orientations look the same; none for those left out.
     """
 
-    models: ObjectModels
+    appearance: ObjectModels
     dynamics: PushModel
     shapes: Mapping[str, ObjectShape]
     symmetries: Mapping[str, Symmetry]
 
 
-def knowledge_of(
+def load_scene_models(
     names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary, data_dir: Path | None, device: str = "cpu"
-) -> Knowledge:
+) -> SceneModels:
     """Load the models of some objects.
 
     Args:
@@ -48,7 +48,7 @@ def knowledge_of(
         UnknownName: if one has no field.
         CorruptFile: if a file is broken.
     """
-    return Knowledge(
+    return SceneModels(
         ObjectModels({name: fields.load(name) for name in names}, fields.load_table(), device=device),
         load_push_model(data_dir, fields, names, device),
         load_shapes(data_dir, fields, names),

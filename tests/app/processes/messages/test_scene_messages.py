@@ -2,7 +2,7 @@ import pickle
 
 import numpy as np
 
-from app.processes.scene_messages import Act, EditScene, SceneChanged, TakeImage
+from app.processes.messages.scene_messages import Act, EditScene, SceneChanged, TakeImage
 from osfcore.geometry.poses import Pose
 from tests.app.storage.test_database import record
 

@@ -1,4 +1,4 @@
-from app.viewer.panels.status_line import status
+from app.viewer.panels.panel import status
 
 
 def test_a_sentence_says_what_it_is_about_and_brings_no_markup_of_its_own():

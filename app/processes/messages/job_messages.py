@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.processes.scene_messages import Act, ObserveScene, TakeView
+from app.processes.messages.scene_messages import Act, ObserveScene, TakeView
 
 
 @dataclass(frozen=True, slots=True)
