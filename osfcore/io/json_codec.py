@@ -67,8 +67,8 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
 
 
 def encode(value: object) -> Any:  # noqa: ANN401
-    """An entry or a dataclass as plain lists, numbers and texts."""
-    return _adapter(type(value)).dump_python(value, mode="json")
+    """An entry or a dataclass as plain lists, numbers and texts, without members that were left out."""
+    return _adapter(type(value)).dump_python(value, mode="json", exclude_unset=True)
 
 
 def decode(kind: type[T], data: object, what: str) -> T:

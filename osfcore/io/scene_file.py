@@ -40,9 +40,9 @@ class PointJson(Entry):
     position: Vector3 = Field(description="[m], world frame.")
 
     @staticmethod
-    def of(position: Float[np.ndarray, "3"] | None) -> PointJson | None:
-        """From an array; None of None."""
-        return None if position is None else PointJson(position=position.tolist())
+    def of(position: Float[np.ndarray, "3"]) -> PointJson:
+        """From an array."""
+        return PointJson(position=position.tolist())
 
 
 class ObjectJson(Entry):
@@ -102,8 +102,8 @@ class StateJson(Entry):
     @staticmethod
     def of(state: SceneState) -> StateJson:
         """From a state."""
-        light = PointJson(position=state.light.position.tolist())
-        return StateJson(objects=posed_objects(state), light=light, pusher=PointJson.of(state.pusher))
+        light = PointJson.of(state.light.position)
+        return StateJson(objects=posed_objects(state), light=light, **pusher_of(state))
 
     def state(self) -> SceneState:
         """The state.
@@ -124,6 +124,11 @@ class SceneJson(StateJson):
     cameras: list[CameraJson] = Field(default_factory=list)
 
 
+def pusher_of(state: SceneState) -> dict[str, PointJson]:
+    """The pusher of a state, if there is one, by its key."""
+    return {} if state.pusher is None else {"pusher": PointJson.of(state.pusher)}
+
+
 def posed_objects(state: SceneState) -> list[ObjectJson]:
     """The objects of a state."""
     return [ObjectJson.of(name, state.pose(name)) for name in state.names]
@@ -131,8 +136,7 @@ def posed_objects(state: SceneState) -> list[ObjectJson]:
 
 def state_to_json(state: SceneState) -> dict[str, Any]:
     """A state as plain lists and numbers: a scene.json without cameras."""
-    data = encode(StateJson.of(state))
-    return data if state.pusher is not None else {key: data[key] for key in ("objects", "light")}
+    return encode(StateJson.of(state))
 
 
 def scene_to_json(scene: Scene) -> dict[str, Any]:

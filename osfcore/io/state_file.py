@@ -21,7 +21,7 @@ from osfcore.errors import InvalidInput, shown
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.io.files import read_json, write_json
 from osfcore.io.json_codec import Entry, Text, decode, encode
-from osfcore.io.scene_file import ObjectJson, PointJson, StateJson, posed_objects
+from osfcore.io.scene_file import ObjectJson, PointJson, StateJson, posed_objects, pusher_of
 
 _Deviation = Annotated[FiniteFloat, Field(ge=0)]
 
@@ -80,7 +80,7 @@ class EstimateJson(StateJson):
                 for entry, (m, rad, doubt) in zip(posed_objects(state), deviations, strict=True)
             ],
             light=EstimatedLightJson(position=state.light.position.tolist(), uncertainty=light_std),
-            pusher=PointJson.of(state.pusher),
+            **pusher_of(state),
             trusted=estimated.trusted,
             reason=estimated.reason,
         )
@@ -111,8 +111,7 @@ def _unbounded(value: float | None) -> float:
 
 def estimated_to_json(estimated: EstimatedState) -> dict[str, Any]:
     """The state as plain lists and numbers."""
-    data = encode(EstimateJson.of_estimate(estimated))
-    return data if estimated.state.pusher is not None else {key: data[key] for key in data if key != "pusher"}
+    return encode(EstimateJson.of_estimate(estimated))
 
 
 def estimated_from_json(data: object) -> EstimatedState:
