@@ -127,7 +127,12 @@ class FetchFailed(OsfError):
 
 
 def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "size"]:
-    """A float64 copy of `size` finite numbers.
+    """A float64 copy of a vector, checked.
+
+    Args:
+        value: anything that NumPy makes an array of.
+        size: how many numbers it must have.
+        what: name of the value for the error, with its unit.
 
     Raises:
         InvalidInput: if there are not exactly `size` numbers, or one is NaN or infinite.

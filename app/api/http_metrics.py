@@ -35,7 +35,13 @@ class Metrics:
         self._registry.register(_State(runner))
 
     def answered(self, method: str, status: int, seconds: float) -> None:
-        """Take note of an answered request."""
+        """Take note of an answered request.
+
+        Args:
+            method: of HTTP; each one is counted for ever, so only known ones may come here.
+            status: of the answer.
+            seconds: from the request to the end of the answer [s].
+        """
         self._requests.labels(method, str(status)).observe(seconds)
 
     def text(self) -> bytes:

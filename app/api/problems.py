@@ -85,7 +85,14 @@ class ProblemResponse(JSONResponse):
 def problem(
     status: int, detail: str, pointers: list[ProblemPointer] | None = None, headers: dict[str, str] | None = None
 ) -> ProblemResponse:
-    """A problem response."""
+    """A response of the problem media type.
+
+    Args:
+        status: of HTTP; decides the title.
+        detail: one sentence for a person.
+        pointers: where in the request it lies; left out if None.
+        headers: further ones.
+    """
     # Lone surrogates come in through JSON escapes, but no UTF-8 goes out with them.
     clean = detail.encode("utf-8", "replace").decode("utf-8")
     body = Problem(title=_TITLES.get(status, "Error"), status=status, detail=clean, errors=pointers)

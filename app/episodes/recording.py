@@ -21,6 +21,11 @@ from osfcore.objects.asset_library import AssetLibrary
 def write_recording(path: Path, library: AssetLibrary, states: Iterable[SceneState]) -> None:
     """Write a `.viser` file that plays true states, one every 0.2 s.
 
+    Args:
+        path: of the file.
+        library: meshes, sizes and labels of the objects.
+        states: one or more, of the same objects.
+
     Raises:
         CannotWrite: if the disk refuses.
     """

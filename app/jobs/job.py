@@ -124,6 +124,12 @@ def check_file_name(job: Job, name: str) -> str:
 def check_params(kind: str, params: dict[str, Any], known: Callable[[str], object], available: int) -> None:
     """Refuse at once what the job would refuse later.
 
+    Args:
+        kind: of the job.
+        params: what it is to be done with.
+        known: raises an OsfError for the name of an object that the job cannot use.
+        available: how many objects have been fetched.
+
     Raises:
         OsfError: if an object is unknown or there are too few.
     """

@@ -32,7 +32,13 @@ class JobDied(OsfError):
 
 
 def after(job: Job, outcome: Outcome, folder: Path) -> Job:
-    """The job as its process left it; the folder of one that came to nothing is removed."""
+    """The job as its process left it; the folder of one that came to nothing is removed.
+
+    Args:
+        job: as it was while it ran.
+        outcome: its result, or why there is none.
+        folder: of the job; of what stays, half-made files go and the others are listed.
+    """
     keeps = job.kind in _KEEPING
     if isinstance(outcome, dict):
         then = ended(job, "done", note="Done", result=outcome)

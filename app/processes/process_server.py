@@ -126,7 +126,14 @@ class ProcessServer:
 
 
 def child_main(connection: Connection, target: Callable[..., None], who: str, *arguments: object) -> None:
-    """Run `target(server, *arguments)`: what every child process starts with."""
+    """Run `target(server, *arguments)`: what every child process starts with.
+
+    Args:
+        connection: to the service.
+        target: serves until the service has gone.
+        who: what people call this process.
+        *arguments: of the target.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service decides when to stop
     silence_stdout()
     target(ProcessServer(connection, who), *arguments)

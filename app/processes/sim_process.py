@@ -59,7 +59,13 @@ _log = logging.getLogger(__name__)
 
 
 def simulation_main(server: ProcessServer, objects_root: Path, max_live_worlds: int) -> None:
-    """Carry out commands until the service has gone."""
+    """Carry out commands until the service has gone.
+
+    Args:
+        server: the pipe to the service.
+        objects_root: folder of the asset library.
+        max_live_worlds: scenes whose simulation stays in memory.
+    """
     import_quietly("osfcore.world.tabletop")  # slow, so before the simulation calls itself ready
     with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
         simulation = Simulation(server.send, AssetLibrary(objects_root), executor, max_live_worlds)

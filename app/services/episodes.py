@@ -168,6 +168,11 @@ class Episodes:
     def frame(self, job: Job, step: int, part: Part) -> bytes:
         """PNG of one frame, or of one of its pictures.
 
+        Args:
+            job: the episode.
+            step: actions executed before the frame.
+            part: "all" for the whole frame, or which of the pictures in its upper row.
+
         Raises:
             UnknownName: if there is no such frame.
             CorruptFile: if it is damaged.

@@ -138,10 +138,15 @@ class Estimates:
             return self._submit(asked, of, names, tuple(camera.name for camera in cameras), folder)
 
     async def of_upload(self, asked: Asked, chunks: AsyncIterator[bytes], file_name: str) -> Job:
-        """Take in a zipped observation folder, bit by bit, and estimate what it shows.
+        """Take in a zipped observation folder, and estimate what it shows.
+
+        Args:
+            asked: what to estimate, and how.
+            chunks: the archive, bit by bit.
+            file_name: what the uploader calls it, for people.
 
         Raises:
-            UploadRefused: if it cannot be read.
+            UploadRefused, CannotStore: if it cannot be read, or the disk is full.
             InvalidInput: if it does not fit the mode.
             UnknownName: if an object in it cannot be recognised, or the earlier estimate is unknown.
             NoPrior: if an earlier estimate is needed and there is none.
@@ -230,7 +235,12 @@ class Estimates:
         return self._observed(job, view)[1]
 
     def comparison(self, job: Job, view: int, step: int | None = None) -> CompareView:
-        """The order that compares what a camera saw with a step's guess, by default the latest one's.
+        """The order that compares what a camera saw with a step's guess.
+
+        Args:
+            job: the estimate.
+            view: number of the camera, from 0.
+            step: number of the step, from 1; None for the latest one.
 
         Raises:
             UnknownName: if there is no such camera or step.

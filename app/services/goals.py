@@ -143,7 +143,13 @@ class Goals:
         return self._keep("upload", name, None, camera.resized(width, height), None, _png(pixels))
 
     def compose(self, scene: str | None, poses: Poses, name: str, light: Light | None = None) -> GoalRecord:
-        """Keep a goal in which objects of a scene, by default the current one, lie elsewhere.
+        """Keep a goal in which objects of a scene lie elsewhere.
+
+        Args:
+            scene: None for the current one.
+            poses: of the objects that lie elsewhere; they come to rest as if let go.
+            name: for people.
+            light: in which it is seen; None for the scene's.
 
         Raises:
             NoTable, UnknownName: if there is no such scene or object.
@@ -156,6 +162,13 @@ class Goals:
         self, scene: str | None, seed: int, moved: int | None, name: str, light: Light | None = None
     ) -> GoalRecord:
         """Keep a goal in which some objects of a scene lie elsewhere at random.
+
+        Args:
+            scene: None for the current one.
+            seed: of the layout.
+            moved: how many objects lie elsewhere; None to draw the number too.
+            name: for people.
+            light: in which it is seen; None for the scene's.
 
         Raises:
             NoTable, UnknownName: if there is no such scene.

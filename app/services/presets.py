@@ -85,6 +85,11 @@ def preset(name: str) -> Preset:
 def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, GoalRecord]:
     """Make a preset's table, which is then shown, and its goal.
 
+    Args:
+        chosen: the preset.
+        runner: takes the scene.
+        goals: take the goal.
+
     Raises:
         OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
     """

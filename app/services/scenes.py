@@ -123,11 +123,7 @@ class Scenes:
         return self._current
 
     def scene(self, scene: str) -> SceneRecord:
-        """One scene.
-
-        Raises:
-            UnknownName: if there is none.
-        """
+        """One scene; raises UnknownName if there is none."""
         with self._lock:
             if scene not in self._records:
                 raise UnknownName("scene", scene, self._records)
@@ -144,11 +140,15 @@ class Scenes:
         poses: tuple[tuple[str, Pose], ...] | None = None,
         image_size: int = DEFAULT_IMAGE_SIDE,
     ) -> SceneRecord:
-        """Make a scene and show it.
+        """Make a scene and show it; raises TooManyScenes, or an OsfError if it cannot be made: then nothing changes.
 
-        Raises:
-            TooManyScenes: if there are too many.
-            OsfError: if the request makes no sense or cannot be met; then nothing changes.
+        Args:
+            names: its objects; None for those of the poses, or random ones.
+            count: of random objects.
+            seed: decides whatever is left open; None for a random one.
+            light: None for a random one.
+            poses: T_world_object [m] by name; None for random ones at rest.
+            image_size: side of its camera images [px].
         """
         image_side(image_size)
         if poses is not None:
@@ -186,8 +186,7 @@ class Scenes:
         """Forget a scene; if it was shown, the latest other one is shown.
 
         Raises:
-            UnknownName: if there is none.
-            SceneHeld: if a job uses it.
+            UnknownName, SceneHeld: if there is none, or a job uses it.
         """
         self._check_free(scene)
         with self._lock:
@@ -200,23 +199,14 @@ class Scenes:
                 self._show(next(reversed(self._records), None))
 
     def activate(self, scene: str) -> SceneRecord:
-        """Show a scene in viewer and pages.
-
-        Raises:
-            UnknownName: if there is none.
-        """
+        """Show a scene in viewer and pages; raises UnknownName if there is none."""
         with self._lock:
             record = self.scene(scene)
             self._show(scene)
             return record
 
     def reset_scene(self, scene: str) -> SceneRecord:
-        """Put a scene back to how it was created.
-
-        Raises:
-            UnknownName: if there is none.
-            SceneHeld: if a job uses it.
-        """
+        """Put a scene back to how it was created; raises UnknownName if there is none, SceneHeld if a job uses it."""
         self._check_free(scene)
         return self._change(ResetScene(scene))
 
@@ -224,6 +214,12 @@ class Scenes:
         self, scene: str, light: Light | None = None, poses: tuple[tuple[str, Pose], ...] = (), *, settle: bool = False
     ) -> SceneRecord:
         """Move light and objects by hand, all or nothing.
+
+        Args:
+            scene: identifier.
+            light: None for as it is.
+            poses: T_world_object [m] of the objects to move, by name.
+            settle: whether objects then come to rest as if let go.
 
         Raises:
             UnknownName: if there is no such scene or object.
@@ -256,7 +252,13 @@ class Scenes:
         return await self._images.image(command)
 
     def observe(self, scene: str, folder: Path, *, goal: bool, masks: bool) -> SceneRecord:
-        """Write what the robot sees of a scene now as an observation folder; tells the scene as it was then.
+        """Write what the robot sees of a scene now; returns the scene as it was then.
+
+        Args:
+            scene: identifier.
+            folder: of the observation, to write.
+            goal: the goal camera's view alone, without the pusher.
+            masks: whether to tell each object's visible pixels.
 
         Raises:
             UnknownName: if there is no such scene.
@@ -269,8 +271,7 @@ class Scenes:
         """How a scene could become, seen by the goal camera; the scene stays as it is.
 
         Raises:
-            UnknownName: if there is no such scene or object.
-            SceneHeld: if a job uses the scene.
+            UnknownName, SceneHeld: if there is no such scene or object, or a job uses the scene.
             OsfError: if something would overlap, or makes no sense.
         """
         self.scene(command.id)

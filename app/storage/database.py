@@ -195,7 +195,16 @@ class Store:
     # Jobs and events
 
     def save_job(self, job: str, number: int, fields: dict[str, Any]) -> None:
-        """Insert or update a job; `number` orders them."""
+        """Insert or update a job.
+
+        Args:
+            job: identifier.
+            number: orders the jobs; an update leaves it.
+            fields: as JSON.
+
+        Raises:
+            CannotStore: if the disk is full.
+        """
         with self._transaction() as database:
             database.execute(
                 "INSERT INTO jobs VALUES (?, ?, ?) ON CONFLICT (id) DO UPDATE SET job = excluded.job",

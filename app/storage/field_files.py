@@ -30,6 +30,11 @@ def workshop(data_dir: Path, name: str) -> Path:
 def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
     """The workshop, emptied if it was left by another order than this one.
 
+    Args:
+        data_dir: of the service.
+        name: of the field.
+        order: plain JSON that tells everything the field will depend on.
+
     Raises:
         CannotWrite: if it cannot be made.
     """

@@ -80,7 +80,13 @@ def prefer_current_poses(
 
 
 def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """The goal, with objects that are there already (but for what estimates err) left exactly where they are."""
+    """The goal, with objects that are there already (but for what estimates err) left exactly where they are.
+
+    Args:
+        goal: where each object of the state should be.
+        state: where the objects are.
+        symmetries: by object; each goal is first turned to the nearest orientation that looks the same.
+    """
     goal = nearest_symmetric_goal(goal, state, symmetries)
     stay = {}
     for name in state.names:
@@ -92,7 +98,13 @@ def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, 
 
 
 def nearest_symmetric_goal(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """The goal with each orientation replaced by its nearest symmetric one (`Symmetry`) to the object's own."""
+    """The goal with each orientation replaced by the one nearest to the object's own of those that look the same.
+
+    Args:
+        goal: where each object should be; positions stay.
+        state: where the objects are.
+        symmetries: by object; one that is missing here keeps its goal.
+    """
     turned = {}
     for name, symmetry in symmetries.items():
         if name in goal.names and symmetry.kind != "none":

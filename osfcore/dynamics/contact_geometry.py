@@ -89,7 +89,13 @@ def outlines(
 
 
 def part_outlines(table: ShapeTable, number: int, pose: Pose) -> Float[np.ndarray, "R K 2"]:
-    """Outlines of one object's convex parts, seen from above [m]."""
+    """Outlines of one object's convex parts, seen from above in the world [m].
+
+    Args:
+        table: shapes, on the CPU.
+        number: which of them the object is.
+        pose: T_world_object.
+    """
     body = table.first_part[number] + torch.arange(int(table.part_count[number]))
     rotation = torch.as_tensor(quaternion_to_matrix(pose.quaternion), dtype=torch.float32)
     centre = torch.as_tensor(pose.apply(table.centre[number].numpy()), dtype=torch.float32)

@@ -198,7 +198,13 @@ def _edge(
 
 
 def mirrored(values: Tensor, flags: Tensor, kind: Literal["node", "edge", "motion"]) -> Tensor:
-    """Features or answers with those rows reflected along their x axis whose flag is set: left becomes right."""
+    """Features or answers with some rows reflected along their x axis: left becomes right.
+
+    Args:
+        values: one row for each object or edge.
+        flags: rows to reflect.
+        kind: what a row holds: features of a "node" or an "edge", or a "motion" (displacement and rotation vector).
+    """
     order, sign = _MIRRORS[kind]
     reflected = values[:, torch.tensor(order, device=values.device)] * values.new_tensor(sign)
     return torch.where(flags[:, None], reflected, values)

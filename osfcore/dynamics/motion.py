@@ -58,6 +58,12 @@ def lowest_point(
 
     The lowest of what is farthest straight down and in directions around it: one alone may find the wrong end of a face
     that hardly tilts.
+
+    Args:
+        table: shapes of the objects.
+        number: which of them each object is.
+        centre: of mass, in the world [m].
+        quaternion: orientations in the world, unit.
     """
     around = functional.pad(_ASIDE * circle(8, centre.device), (0, 1), value=-1.0)
     down = torch.cat([centre.new_tensor([[0.0, 0.0, -1.0]]), around])

@@ -27,10 +27,15 @@ def network_path(data_dir: Path | None) -> Path:
 
 
 def load_shapes(data_dir: Path | None, fields: FieldLibrary, names: Iterable[str]) -> dict[str, ObjectShape]:
-    """The shapes of some objects, each from its field.
+    """The shapes of some objects by name, each from its field.
 
     A field that is seen for the first time is cut into convex parts, which takes up to half a minute; they are kept in
     DATA_DIR/dynamics/parts.
+
+    Args:
+        data_dir: DATA_DIR; where it is None, nothing is kept.
+        fields: of the objects.
+        names: which objects.
 
     Raises:
         UnknownName: if an object has no field.
@@ -61,8 +66,15 @@ def load_push_model(
 ) -> PushModel:
     """The network with the shapes of some objects, each from its field.
 
+    Args:
+        data_dir: as in `load_shapes`; a network in it comes before the package's.
+        fields: of the objects.
+        names: which objects.
+        device: that computes.
+
     Raises:
         UnknownName: if an object has no field.
         CorruptFile: if a file is broken.
+        OsfError: if nothing in a field is solid.
     """
     return PushModel(read_network(network_path(data_dir)), load_shapes(data_dir, fields, names), device)

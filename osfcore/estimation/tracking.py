@@ -91,9 +91,12 @@ class TrackingConfig:
 
 
 def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
-    """By how much each object's images differ from what is rendered where it stands [radiance].
+    """RMS residual of each object where it stands [radiance]: fields err; what is normal here tells later what is not.
 
-    Fields err, some more than others and more under some lights: what is normal here tells later what is not.
+    Args:
+        models: fields of the objects and the table.
+        observation: one or more views; masks play no part.
+        state: what to render, an estimate from this observation; the pusher is the observation's.
     """
     return object_residuals(
         evaluate_fit(models, views_of(observation, FINE_SIDE, samples=2), SceneParameters.of(state, observation.pusher))

@@ -51,7 +51,13 @@ class FitQuality:
 
 
 def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> FitQuality:
-    """Compare a guess with the images."""
+    """Compare a guess with the images.
+
+    Args:
+        models: fields of the objects and the table.
+        views: what was observed; masks, where there are any, give the overlap of silhouettes.
+        params: the guess.
+    """
     batch: SceneBatch = params.perturbed(np.zeros((1, params.size)))
     rendered = models.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
     assert rendered.opacity is not None

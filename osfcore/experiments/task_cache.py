@@ -66,6 +66,11 @@ class TaskCache:
     def write(self, name: str, circumstances: Mapping[str, Any], result: TaskResult) -> None:
         """Keep the result of a task.
 
+        Args:
+            name: of the task.
+            circumstances: plain JSON, as `read` will be asked.
+            result: with one comparison or more, all of one image size.
+
         Raises:
             CannotWrite: if the disk refuses.
         """

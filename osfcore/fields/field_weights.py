@@ -142,7 +142,12 @@ def read_tensors(path: Path, expected: str) -> Tensors:
 
 
 def tensors_from_bytes(data: bytes, expected: str, where: Path | str) -> Tensors:
-    """The same from the contents of a file; `where` is what messages name.
+    """Metadata and tensors from the contents of a safetensors file.
+
+    Args:
+        data: the contents.
+        expected: format that the metadata must name.
+        where: what messages name.
 
     Raises:
         CorruptFile: if they are cut short or of another format or version.

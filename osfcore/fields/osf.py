@@ -77,6 +77,11 @@ def outgoing_radiance(
 
     The integral over light directions is the one term rho * L_light, linear in the light's intensity. Deviation:
     ambient light has an intensity of its own, so that a lamp can be dimmed or shadowed without it.
+
+    Args:
+        scatter: both parts of rho.
+        light_intensity: L_light at the points, relative to the lamp of the training images.
+        ambient_intensity: likewise, relative to their ambient light.
     """
     return ambient_intensity * scatter.ambient + light_intensity * scatter.direct
 

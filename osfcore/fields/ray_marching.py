@@ -33,8 +33,15 @@ def optical_density(g):  # noqa: ANN001, ANN201
 
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
-def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201
-    """Trilinear value at voxel coordinates of a grid that begins at `start` of a flat array."""
+def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201, D417
+    """Trilinear value at a point of a grid.
+
+    Args:
+        flat: values on the corners of one or several grids.
+        start: where the grid begins in it.
+        ny, nz: corners along y and z.
+        px, py, pz: the point in voxel coordinates, moved into the grid by `within`.
+    """
     i, j, k = int(px), int(py), int(pz)
     fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)  # int64 would promote to double
     at = start + (i * ny + j) * nz + k
@@ -55,8 +62,14 @@ def within(p, count):  # noqa: ANN001, ANN201
 
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
-def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201
-    """The part of [t0, t1] in which origin + t * direction lies between low and high."""
+def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201, D417
+    """The part of a ray that lies between two bounds on one axis; it ends before it begins where there is none.
+
+    Args:
+        origin, direction: of the ray on this axis.
+        low, high: the bounds.
+        t0, t1: the part of the ray that is left so far.
+    """
     if abs(direction) < np.float32(1e-9):
         return (t0, t1) if low < origin < high else (_ONE, -_ONE)
     a, b = (low - origin) / direction, (high - origin) / direction
@@ -65,7 +78,15 @@ def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
-    """How far a ray stays, on one axis, among the blocks less than `distance` away from its own; inverse: of d."""
+    """How far along a ray it stays, on one axis, among the blocks known to be empty.
+
+    Args:
+        p: where the ray is [voxels].
+        d: component of its direction [voxels per unit of t].
+        inverse: of d.
+        block: number of its block on this axis.
+        distance: blocks less than this far away are empty (`KiloOSF.macro`).
+    """
     if d >= np.float32(0):
         return (np.float32((block + distance) * MACRO) - p) * inverse
     return (p - np.float32((block + 1 - distance) * MACRO)) * abs(inverse)

@@ -70,7 +70,17 @@ def shell_field(
     origin: np.ndarray, voxel: float, features: Float32[np.ndarray, "nx ny nz 8"], keep: Bool[np.ndarray, "nx ny nz"],
     cells: np.ndarray, networks: np.ndarray, ambient: np.ndarray,
 ) -> KiloOSF:  # fmt: skip
-    """A field of the corners in `keep`; those on the grid's faces stay empty, so that nothing is cut off."""
+    """A field of some corners of a grid; those on the grid's faces stay empty, so that nothing is cut off.
+
+    Args:
+        origin: corner (0, 0, 0) of the grid [m].
+        voxel: side of a voxel [m].
+        features: of all corners.
+        keep: corners that belong to the shell.
+        cells: number of the tiny network of each cell.
+        networks: parameters of the tiny networks; their width follows from them.
+        ambient: what an unlit white point sends out, per colour.
+    """
     keep = keep.copy()
     for axis in range(3):
         np.moveaxis(keep, axis, 0)[[0, -1]] = False
@@ -84,7 +94,14 @@ def shell_field(
 
 
 def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Generator) -> KiloOSF:
-    """The same field on a finer grid, kept only around the surfaces that some view sees."""
+    """The same field on a finer grid, kept only around the surfaces that some view sees.
+
+    Args:
+        field: on the coarse grid.
+        images: the views.
+        across: voxels along the longest side of what is occupied.
+        rng: chooses the pixels to look at, where there are very many.
+    """
     origin, voxel, shape = grid_over(field.extent, across)
     coarse = np.where((field.index > 0)[..., None], field.rows[field.index], 0)
     coarse[..., 0] = field.density
@@ -101,7 +118,13 @@ def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Gene
 
 
 def seen_corners(field: KiloOSF, images: ImageSet, rng: np.random.Generator) -> Bool[np.ndarray, "nx ny nz"]:
-    """The grid corners next to which some pixel's ray finds something."""
+    """The grid corners next to which some pixel's ray finds something.
+
+    Args:
+        field: what is looked at.
+        images: the views.
+        rng: chooses the pixels to look at, where there are very many.
+    """
     source = RaySource(images)
     pixels = source.silhouette_pixels()
     pixels = rng.permutation(pixels)[:_PIXELS_LOOKED_AT]

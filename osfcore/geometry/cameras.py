@@ -68,10 +68,18 @@ class Camera:
         fov_y_deg: float = FIELD_OF_VIEW_DEG,
         up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     ) -> Camera:
-        """A square camera at `position` [m] that looks at `target` [m] with `up` upwards in its image.
+        """A camera with a square image that looks at a point.
+
+        Args:
+            name: how files and pages call it.
+            position: of the optical centre in the world [m].
+            target: what appears in the middle of the image [m].
+            size: sides of the image [px].
+            fov_y_deg: angle of view, vertical and horizontal [deg].
+            up: world direction that points upwards in the image; world y takes its place for a view along it.
 
         Raises:
-            InvalidInput: if both points coincide.
+            InvalidInput: if both points coincide or are not finite, or `size` is outside 16 to 1024.
         """
         origin = finite_vector(position, 3, f"position of camera {name} [m]")
         forward = finite_vector(target, 3, f"target of camera {name} [m]") - origin

@@ -76,11 +76,19 @@ def _decomposed(
 def reduced_hull(
     points: Float[np.ndarray, "P 3"], max_vertices: int = MAX_VERTICES, tolerance_m: float = CUT_TOLERANCE_M
 ) -> Float[np.ndarray, "M 3"] | None:
-    """Few of the points whose hull leaves out no other by more than `tolerance_m`, or None if they span no volume.
+    """A convex hull of few vertices around points, or None if they span no volume.
 
     Starts from the extremes along 13 axes and adds the point that sticks out most, again and again. Where
     `max_vertices` do not suffice, the hull is swollen by half of what still sticks out, or until only about twice the
     tolerance does.
+
+    Args:
+        points: what it shall enclose [m].
+        max_vertices: where adding stops; the first extremes, at most 26, stay in any case.
+        tolerance_m: by which points may stick out [m].
+
+    Returns:
+        Vertices of the hull: some of the points, moved outward if it was swollen.
     """
     try:
         points = points[ConvexHull(points).vertices]

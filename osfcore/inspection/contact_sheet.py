@@ -71,7 +71,14 @@ def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 
 
 
 def put_text(sheet: UInt8[np.ndarray, "H W 3"], text: str, place: tuple[int, int], width: int) -> None:
-    """Small black letters, cut to a width [px]."""
+    """Write small black letters into an image, in place.
+
+    Args:
+        sheet: the image.
+        text: letters that do not fit are left out at its end.
+        place: (x, y) of the lower left corner of the text [px].
+        width: room for the text [px].
+    """
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.32
     while text and cv2.getTextSize(text, font, scale, 1)[0][0] > width:
         text = text[:-1]

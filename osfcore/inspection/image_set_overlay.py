@@ -71,7 +71,17 @@ def draw_line(
     width: int,
     label: str = "",
 ) -> None:
-    """Draw the part of a line between world points that lies before the camera; a labelled one is an arrow."""
+    """Draw the part of a line between world points that lies before the camera, in place.
+
+    Args:
+        bgr: the camera's image.
+        camera: that took it.
+        a: start of the line, world frame [m].
+        b: end of the line [m].
+        colour: BGR.
+        width: of the line [px].
+        label: written beside `b`; a labelled line is an arrow to it.
+    """
     depth = camera.T_world_camera.inverse().apply(np.stack([a, b]))[:, 2]
     near = _NEAR * float(np.abs(depth).max())
     if depth.max() <= near:
@@ -88,6 +98,13 @@ def draw_line(
 
 
 def draw_text(bgr: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    """Write small letters with a shadow, their lower left corner at a pixel."""
+    """Write small letters with a shadow into an image, in place.
+
+    Args:
+        bgr: the image.
+        text: ASCII; OpenCV's font has nothing else.
+        place: (x, y) of the lower left corner of the text [px].
+        colour: BGR.
+    """
     for x, y, shade in ((place[0] + 1, place[1] + 1, (0, 0, 0)), (*place, colour)):
         cv2.putText(bgr, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, shade, 1, cv2.LINE_AA)

@@ -25,6 +25,11 @@ def psnr(
     The MSE is the mean over the pixels of the mask and the three colours. A difference of d everywhere gives
     -20 log10(d). Equal images would give infinity; they get 100 dB, so that means stay finite.
 
+    Args:
+        truth: linear radiance in [0, 1].
+        image: what is compared with it.
+        mask: pixels that count; all by default.
+
     Raises:
         InvalidInput: if shapes differ, or the mask has no pixel.
     """

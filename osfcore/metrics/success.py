@@ -58,7 +58,13 @@ class RearrangementScore:
 
 
 def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, Symmetry]) -> RearrangementScore:
-    """The score of a true state at the end."""
+    """The score of a rearrangement.
+
+    Args:
+        task: start, goal, and which objects had to move, at least one.
+        end: the true state at the end.
+        symmetries: of every object of the task, by name.
+    """
     mm, deg, pose6d = {}, {}, []
     for name in task.start.names:
         here, there = end.pose(name), task.goal.pose(name)

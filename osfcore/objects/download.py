@@ -59,7 +59,13 @@ def temporary_folder(parent: Path, what: str) -> Iterator[Path]:
 
 
 def remove_old(parent: Path, prefix: str, age_s: float) -> None:
-    """Remove folders of that prefix which are older than `age_s` [s]."""
+    """Remove folders that a killed process left behind.
+
+    Args:
+        parent: folder in which they lie.
+        prefix: of their names.
+        age_s: since their last change, from which on they are removed [s].
+    """
     for path in parent.glob(f"{prefix}*"):
         with contextlib.suppress(OSError):  # another process may be removing it, too
             if time.time() - path.stat().st_mtime > age_s:
@@ -68,6 +74,11 @@ def remove_old(parent: Path, prefix: str, age_s: float) -> None:
 
 def download(address: str, path: Path, max_bytes: int = MAX_BYTES) -> bool:
     """Load a file from an http(s) address, with a few tries; False if the server does not have it.
+
+    Args:
+        address: URL.
+        path: where the file goes, over an older one.
+        max_bytes: largest size that is accepted [bytes].
 
     Raises:
         FetchFailed: if the server cannot be reached, answers with an error, sends too much or breaks off, or the disk
@@ -116,7 +127,12 @@ def _save(answer: http.client.HTTPResponse, path: Path, max_bytes: int, address:
 
 
 def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
-    """Unpack a tar archive into `folder`; nothing in it can land elsewhere.
+    """Unpack a tar archive; nothing in it can land outside the folder.
+
+    Args:
+        archive: .tar, also compressed.
+        folder: where its files go.
+        max_bytes: largest sum of its files' sizes that is accepted [bytes].
 
     Raises:
         CorruptFile: if it is damaged, too large or holds anything but plain files and folders inside `folder`.

@@ -112,9 +112,15 @@ def _converted(
 def convert(files: MeshFiles, info: ObjectInfo, library: AssetLibrary, source: str) -> None:
     """Read one object's files, make its collision parts and resting orientations, and write it.
 
+    Args:
+        files: mesh and texture.
+        info: the catalogue's facts about the object.
+        library: where it goes, over an older one of that name.
+        source: where the files came from, for people.
+
     Raises:
         CorruptFile: if a file is damaged.
-        InvalidInput: if the mesh is not of a tabletop object's size.
+        InvalidInput: if the mesh is not of a tabletop object's size, or encloses no volume.
         FetchFailed: if the disk is full.
     """
     library.write(make_asset(_read(files), info), source)

@@ -16,7 +16,14 @@ _RIM_TEXELS = 2  # JPEG mixes the background into this many texels of a chart's 
 def coverage(
     uv: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
 ) -> UInt8[np.ndarray, "height width"]:
-    """1 for each texel that a face touches, else 0; first row at v = 1."""
+    """1 for each texel that a face touches, else 0; first row at v = 1.
+
+    Args:
+        uv: texture coordinates of the vertices, v upwards; what lies outside [0, 1] is cut off.
+        faces: vertex indices.
+        width: of the texture [texels].
+        height: of the texture [texels].
+    """
     mask = np.zeros((height, width), np.uint8)
     pixels = np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], axis=1) - 0.5
     corners = np.round(pixels * 2**_SUBPIXEL_BITS).astype(np.int32)[faces]
@@ -52,10 +59,16 @@ def clean_texture(
     faces: Int[np.ndarray, "F 3"],
     max_side: int = MAX_TEXTURE_SIDE,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """The texture at most `max_side` texels a side, with everything outside the charts filled from their rims.
+    """The texture, reduced if need be, with everything outside the charts filled from their rims.
 
     A covered texel of the result is the mean of the covered texels beneath it. A texture of which no face covers
-    anything comes back unfilled.
+    anything comes back as it is.
+
+    Args:
+        texture: RGB.
+        uv: texture coordinates of the vertices, v upwards.
+        faces: vertex indices.
+        max_side: longest side of the result [texels].
     """
     height, width = texture.shape[:2]
     covered = coverage(uv, faces, width, height)

@@ -40,7 +40,15 @@ class PushSource(Protocol):
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "P T 3"]:
-        """About `count` sequences of actions [m/s]."""
+        """Sequences of actions [m/s].
+
+        Args:
+            state: of the scene, with its pusher.
+            goal: where everything should be.
+            count: how many are wanted; fewer may come back, and none where nothing needs a push.
+            horizon: actions in each sequence (T).
+            rng: draws them.
+        """
         ...
 
 

@@ -2,7 +2,7 @@
 
 Conventions of coordinates, types and inlining are those of `kernels.py`.
 """
-# ruff: noqa: ANN001, ANN201, ANN202 - compiled helpers; types are given by their callers
+# ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
 
 from __future__ import annotations
 
@@ -18,7 +18,15 @@ _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 @numba.njit(**HELPER)
 def clip_to_extent(reach, n, ox, oy, oz, ix, iy, iz, far, step):
-    """First and last sample of a ray within the occupied part of object n; last < first: none."""
+    """First and last sample of a ray within the occupied part of an object; last < first: none.
+
+    Args:
+        reach, n: occupied parts (`launch.Scene`), and which one.
+        ox, oy, oz: ray origin in the object's voxel coordinates.
+        ix, iy, iz: components of its direction [voxels/m], inverted.
+        far: where the ray ends [m].
+        step: between samples [m].
+    """
     a, b = (reach[n, 0] - ox) * ix, (reach[n, 3] - ox) * ix
     t0, t1 = max(_ZERO, min(a, b)), min(far, max(a, b))
     a, b = (reach[n, 1] - oy) * iy, (reach[n, 4] - oy) * iy
@@ -32,7 +40,15 @@ def clip_to_extent(reach, n, ox, oy, oz, ix, iy, iz, far, step):
 
 @numba.njit(**HELPER)
 def next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels):
-    """The next sample k <= last of field a with any density, and its optical depth; k > last if there is none."""
+    """The next sample of a field with any density, and its optical depth; past `last` if there is none.
+
+    Args:
+        pack, a: fields (`packing.Packed`), and which one.
+        ox, oy, oz: ray origin in the field's voxel coordinates.
+        dx, dy, dz: its direction [voxels/m]; ix, iy, iz: each component inverted.
+        k, last: sample to begin with, and the ray's last one.
+        step, step_voxels: between samples, in [m] and in [voxels].
+    """
     corners, blocks = pack.starts[a, 0], pack.starts[a, 2]
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
     my, mz = pack.shapes[a, 4], pack.shapes[a, 5]
@@ -81,7 +97,15 @@ def _transform(matrix, b, n, m, x, y, z):
 
 @numba.njit(**HELPER)
 def light_transmittance(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
-    """Share of the light that reaches a point in object n's voxel coordinates past all others; n = N: of the world."""
+    """Share of the light that reaches a point of object n past all other objects; n = N: a point of the world.
+
+    Args:
+        pack, fields, scene: as in `kernels.render_batch`.
+        b, n: scene, and object that does not shade the point.
+        x, y, z: the point, in voxel coordinates of object n or in the world [m].
+        step_voxels: between samples of the shadow ray [voxels].
+        enough: optical depth past which no light counts.
+    """
     depth = _ZERO
     for m in range(len(fields)):
         if m != n and depth < enough:
@@ -163,7 +187,17 @@ def _run_network(flat, at, hidden, inputs, h1, h2):
 
 @numba.njit(**HELPER)
 def radiance_at(pack, fields, scene, b, n, t, rules, work):
-    """Rho of object n where the ray of `work` is at t, in out[0:6], and the light that reaches it."""
+    """Rho of object n where the ray of `work` is at t, left in work.out[0:6].
+
+    Args:
+        pack, fields, scene, rules: as in `kernels.render_batch`.
+        b, n: scene and object.
+        t: distance from the camera [m].
+        work: the thread's ray and memory; light found before is kept in it, for `rules.one_shadow`.
+
+    Returns:
+        Transmittance from there toward the light; 0, unasked, where the object scatters no direct light.
+    """
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
     a, view = fields[n], work.where[0]
     x = within(scene.eye[b, view, n, 0] + t * d[n, 0], pack.shapes[a, 0])

@@ -6,7 +6,7 @@ asks for light; t is in metres throughout. Arrays are indexed in full, never sli
 they meet one, and helpers are inlined and count no references (`_nrt=False`; they allocate nothing): slices, double
 precision and counting would each cost more than the arithmetic here.
 """
-# ruff: noqa: ANN001, ANN202 - compiled helpers; types are given by their callers
+# ruff: noqa: ANN001, ANN202, D417 - compiled helpers; types are given by their callers
 
 from __future__ import annotations
 
@@ -224,10 +224,13 @@ def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_di
                  outlines, rules, only, rgb, opacity, distance) -> None:  # fmt: skip
     """Every image of a batch; what no object and no shadow can touch is copied from the empty table.
 
-    fields: N; scene: see `launch.Scene`; cameras: V x 12; base_of: number of the base light of each scene; boxes,
-    shadows: B x V x N x 4 (columns from, to, rows from, to); outlines: see `launch.Outlines`; only: V x h x w, 0 for
-    pixels that stay black, or empty; rgb: B x V x h x w x 3;
-    opacity: B x V x N' x h x w or empty; distance: B x V x h x w or empty.
+    Args:
+        pack, fields: packed fields, and that of each of N objects; table, scene, outlines, rules: types of `launch`.
+        directs, cameras: B x 3 direct light on a white table; V x 12 numbers of `types.camera_numbers`.
+        base_rgb, base_distance, base_of: L empty tables (see `render_base`), and which of them each scene has.
+        boxes, shadows: B x V x N x 4, pixels of objects and of their shadows (columns from, to, rows from, to).
+        only: V x h x w, 0 for pixels that stay black, or empty.
+        rgb, opacity, distance: results: B x V x h x w x 3; B x V x N' x h x w or empty; B x V x h x w or empty.
     """
     scenes, views, height, width = rgb.shape[0], rgb.shape[1], rgb.shape[2], rgb.shape[3]
     count = len(fields)

@@ -71,7 +71,7 @@ class Rules(NamedTuple):
     samples: int
 
 
-def launch(
+def launch(  # noqa: D417
     pack: Packed,
     numbers: Int[np.ndarray, "N"],
     table: TableField | None,
@@ -82,7 +82,12 @@ def launch(
     outputs: frozenset[str] | set[str],
     only: Bool[np.ndarray, "V h w"] | None,
 ) -> Rendered:
-    """Render a batch; `numbers` are the objects' fields in the pack, the pusher's last."""
+    """Render a batch on the CPU.
+
+    Args:
+        pack, numbers, size: fields, which of them each object has (the pusher's last), and h, w of the images [px].
+        table, batch, cameras, quality, outputs, only: as in `SceneRenderer` and its `render`.
+    """
     rotations, positions = poses_of(batch)
     scenes, views, count = len(batch.lights), len(cameras), len(batch.names)
     lenses = np.array([camera_numbers(camera) for camera in cameras])

@@ -85,7 +85,18 @@ def render_on_device(
     fields: Mapping[str, KiloOSF], table: TableField | None, batch: SceneBatch, cameras: Sequence[Camera], device: str,
     quality: Quality, outputs: frozenset[str] | set[str], only: Bool[np.ndarray, "V h w"] | None = None,
 ) -> Rendered:  # fmt: skip
-    """A batch in single precision on a PyTorch device."""
+    """A batch in single precision on a PyTorch device.
+
+    Args:
+        fields: by name.
+        table: None for black surroundings.
+        batch: B scenes.
+        cameras: V cameras of one image size.
+        device: PyTorch's name of it.
+        quality: only its spacing of samples and rays per pixel count; nothing is skipped here.
+        outputs: as in `SceneRenderer.render`.
+        only: pixels to keep; all others come out black and empty.
+    """
     rendered = _render_batch(fields, table, batch, cameras, torch.device(device), torch.float32, quality, outputs)
     if only is None:
         return rendered

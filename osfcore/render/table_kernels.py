@@ -1,5 +1,5 @@
 """Compiled rays from pixels to the table, and the table where nothing stands on it."""
-# ruff: noqa: ANN001, ANN201 - compiled helpers; types are given by their callers
+# ruff: noqa: ANN001, ANN201, D417 - compiled helpers; types are given by their callers
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 @numba.njit(**HELPER)
 def pixel_ray(cameras, view, u, v):
-    """Unit direction through pixel coordinates, and 1 / the length it had."""
+    """Unit direction in the world through a place of the image, and 1 / the length it had.
+
+    Args:
+        cameras, view: V x 12 numbers of `types.camera_numbers`, and which camera.
+        u, v: the place [px], columns and rows.
+    """
     x = cameras[view, 3] * u + cameras[view, 4] * v + cameras[view, 5]
     y = cameras[view, 6] * u + cameras[view, 7] * v + cameras[view, 8]
     z = cameras[view, 9] * u + cameras[view, 10] * v + cameras[view, 11]
@@ -27,7 +32,13 @@ def pixel_ray(cameras, view, u, v):
 
 @numba.njit(**HELPER)
 def meet_table(table, cameras, view, dx, dy, dz):
-    """Distance along a ray to the table; very far if it misses."""
+    """Distance along a camera's ray to the table [m]; `FAR` if it misses.
+
+    Args:
+        table: `launch.Table`.
+        cameras, view: as in `pixel_ray`.
+        dx, dy, dz: unit direction in the world.
+    """
     if table.exists and dz < -TINY and cameras[view, 2] > _ZERO:
         t = -cameras[view, 2] / dz
         x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
@@ -38,7 +49,14 @@ def meet_table(table, cameras, view, dx, dy, dz):
 
 @numba.njit(**HELPER)
 def table_colour(table, directs, b, x, y, visible):
-    """Radiance of the table at a point of it."""
+    """Radiance of the table at a point of it.
+
+    Args:
+        table: `launch.Table`.
+        directs, b: direct light on a white table (a row for each light), and which row.
+        x, y: the point in the world [m].
+        visible: transmittance from there toward the light.
+    """
     g = len(table.albedo)
     u = (x / table.half_side + _ONE) * _HALF * np.float32(g - 1)
     v = (y / table.half_side + _ONE) * _HALF * np.float32(g - 1)
@@ -58,7 +76,16 @@ def table_colour(table, directs, b, x, y, visible):
 
 @numba.njit(**KERNEL)
 def render_base(table, cameras, directs, samples, rgb, distance) -> None:
-    """The empty, unshaded table under L lights from V cameras: rgb L x V x h x w x 3; distance likewise, 0: nothing."""
+    """The empty, unshaded table under L lights from V cameras.
+
+    Args:
+        table: `launch.Table`.
+        cameras: V x 12 numbers of `types.camera_numbers`.
+        directs: L x 3, direct light on a white table.
+        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough.
+        rgb: result, L x V x h x w x 3.
+        distance: result, L x V x h x w [m]; 0 where there is no table.
+    """
     lights, views, height, width = distance.shape
     for job in numba.prange(lights * views * height):
         row, view, b = job % height, (job // height) % views, job // (height * views)

@@ -116,6 +116,12 @@ def check_request(
 ) -> tuple[int, int]:
     """Height and width of the images [px], after everything asked for was found possible.
 
+    Args:
+        fields: those there are, by name.
+        batch: scenes to render.
+        cameras: from which.
+        outputs: names of what is asked for.
+
     Raises:
         UnknownName: if an object has no field.
         InvalidInput: if there is no camera, cameras differ in size, or an output is unknown.

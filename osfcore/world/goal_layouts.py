@@ -22,9 +22,14 @@ _RESTS_M, _RESTS_RAD = 0.002, 0.03  # by how much an object may move when it is 
 
 
 def draw_goal(world: Tabletop, count: int, rng: np.random.Generator) -> tuple[SceneState, tuple[str, ...]] | None:
-    """How the table could become, with `count` objects elsewhere, and which; None if there is no room.
+    """How the table could become with some objects elsewhere, and which; None if there is no room.
 
-    The world is left as the goal is, at rest.
+    The world is left as the goal is, at rest, or anyhow if there is none.
+
+    Args:
+        world: with the objects where they start from.
+        count: of objects that move.
+        rng: chooses them and their places.
     """
     start = world.truth()
     moved = tuple(start.names[int(n)] for n in rng.permutation(len(start.names))[:count])
@@ -60,8 +65,13 @@ def _shifted(world: Tabletop, name: str, pose: Pose, rng: np.random.Generator) -
 def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneState, tuple[str, ...]]:
     """A random layout with some objects elsewhere, and which; the world is left like that.
 
+    Args:
+        world: with the objects where they start from.
+        seed: of everything random.
+        moved: how many objects move; None for a random number.
+
     Raises:
-        InvalidInput: if more shall move than there are.
+        InvalidInput: if more shall move than there are, or none.
         NoRoom: if none has room.
     """
     start = world.truth()

@@ -213,14 +213,23 @@ class Physics:
     def set_velocity(
         self, name: str, linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"] | None = None
     ) -> None:
-        """Give an object's centre of mass a velocity [m/s], and the object an angular velocity [rad/s], 0 if None."""
+        """Let an object move from now on.
+
+        Args:
+            name: which object.
+            linear: velocity of its centre of mass in the world [m/s].
+            angular: angular velocity in the world [rad/s]; 0 if None.
+        """
         turning = [0.0, 0.0, 0.0] if angular is None else angular.tolist()
         pybullet.resetBaseVelocity(self._bodies[name].uid, linear.tolist(), turning, physicsClientId=self._client)
 
     def distance(self, first: str, second: str | None, reach_m: float = 0.05) -> float:
-        """Gap between two objects, or an object and the pusher (None) [m]; negative if they penetrate.
+        """Gap between two objects, or an object and the pusher [m]; negative if they penetrate.
 
-        Gaps of more than `reach_m` come back as `reach_m`.
+        Args:
+            first: an object.
+            second: another object, or None for the pusher.
+            reach_m: returned for gaps that are larger.
         """
         other = self._pusher if second is None else self._bodies[second].uid
         return self._gap(self._bodies[first].uid, other, reach_m)

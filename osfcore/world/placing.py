@@ -27,6 +27,11 @@ CALM_TURN_RAD_S = 2e-2
 def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> None:
     """Drop all objects in random stable poses without overlap, let them rest, put the pusher in a free place.
 
+    Args:
+        physics: a simulation of these objects; it starts over.
+        assets: of the objects, by name.
+        rng: draws poses and places.
+
     Raises:
         NoRoom: if no layout was found.
     """
@@ -42,7 +47,13 @@ def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.
 
 
 def settle(physics: Physics, names: tuple[str, ...], limit_steps: int = _SETTLE_LIMIT_STEPS) -> int:
-    """Step without pushing until nothing has moved for a twentieth of a second; return the steps taken."""
+    """Step without pushing until nothing has moved for a twentieth of a second; return the steps taken.
+
+    Args:
+        physics: steps in place.
+        names: objects that shall come to rest.
+        limit_steps: when to give up.
+    """
     calm = 0
     for step in range(limit_steps):
         if calm >= _CALM_STEPS:

@@ -270,7 +270,17 @@ class Tabletop:
         self._light = light
 
     def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """Images from any cameras of one image size, with masks on demand, with or without the pusher."""
+        """Images of the present state from any cameras.
+
+        Args:
+            cameras: of one image size.
+            masks: take the objects' masks as well.
+            with_pusher: draw the pusher.
+
+        Raises:
+            InvalidInput: if there is no camera, or they differ in image size.
+            OsfError: if the table is empty.
+        """
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise InvalidInput("image sizes", [(c.width, c.height) for c in cameras], "the same for all cameras")
         pictures = self.pictures(cameras, with_pusher=with_pusher)

@@ -166,7 +166,13 @@ class SceneObject(ObjectJson):
 
     @staticmethod
     def labelled(name: str, pose: Pose, labels: dict[str, str]) -> SceneObject:
-        """With its label, where it has one."""
+        """An object with its label.
+
+        Args:
+            name: of the object.
+            pose: T_world_object [m].
+            labels: by name; an object without one is called by its name.
+        """
         return SceneObject(**dict(ObjectJson.of(name, pose)), label=labels.get(name, name))
 
 
@@ -187,7 +193,13 @@ class SceneOut(BaseModel):
 
     @staticmethod
     def of(record: SceneRecord, labels: dict[str, str], *, is_current: bool) -> SceneOut:
-        """From the simulation's record."""
+        """From the simulation's record.
+
+        Args:
+            record: of the scene.
+            labels: of objects, by name.
+            is_current: whether viewer and page show this scene.
+        """
         state = record.state
         return SceneOut(
             id=record.id,

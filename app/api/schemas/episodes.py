@@ -163,7 +163,14 @@ class EpisodeOut(BaseModel):
     def of_job(
         job: Job, settings: EpisodeSettings, report: dict[str, Any] | None, files: tuple[str, ...]
     ) -> EpisodeOut:
-        """From the registry's job and what it has written so far."""
+        """From the registry's job and what it has written so far.
+
+        Args:
+            job: of the kind "episode".
+            settings: as they are now.
+            report: what report.json holds; None before there is one, or where steps are not asked for.
+            files: names that can be downloaded.
+        """
         report, result = report or {}, job.result or {}
         return EpisodeOut(
             id=job.id,

@@ -98,7 +98,14 @@ class EstimateOut(BaseModel):
     def of_job(
         job: Job, steps: tuple[dict[str, Any], ...], estimate: EstimateJson | None, errors: dict[str, Any] | None
     ) -> EstimateOut:
-        """From the registry's job and what it has made."""
+        """From the registry's job and what it has made.
+
+        Args:
+            job: of the kind "estimate".
+            steps: as `read_steps` tells them; none where they are not asked for.
+            estimate: the result; None before it is there, or where it is not asked for.
+            errors: against the truth, as `errors_of` tells them; None where nobody knows it.
+        """
         return EstimateOut(
             id=job.id,
             mode=job.params["mode"],

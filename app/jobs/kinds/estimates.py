@@ -99,7 +99,15 @@ def load_models(data_dir: Path, names: tuple[str, ...]) -> ObjectModels:
 def steps_of(
     mode: Mode, models: ObjectModels, observation: Observation, prior: SceneState | None, rng: np.random.Generator
 ) -> Iterator[EstimateStep]:
-    """The estimator for a first frame, a later one (begun at the prior), or a goal image (objects as in the prior)."""
+    """The estimator that a mode asks for, which begins to work when its first step is taken.
+
+    Args:
+        mode: "next" or "goal"; without a prior it plays no part.
+        models: fields of the objects and the table.
+        observation: with masks for a first frame; of one view for a goal.
+        prior: where "next" begins, or how the objects of a goal lie now; None for a first frame.
+        rng: of the searches; a goal needs none.
+    """
     if prior is None:
         from osfcore.estimation.first_frame import estimate_first
 

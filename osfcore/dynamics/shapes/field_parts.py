@@ -66,6 +66,11 @@ def _without_specks(solid: np.ndarray) -> np.ndarray:
 def write_parts(path: Path, parts: Parts, field_digest: str) -> None:
     """Write the parts of a field.
 
+    Args:
+        path: of the file.
+        parts: corners of each part, in the object's frame [m].
+        field_digest: of the field's file; `read_parts` refuses the parts of another.
+
     Raises:
         CannotWrite: if the disk refuses.
     """

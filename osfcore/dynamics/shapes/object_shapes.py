@@ -145,12 +145,23 @@ class ShapeTable:
 
         The points are those of the nearest direction on the map, 3.6 deg away at most: they reach 0.03 to 0.25 mm less
         far than the farthest ones (rms over all directions), and some millimetres less beside the normal of a face.
+
+        Args:
+            number: of each body in the table.
+            rotation: from each body's frame to the world.
+            directions: of any length but 0, the same for all bodies or for each its own.
         """
         local = directions @ rotation  # R^T d for every d
         return self._support(number, local) @ rotation.transpose(1, 2)
 
     def extents(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "... D 3"]) -> Tensor:
-        """How far A bodies reach in D directions of the world from their centres of mass (A, D) [m]."""
+        """How far A bodies reach in D directions of the world from their centres of mass (A, D) [m].
+
+        Args:
+            number: of each body in the table.
+            rotation: from each body's frame to the world.
+            directions: unit vectors, the same for all bodies or for each its own.
+        """
         local = directions @ rotation
         reach = self._support(number, local) * local
         return reach[..., 0] + reach[..., 1] + reach[..., 2]

@@ -45,7 +45,13 @@ class Validation:
 
 
 def distance(motion: Motion, pieces: Batch, step: int) -> Tensor:
-    """How far every object is from the truth after a substep (B, N) [m], its orientation included."""
+    """How far every object is from the truth after a substep (B, N) [m], its orientation included.
+
+    Args:
+        motion: predicted.
+        pieces: the windows, with the truth.
+        step: which substep, from 0.
+    """
     shift = motion.centre - pieces.targets.centre[step]
     turn = 2 * _sine(motion.quaternion, pieces.targets.quaternion[step])
     return (shift.square().sum(dim=-1) + (_ARM_M * turn).square() + 1e-8).sqrt()
@@ -61,7 +67,14 @@ def _sine(a: Tensor, b: Tensor) -> Tensor:
 def validate(
     network: PropagationNetwork, table: ShapeTable, recording: Recording, device: torch.device | str = "cpu"
 ) -> Validation:
-    """Errors on windows of four actions in which something happens."""
+    """Errors on windows in which something happens.
+
+    Args:
+        network: to measure.
+        table: shapes of the recorded objects, on `device`.
+        recording: held out, with windows of four actions; of its busy ones 2000 at most are measured.
+        device: that computes.
+    """
     busy = np.flatnonzero(recording.is_busy)
     chosen = np.random.default_rng(0).permutation(busy)[:_MEASURED]
     pieces = batch(recording, table, chosen, device)

@@ -62,6 +62,11 @@ class Recording:
 def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], length: int) -> Recording:
     """Episodes as tensors, with the windows that can be learned from.
 
+    Args:
+        episodes: recorded with poses within their actions.
+        shapes: of all objects in them, by name; numbered by sorted names.
+        length: of the windows [actions].
+
     Raises:
         InvalidInput: if the episodes were recorded without substeps, differ in length or number of objects, or are
             shorter than a window.
@@ -124,10 +129,15 @@ def batch(
     device: torch.device | str = "cpu",
     coarse: Bool[np.ndarray, "B"] | None = None,
 ) -> Batch:
-    """Windows by their numbers in `recording.starts`.
+    """Windows of a recording, ready to be rolled out. Velocities at their starts are those of the substep before.
 
-    Velocities at their starts are those of the substep before; in `coarse` ones, means over the action before, which is
-    all that a rollout from observed states knows.
+    Args:
+        recording: that holds them.
+        table: shapes, on `device`.
+        windows: numbers in `recording.starts`.
+        device: of the tensors.
+        coarse: windows that start with means over the action before instead, all that a rollout from observed states
+            knows; by default none.
     """
     episode, start = (torch.as_tensor(column) for column in recording.starts[windows].T)
     first = start * SUBSTEPS

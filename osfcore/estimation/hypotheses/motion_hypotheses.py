@@ -34,7 +34,13 @@ _ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
 def joint_push_hypotheses(
     params: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "K N 3"]:
-    """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's."""
+    """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's [m].
+
+    Args:
+        params: the guess.
+        numbers: of the objects that may have moved; up to four are combined in all ways, more move by one share.
+        push: motion of the pusher [m].
+    """
     if len(numbers) <= _MAX_COMBINED:
         shares = np.array(list(product(_SHARES, repeat=len(numbers))))
     else:
@@ -45,7 +51,14 @@ def joint_push_hypotheses(
 
 
 def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
-    """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch."""
+    """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch.
+
+    Args:
+        models: fields, for the object's centre of mass and how it can roll.
+        params: the guess, around which the grid lies.
+        number: of the object.
+        push: motion of the pusher [m]; under 5 mm the grid covers about 2 cm around the guess, and nothing rolls.
+    """
     length = float(np.linalg.norm(push))
     step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
     beside = np.array([-step[1], step[0], 0.0])
@@ -64,7 +77,11 @@ def rolling_hypotheses(
 ) -> Pose:
     """Poses of one object turned about the axis about which a push rolls it, its own first; a batch.
 
-    Only its own pose if no push rolls it that way.
+    Args:
+        models: fields, for the object's centre of mass and how it can roll.
+        params: the guess; the object's centre of mass stays.
+        number: of the object.
+        push: motion of the pusher [m]; if it cannot roll the object, only its own pose is returned.
     """
     axis = _rolling_axis(models, params, number, push)
     angles = np.arange(_ROLLS if axis.any() else 1) * 2 * np.pi / _ROLLS
@@ -74,7 +91,13 @@ def rolling_hypotheses(
 
 
 def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
-    """All resting orientations of an object at its guessed position; a batch."""
+    """Poses of one object in all its resting orientations; a batch.
+
+    Args:
+        models: fields, for how the object can lie.
+        params: the guess; the centre of mass stays above the same point of the table.
+        number: of the object.
+    """
     resting = models.resting(params.names[number])
     centre = params.positions[number] + rotate(params.quaternions[number], resting.centre)
     centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])

@@ -25,7 +25,13 @@ _SAME_RAD = np.deg2rad(12.0)
 
 
 def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
-    """An object turned in place about the vertical through its centre of mass, by equal steps; a batch of poses."""
+    """An object turned in place about the vertical through its centre of mass, by equal steps; a batch of poses.
+
+    Args:
+        models: fields, for the centre of mass.
+        params: the guess; the object's own pose is not among the result.
+        number: of the object.
+    """
     turns = yaw_quaternions(np.arange(1, _YAWS) * 2 * np.pi / _YAWS)
     quaternions = quaternion_multiply(turns, params.quaternions[number][None])
     centre = models.resting(params.names[number]).centre
@@ -98,7 +104,13 @@ def _distinct_orientations(poses: Pose) -> list[int]:
 
 
 def with_pose(params: SceneParameters, number: int, pose: Pose) -> SceneParameters:
-    """A guess with one object in another pose."""
+    """A guess with one object in another pose.
+
+    Args:
+        params: the guess, which stays as it is.
+        number: of the object.
+        pose: its new `T_world_object`.
+    """
     positions, quaternions = params.positions.copy(), params.quaternions.copy()
     positions[number], quaternions[number] = pose.position, pose.quaternion
     return replace(params, positions=positions, quaternions=quaternions)
@@ -111,7 +123,15 @@ def _pose(params: SceneParameters, number: int) -> Pose:
 def pose_losses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
 ) -> Float[np.ndarray, "K"]:
-    """Loss of a scene with one object in K poses."""
+    """Photometric loss of a scene with one object in each of K poses.
+
+    Args:
+        models: fields.
+        views: images to compare with, whole ones or windows around the object.
+        params: the guess; all other objects and the light stay.
+        number: of the object.
+        poses: the K poses, a batch of `T_world_object`.
+    """
     batch = params.perturbed(np.zeros((len(poses.position), params.size)))
     positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
     positions[:, number], quaternions[:, number] = poses.position, poses.quaternion

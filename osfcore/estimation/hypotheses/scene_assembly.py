@@ -51,7 +51,14 @@ def assemble_scene(
 def reassign_poses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, matches: list[TemplateMatches]
 ) -> SceneParameters:
-    """In turn each object at the match that explains whole images better than its pose does; the same if none."""
+    """In turn each object at the match that explains whole images better than its pose does; the same if none.
+
+    Args:
+        models: fields.
+        views: images to compare with.
+        params: the guess.
+        matches: of each object, in the guess's order.
+    """
     for n, found in enumerate(matches):
         params, _ = best_placement(models, views, params, n, found)
     return params
@@ -60,7 +67,15 @@ def reassign_poses(
 def best_placement(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
 ) -> tuple[SceneParameters, float]:
-    """The guess with an object where the image is explained best, where it is or at a match; and the loss."""
+    """The guess with an object where its photometric loss is least, where it is or at a match; and that loss.
+
+    Args:
+        models: fields.
+        views: images to compare with.
+        params: the guess.
+        n: number of the object.
+        found: its matches, perhaps none.
+    """
     own, losses = loss_of(models, views, params), _losses(models, views, params, n, found)
     if losses.min(initial=np.inf) >= own:
         return params, own

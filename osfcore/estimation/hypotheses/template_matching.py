@@ -73,7 +73,13 @@ def table_errors(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray
 
 
 def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> Float[np.ndarray, "h w"]:
-    """Squared error of the first view's pixels where a scene is thought to be known."""
+    """Squared error of the first view's pixels, summed over the colours and truncated.
+
+    Args:
+        models: fields.
+        views: what was observed; only the first view counts.
+        params: the scene to render, such as the objects found so far.
+    """
     rendered = models.together.render(params.perturbed(np.zeros((1, params.size))), views.cameras[:1], quality=QUALITY)
     return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MAX_TABLE_ERROR**2)
 

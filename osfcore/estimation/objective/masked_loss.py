@@ -37,7 +37,16 @@ def render_poses(
     quaternions: Float[np.ndarray, "B 4"],
     light: Float[np.ndarray, "3"],
 ) -> RenderedObject:
-    """Render one object in B poses under one light."""
+    """Render one object in B poses, alone.
+
+    Args:
+        models: fields.
+        name: of the object.
+        part: the crop whose cameras and quality are used.
+        positions: of the object's origin [m].
+        quaternions: rotations from the object's frame to the world, unit.
+        light: unit vector toward the light, the same for all poses.
+    """
     lights = np.tile(light, (len(positions), 1))
     batch = SceneBatch((name,), positions[:, None], quaternions[:, None], lights, None)
     rendered = models.alone.render(batch, part.cameras, quality=part.quality, outputs={"rgb", "opacity"})

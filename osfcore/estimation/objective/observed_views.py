@@ -43,7 +43,13 @@ class ObservedViews:
 
 
 def views_of(observation: Observation, side: int, *, samples: int = 1) -> ObservedViews:
-    """An observation of at most `side` pixels a side, to be compared with `samples` squared rays a pixel."""
+    """An observation at the resolution at which it is compared with renderings.
+
+    Args:
+        observation: images are reduced by area averaging, never enlarged.
+        side: longest side of the result [px]; the other does not fall below 16 px.
+        samples: rays along each side of a rendered pixel.
+    """
     height, width = observation.images.shape[1:3]
     scale = min(1.0, side / max(height, width))
     size = (max(MIN_IMAGE_SIDE, round(width * scale)), max(MIN_IMAGE_SIDE, round(height * scale)))
@@ -83,9 +89,12 @@ class ObjectView:
 
 
 def crop_to_masks(views: ObservedViews, number: int, *, margin: int = 3) -> ObjectView:
-    """The part that shows object `number` by its masks, and `margin` pixels around it.
+    """The windows around one object's masks.
 
-    Views in which its mask is empty are left out; at least one must not be.
+    Args:
+        views: with masks; views in which the object's is empty are left out, and at least one must not be.
+        number: of the object.
+        margin: around the largest mask [px].
     """
     assert views.masks is not None
     shown = [v for v, mask in enumerate(views.masks[:, number]) if mask.max() > 0.5]
@@ -108,9 +117,14 @@ def crop_to_masks(views: ObservedViews, number: int, *, margin: int = 3) -> Obje
 def crop_to_object(
     views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int, *, reach: float = 0.0
 ) -> ObservedViews:
-    """The windows around one object of a guess, and `reach` [m] more, without masks.
+    """The windows around one object of a guess, without masks, or whole images if none shows it.
 
-    Whole images where it shows in none of them.
+    Args:
+        views: whole images; those that do not show the object are left out.
+        models: fields, for the object's bounding sphere.
+        params: the guess.
+        number: of the object.
+        reach: by how much the windows reach beyond that sphere [m].
     """
     resting = models.resting(params.names[number])
     centre = params.positions[number] + rotate(params.quaternions[number], resting.centre)
@@ -137,7 +151,14 @@ def crop_to_object(
 def crop_to_silhouette(
     views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int
 ) -> ObservedViews:
-    """The windows around one object of a guess, of which only pixels in or just beside its silhouette count."""
+    """The windows around one object of a guess, of which only pixels in or just beside its silhouette count.
+
+    Args:
+        views: whole images.
+        models: fields; the object is rendered alone for its silhouette.
+        params: the guess.
+        number: of the object.
+    """
     own = crop_to_object(views, models, params, number)
     alone = SceneBatch((params.names[number],), params.positions[None, [number]], params.quaternions[None, [number]],
                        params.light[None], None)  # fmt: skip
@@ -150,7 +171,18 @@ def crop_to_silhouette(
 
 
 def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """The camera that sees a window of another's image, whose corner is at pixel (x, y)."""
+    """The camera that sees a window of another's image.
+
+    Args:
+        camera: the other.
+        x: left edge of the window in its image [px]; may lie outside.
+        y: upper edge likewise [px].
+        width: of the window [px].
+        height: of the window [px].
+
+    Raises:
+        InvalidInput: if the window's sides are outside 16 to 1024 px.
+    """
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2, 2] -= x, y
     return replace(camera, intrinsics=intrinsics, width=width, height=height)

@@ -14,7 +14,13 @@ HUBER = 0.1  # h [radiance]
 
 
 def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> Float32[np.ndarray, "B V h w 3"]:
-    """Rendered minus observed; 0 where pixels do not count."""
+    """Rendered minus observed [radiance]; 0 where pixels do not count.
+
+    Args:
+        models: fields of the objects and the table.
+        views: what was observed.
+        batch: B scenes to render.
+    """
     rendered = models.together.render(batch, views.cameras, quality=views.quality, only=views.only)
     return rendered.rgb - views.images
 
@@ -31,5 +37,11 @@ def photometric_loss(errors: Float[np.ndarray, "B *pixels"]) -> Float[np.ndarray
 
 
 def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
-    """Photometric loss of one scene."""
+    """Photometric loss of one scene.
+
+    Args:
+        models: fields of the objects and the table.
+        views: what was observed.
+        params: the scene.
+    """
     return float(photometric_loss(residuals(models, views, params.perturbed(np.zeros((1, params.size)))))[0])

@@ -51,7 +51,13 @@ def search_light(
 
 
 def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
-    """Least loss on the grid over the hemisphere, divided by the loss under the guess's own light."""
+    """Least truncated error on the grid over the hemisphere, divided by the error under the guess's own light.
+
+    Args:
+        models: fields.
+        views: images to compare with; coarse ones will do.
+        params: the guess.
+    """
     directions = np.concatenate([params.light[None], hemisphere()])
     losses = _losses(models, views, params, directions)
     return float(losses[1:].min() / max(losses[0], 1e-12))

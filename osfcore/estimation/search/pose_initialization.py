@@ -53,7 +53,15 @@ class RankedPoses:
 
 
 def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPoses:
-    """Every way the object can lie, put where the masks are, under a light of unknown brightness from overhead."""
+    """Every way the object can lie, put where the masks are, ranked by the masked loss.
+
+    Rendered under a light from overhead of unknown brightness, since the true one is not known yet.
+
+    Args:
+        models: fields.
+        name: of the object.
+        part: windows around its masks.
+    """
     resting = models.resting(name)
     positions = _positions_along_rays(part, resting)
     for _ in range(_CENTRING_ROUNDS):
@@ -72,7 +80,17 @@ def rank_poses(
     *,
     any_brightness: bool = False,
 ) -> RankedPoses:
-    """Poses in the order of their masked loss under a light."""
+    """Poses in the order of their masked loss, the best first.
+
+    Args:
+        models: fields.
+        name: of the object.
+        part: windows around its masks.
+        positions: of the object's origin [m].
+        quaternions: rotations from the object's frame to the world, unit.
+        light: unit vector toward the light.
+        any_brightness: compare colours up to a factor, see `masked_loss`.
+    """
     look = render_poses(models, name, part, positions, quaternions, light)
     losses = masked_loss(look, part, any_brightness=any_brightness)
     order = np.argsort(losses)

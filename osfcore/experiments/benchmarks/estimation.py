@@ -104,7 +104,12 @@ class BenchEstimateStep:
 
 
 def bench_estimate(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[BenchEstimateStep]:
-    """Time every kind of estimate, scene by scene; of the default objects where they are, else of those there are.
+    """Time every kind of estimate, scene by scene.
+
+    Args:
+        config: what to measure, and how often.
+        fields: of the objects and the table; where enough of the default objects have both field and mesh, only these.
+        assets: meshes, for the simulator.
 
     Raises:
         InvalidInput: if a number is out of range, or there are too few objects.

@@ -88,6 +88,11 @@ class BenchStep:
 def bench_render(config: BenchRender, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[BenchStep]:
     """Measure everything, one part after the other.
 
+    Args:
+        config: what to measure, and how often.
+        fields: what we render.
+        assets: meshes, which TinyRenderer draws.
+
     Raises:
         InvalidInput: if a number is out of range, or there is no field.
         MissingAssets: if no object has both a field and a mesh.
@@ -136,7 +141,16 @@ def lay_out(assets: Sequence[ObjectAsset], rng: np.random.Generator) -> Pose:
 def rollouts(
     start: Pose, light: Light, names: tuple[str, ...], rng: np.random.Generator, candidates: int, steps: int
 ) -> SceneBatch:
-    """Images that planning asks for, candidate by candidate: one or two objects of each slide and turn step by step."""
+    """Images that planning asks for, candidate by candidate: one or two objects of each slide and turn step by step.
+
+    Args:
+        start: T_world_object of all objects [m].
+        light: the same in all images.
+        names: of the objects.
+        rng: chooses what moves, and where to.
+        candidates: sequences of actions.
+        steps: of each candidate.
+    """
     count = len(names)
     positions = np.tile(start.position, (candidates, steps, 1, 1))
     quaternions = np.tile(start.quaternion, (candidates, steps, 1, 1))

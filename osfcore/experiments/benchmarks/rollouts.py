@@ -45,7 +45,16 @@ class RolloutCosts:
 def bench_rollouts(
     network: PropagationNetwork, shapes: Mapping[str, ObjectShape], device: torch.device | str = "cpu"
 ) -> RolloutCosts:
-    """Time rollouts of the first three objects, which stand around the pusher."""
+    """Time rollouts of three objects, which stand around the pusher.
+
+    Args:
+        network: what is timed; it stays on the device.
+        shapes: by name; the first three names are taken.
+        device: that computes.
+
+    Raises:
+        InvalidInput: if there are no shapes.
+    """
     names = tuple(sorted(shapes))[: len(BENCH_NAMES)]
     model = PushModel(network, {name: shapes[name] for name in names}, device)
     state, actions = _scene(names, shapes), _paths(np.random.default_rng(0))

@@ -58,6 +58,11 @@ def _panel(title: str, label: str, curves: Sequence[Curve]) -> Chart:
 def write_gallery(folder: Path, report: DynamicsReport, shapes: Mapping[str, ObjectShape]) -> None:
     """Draw trajectories.png: the best, the middle and the worst windows of three objects after ten actions.
 
+    Args:
+        folder: of the picture.
+        report: with the network's predictions.
+        shapes: of all objects in it, by name.
+
     Raises:
         CannotWrite: if the disk refuses.
     """

@@ -124,7 +124,13 @@ def constant(windows: Windows) -> Predicted:
 
 
 def learned(network: PropagationNetwork, shapes: Mapping[str, ObjectShape], windows: Windows) -> Predicted:
-    """The network, told the poses of one step ago."""
+    """Predictions of the network, told the poses of one action before the start.
+
+    Args:
+        network: on the CPU.
+        shapes: of all objects in the windows, by name.
+        windows: what to predict.
+    """
 
     def roll(scenes: _Scenes) -> Iterator[Motion]:
         given = (network, scenes.table, scenes.number)
@@ -192,7 +198,13 @@ def _motion(table: ShapeTable, number: Tensor, windows: Windows, rows: slice, at
 
 
 def errors(windows: Windows, predicted: Predicted, symmetries: Mapping[str, Symmetry]) -> Errors:
-    """Score a predictor at every horizon."""
+    """Score a predictor at every horizon.
+
+    Args:
+        windows: with the truth.
+        predicted: for these windows.
+        symmetries: of all objects in them, by name.
+    """
     at = np.array(HORIZONS)
     true_p, true_q = (np.moveaxis(a[:, 1 + at], 1, 0) for a in (windows.positions, windows.quaternions))
     p, q = (np.moveaxis(a[:, at - 1], 1, 0) for a in (predicted.positions, predicted.quaternions))

@@ -54,6 +54,11 @@ def evaluate_estimate(
 ) -> Iterator[EstimateEvaluationStep]:
     """Measure every part that is asked for, task by task; pictures and report.json go to `config.folder`.
 
+    Args:
+        config: what to measure.
+        fields: of the objects and the table.
+        assets: meshes, for the simulator.
+
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
         InvalidInput: if a number is out of range.

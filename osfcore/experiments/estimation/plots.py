@@ -127,7 +127,13 @@ def views_charts(report: EstimateReport) -> list[Chart]:
 
 
 def frame_failure(title: str, score: FrameScore, shown: Sequence[Comparison]) -> Failure | None:
-    """A frame with an object that is wrong, or right and flagged; None if there is nothing to see."""
+    """A frame that was refused, or with an object that is wrong, or right and flagged; None if there is nothing to see.
+
+    Args:
+        title: of the task, for the first line.
+        score: of the frame.
+        shown: observed and rendered images.
+    """
     if score.refused:
         return Failure(np.inf, (f"{title}: REFUSED: {score.refused}",), tuple(shown))
     if score.is_right and not any(o.flagged for o in score.objects):
@@ -144,7 +150,13 @@ def frame_failure(title: str, score: FrameScore, shown: Sequence[Comparison]) ->
 
 
 def track_failure(title: str, score: TrackScore, shown: Sequence[Comparison]) -> Failure | None:
-    """An episode in which an object was lost; None if none was."""
+    """An episode in which an object was lost, or that had no start; None if there is nothing to see.
+
+    Args:
+        title: of the task, for the first line.
+        score: of the episode.
+        shown: observed and rendered images of the step at which the first object was lost.
+    """
     if score.refused:
         return Failure(np.inf, (f"{title}: no start: {score.refused}",), tuple(shown))
     lost = {n: step for n, step in enumerate(score.lost_at) if step is not None}
@@ -160,7 +172,13 @@ def track_failure(title: str, score: TrackScore, shown: Sequence[Comparison]) ->
 
 
 def bad_failure(title: str, score: BadScore, shown: Sequence[Comparison]) -> Failure | None:
-    """A spoiled input that was believed although the answer is wrong; None otherwise."""
+    """A spoiled input that was believed although the answer is wrong; None otherwise.
+
+    Args:
+        title: of the case, for the only line.
+        score: of the answer.
+        shown: observed and rendered images.
+    """
     if not score.is_confidently_wrong:
         return None
     errors = ", ".join(f"{p:.0f} mm / {r:.0f} deg" for p, r in zip(score.position_mm, score.rotation_deg, strict=True))

@@ -160,7 +160,13 @@ def drift(tracks: Iterable[TrackScore], which: int) -> dict[str, float | None]:
 
 
 def errors_at(tracks: Iterable[TrackScore], step: int, which: int) -> list[float]:
-    """Errors of all visible objects after so many steps: of position [mm] (0) or rotation [deg] (1)."""
+    """Errors of all visible objects at one step.
+
+    Args:
+        tracks: those that ended before this step have none.
+        step: from 1.
+        which: 0 for position [mm], 1 for rotation [deg].
+    """
     return [pair[which] for track in tracks if len(track.seconds) >= step for pair in _seen(track, step - 1)]
 
 

@@ -133,7 +133,13 @@ def is_right(position_mm: float, rotation_deg: float) -> bool:
 def lost_at(position_mm: Sequence[float], rotation_deg: Sequence[float], absent: Sequence[Absence]) -> int | None:
     """The first step at which one object was over 3 cm or 20 deg off for two steps running; None if never.
 
-    A step at which no image told where the object was counts neither as off nor as kept: it interrupts the run.
+    Args:
+        position_mm: errors, step by step [mm].
+        rotation_deg: likewise, symmetries considered [deg].
+        absent: why no image told where the object was; such a step is neither off nor kept: it interrupts the run.
+
+    Returns:
+        The second of the two steps, from 0.
     """
     run = 0
     for step, (position, rotation, why) in enumerate(zip(position_mm, rotation_deg, absent, strict=True)):
@@ -146,7 +152,13 @@ def lost_at(position_mm: Sequence[float], rotation_deg: Sequence[float], absent:
 def pose_errors(
     estimate: SceneState, truth: SceneState, assets: Mapping[str, ObjectAsset]
 ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Errors of position [mm] and rotation [deg], objects in the order of the estimate; both know the same ones."""
+    """Errors of position [mm] and rotation [deg], objects in the order of the estimate.
+
+    Args:
+        estimate: poses of objects.
+        truth: of the same objects, in any order.
+        assets: by name; they tell which rotations look alike.
+    """
     shift, turn = [], []
     for name in estimate.names:
         mine, true = estimate.pose(name), truth.pose(name)
@@ -183,7 +195,13 @@ def score_frame(
 
 
 def refused_frame(names: tuple[str, ...], reason: str, seconds: float) -> FrameScore:
-    """The score of a frame that the estimator would not look at."""
+    """The score of a frame that the estimator would not look at.
+
+    Args:
+        names: the objects in it.
+        reason: why it was refused; not empty.
+        seconds: until it was refused [s].
+    """
     return FrameScore(names, (), None, (), seconds, False, reason)
 
 

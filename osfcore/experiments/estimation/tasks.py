@@ -81,6 +81,11 @@ class Goal:
 def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) -> Frame:
     """The scene at rest, with masks and with the pusher in a free place.
 
+    Args:
+        draw: the scene.
+        library: meshes of its objects.
+        cameras: of one image size.
+
     Raises:
         UnknownName, MissingAssets: if an object has no mesh here.
         NoRoom: if the objects do not fit side by side.
@@ -93,6 +98,12 @@ def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, s
     """Pushes that follow the first frame; in the course of them some object moves by 5 cm or more.
 
     Pushes that move nothing so far are drawn again, a hundred times at most; `moved_m` tells.
+
+    Args:
+        draw: the scene.
+        library: meshes of its objects.
+        cameras: of one image size.
+        steps: actions of 0.2 s, one frame after each.
 
     Raises:
         UnknownName, MissingAssets, NoRoom: as for the first frame.
@@ -116,6 +127,11 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
     """For each m from 1 to all objects: m of them shifted by 7.5 to 20 cm and turned about the vertical, another light.
 
     Where there is no room for an object it stays; the goal tells which ones moved.
+
+    Args:
+        draw: the scene.
+        library: meshes of its objects.
+        camera: sees the goals.
 
     Raises:
         UnknownName, MissingAssets, NoRoom: as for the first frame.
@@ -153,7 +169,14 @@ def opened(draw: Draw, library: AssetLibrary) -> Iterator[Tabletop]:
 
 
 def take_frame(world: Tabletop, cameras: tuple[Camera, ...], *, masks: bool, with_pusher: bool = True) -> Frame:
-    """The world as it is."""
+    """The world as it is.
+
+    Args:
+        world: stays as it is.
+        cameras: of one image size.
+        masks: whether the observation tells each object's visible pixels.
+        with_pusher: whether the pusher is seen; where not, the truth has none either.
+    """
     observation = world.render(cameras, masks=True, with_pusher=with_pusher)
     truth = world.truth() if with_pusher else replace(world.truth(), pusher=None)
     assert observation.masks is not None

@@ -80,7 +80,14 @@ class Draw:
 
 
 def draw_scene(available: Sequence[str], count: int, seed: int, number: int) -> Draw:
-    """The number-th random scene of `count` among the available objects; it does not depend on the others."""
+    """One of many random scenes; it does not depend on the others.
+
+    Args:
+        available: objects to choose from, `count` or more.
+        count: objects in the scene.
+        seed: of all the scenes.
+        number: which of them.
+    """
     rng = np.random.default_rng([seed, number])
     light = Light.random(rng, HARSH_ELEVATION_DEG)
     arrangement = int(rng.integers(1 << 31))
@@ -90,6 +97,11 @@ def draw_scene(available: Sequence[str], count: int, seed: int, number: int) -> 
 
 def simulate(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) -> Truth:
     """Let the objects come to rest on the table and take pictures.
+
+    Args:
+        draw: the scene.
+        library: meshes of its objects.
+        cameras: of one image size.
 
     Raises:
         UnknownName, MissingAssets: if an object has no mesh here.

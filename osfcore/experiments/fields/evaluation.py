@@ -105,6 +105,11 @@ class EvaluationStep:
 def evaluate_fields(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[EvaluationStep]:
     """Measure every object, then scenes of them; contact sheets go to objects.png, scenes.png and folders beside them.
 
+    Args:
+        config: what to measure.
+        fields: of the objects and the table.
+        assets: meshes, for the simulator.
+
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
         InvalidInput: if a number is out of range.

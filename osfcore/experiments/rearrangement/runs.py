@@ -47,7 +47,15 @@ def run_from_images(
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> Iterator[Event | Ended]:
-    """The whole loop; the last step is how it ended."""
+    """The whole loop; the last step is how it ended.
+
+    Args:
+        task: what is told of it is the goal image alone.
+        assets: meshes, for the simulator.
+        models: of the task's objects.
+        settings: how the loop goes.
+        rng: of estimates and plans.
+    """
     world = Tabletop(assets)
     try:
         goal = _goal_image(world, task)
@@ -65,7 +73,15 @@ def run_told_the_truth(
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> Ended:
-    """The same planner with true poses, and with the simulator as its dynamics."""
+    """How the same planner leaves the table, with true poses and with the simulator as its dynamics.
+
+    Args:
+        task: with the true goal.
+        assets: meshes, for the simulator.
+        models: of which only shapes and symmetries play a part.
+        settings: of which only steps, plans and what counts as arrived play a part.
+        rng: of the plans.
+    """
     world, dynamics = Tabletop(assets), SimulatedPushes({name: assets.load(name) for name in task.start.names})
     try:
         image = _goal_image(world, task)

@@ -20,7 +20,14 @@ _LAYOUTS = 30  # of a task, until one has room for where its objects shall go
 def mpc_task(
     library: AssetLibrary, available: Sequence[str], objects: int, seed: int, number: int
 ) -> RearrangementTask:
-    """The number-th task; it does not depend on the others. A third each move one, two and three objects.
+    """One of many tasks, which does not depend on the others; in turn one, two and three objects move.
+
+    Args:
+        library: meshes of the objects.
+        available: objects to choose from.
+        objects: in the scene; no more than these move.
+        seed: of all the tasks.
+        number: which of them, from 0.
 
     Raises:
         UnknownName, MissingAssets: if an object has no mesh here.

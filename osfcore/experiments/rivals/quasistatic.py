@@ -31,7 +31,14 @@ _STRETCH_M = 0.0025  # the pusher travels at most this far between two looks at 
 def push(
     table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, shifts: Float[Tensor, "S B 2"]
 ) -> Iterator[Motion]:
-    """The scenes after each of the pusher's displacements [m]."""
+    """The scenes after each of the pusher's displacements.
+
+    Args:
+        table: shapes of objects.
+        number: of each object in the table.
+        motion: the scenes at the start, in world coordinates; how they moved before plays no part.
+        shifts: displacements of the pusher, one after the other [m].
+    """
     outline = _outlines(table, number, motion)
     arm = friction_arm(outline)
     for shift in shifts:

@@ -39,6 +39,11 @@ class Checkpoint:
 def write_checkpoint(path: Path, checkpoint: Checkpoint, fingerprint: Mapping[str, Any]) -> None:
     """Write a checkpoint; the former one stays until the new one is whole.
 
+    Args:
+        path: of the file.
+        checkpoint: the run as it is.
+        fingerprint: settings and data of the run, which `read_checkpoint` compares.
+
     Raises:
         CannotWrite: if the disk refuses.
     """

@@ -98,7 +98,17 @@ class Distillation(Stage):
         self.osf = osf
 
     def step(self, rays: RayBatch, share: float, rng: np.random.Generator, generator: torch.Generator) -> float:
-        """One step of descent on points along some rays; returns the loss. `share` of the stage is done."""
+        """One step of descent on random points near the surface.
+
+        Args:
+            rays: points lie near what they meet, seen along them; lights are drawn from theirs.
+            share: of the stage that is done, in [0, 1].
+            rng: draws points and lights.
+            generator: draws the jitter of the cells.
+
+        Returns:
+            The loss.
+        """
         if self._count % _REFRESH == 0:
             self.field = self.snapshot()
         self._count += 1
@@ -120,7 +130,14 @@ class Distillation(Stage):
         view: Float[Tensor, "S 3"],
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """Squared error of a voxel's opacity, and of both parts of rho where the teacher is opaque."""
+        """Squared error of a voxel's opacity, and of both parts of rho where the teacher is opaque.
+
+        Args:
+            x: points in the object's frame [m].
+            light: unit vectors toward the light, in the object's frame.
+            view: unit vectors from the camera into the scene, in the object's frame.
+            generator: draws the jitter of the cells.
+        """
         voxel = self.field.voxel
         with torch.no_grad():
             right = self.osf(x, light, view)
@@ -151,7 +168,14 @@ class Distillation(Stage):
 
     @staticmethod
     def restored(field: KiloOSF, state: dict[str, Any], size: OSFSize, device: torch.device) -> Distillation:
-        """Go on from a checkpoint."""
+        """Go on from a checkpoint.
+
+        Args:
+            field: as it was.
+            state: what `state` told.
+            size: of the teacher's network.
+            device: that computes.
+        """
         osf = OSF(state["box"].numpy(), size, device=device)
         osf.load_state_dict(state["teacher"])
         stage = Distillation(field, osf, device)

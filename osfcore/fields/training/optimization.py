@@ -86,7 +86,17 @@ class Stage:
         self._count = 0
 
     def step(self, rays: RayBatch, share: float, rng: np.random.Generator, generator: torch.Generator) -> float:
-        """One step of descent; returns the loss. `share` of the stage is done."""
+        """One step of descent on the pixels of some rays.
+
+        Args:
+            rays: with the pixels' colours and opacities.
+            share: of the stage that is done, in [0, 1].
+            rng: draws the offsets of the samples along the rays.
+            generator: draws the jitter of the cells.
+
+        Returns:
+            The loss.
+        """
         if self._count % _DENSITY_REFRESH == 0:
             self.field = self.snapshot()
         self._count += 1

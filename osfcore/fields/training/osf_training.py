@@ -159,13 +159,31 @@ class Teacher:
         images: ImageSet, box: Float[np.ndarray, "2 3"], recipe: TeacherRecipe, rng: np.random.Generator,
         device: torch.device,
     ) -> Teacher:  # fmt: skip
-        """A new network, and fog in the visual hull."""
+        """A new network, and fog in the visual hull.
+
+        Args:
+            images: whose silhouettes carve the hull.
+            box: of the object [m].
+            recipe: how it learns.
+            rng: draws the first weights.
+            device: that computes.
+        """
         fog = first_shell(images, box, across=recipe.across, cells=1, hidden=8, inside_g=_FOG_G, rng=rng)
         weights = torch.Generator().manual_seed(int(rng.integers(2**62)))
         return Teacher(OSF(fog.box, recipe.size, generator=weights, device=device), fog, recipe, fog.index > 0)
 
     def step(self, rays: RayBatch, share: float, rng: np.random.Generator, _generator: torch.Generator) -> float:
-        """One step of descent; returns the loss. `share` of the training is done."""
+        """One step of descent on the pixels of some rays.
+
+        Args:
+            rays: with the pixels' colours and opacities.
+            share: of the training that is done, in [0, 1].
+            rng: draws the offsets of the samples along the rays.
+            _generator: not needed here; the stages of a KiloOSF draw from it.
+
+        Returns:
+            The loss.
+        """
         self._count += 1
         for group in self._optimiser.param_groups:
             group["lr"] = self.recipe.rates.at(share) * min(1.0, self._count / _WARM_UP)
@@ -208,7 +226,14 @@ class Teacher:
     def restored(
         proposal: KiloOSF, state: dict[str, Any], recipe: TeacherRecipe, device: torch.device
     ) -> Teacher:  # fmt: skip
-        """Go on from a checkpoint."""
+        """Go on from a checkpoint.
+
+        Args:
+            proposal: as it was.
+            state: what `state` told.
+            recipe: how it learns.
+            device: that computes.
+        """
         osf = OSF(proposal.box, recipe.size, device=device)
         osf.load_state_dict(state["network"])
         teacher = Teacher(osf, proposal, recipe, state["hull"].numpy())
@@ -242,7 +267,13 @@ def corners(grid: KiloOSF) -> Float32[np.ndarray, "nx ny nz 3"]:
 
 @torch.no_grad()
 def baked_g(osf: OSF, points: Float32[np.ndarray, "n 3"], voxel: float) -> Float32[np.ndarray, "n"]:
-    """Density features of voxels of a side [m] as dense as the teacher; EMPTY_G where that is next to nothing."""
+    """Density features as dense as the teacher, at points; EMPTY_G where that is next to nothing.
+
+    Args:
+        osf: teacher.
+        points: in the object's frame [m].
+        voxel: side of the voxels that get the features [m].
+    """
     pieces = np.array_split(points, max(1, len(points) // _POINTS_AT_ONCE))
     parts = [osf.density(torch.as_tensor(piece, device=osf.ambient.device)).cpu() for piece in pieces]
     return inverse_density(torch.cat(parts).numpy() * np.float32(voxel))

@@ -99,6 +99,13 @@ def collect_object(config: CollectObject, library: AssetLibrary) -> Iterator[Pro
     distance = mesh.radius_m / np.sin(half_angle)
 
     def shoot(rng: np.random.Generator, number: int, count: int) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """Camera and unit vector toward the light, both in the object's frame, and RGBA image.
+
+        Args:
+            rng: draws them.
+            number: of the image in its split, which tells the ring of views.
+            count: images of the split.
+        """
         camera = Camera.look_at("view", distance * _spread(rng, number, count), (0, 0, 0), size=config.size)
         light = _spread(rng, int(rng.integers(count)), count)
         picture = tracer.render_alone(config.name, light, camera, samples=_SAMPLES)
@@ -120,6 +127,13 @@ def collect_table(config: CollectTable) -> Iterator[Progress]:
     nothing = Pose(np.zeros((0, 3)), np.zeros((0, 4)))
 
     def shoot(rng: np.random.Generator, number: int, count: int) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """Camera, position of the light in the world and RGBA image.
+
+        Args:
+            rng: draws them.
+            number: of the image in its split: odd ones are taken from anywhere.
+            count: images of the split; it does not matter here.
+        """
         light = Light.random(rng, MIN_LIGHT_ELEVATION_DEG)
         camera = fixed[(number // 2) % len(fixed)] if number % 2 == 0 else _anywhere(rng, config.size)
         (picture,) = tracer.render(SceneState((), nothing, light, None), (camera,), samples=_SAMPLES)

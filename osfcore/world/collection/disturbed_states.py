@@ -90,7 +90,13 @@ class _Track:
         return (np.linalg.norm(linear, axis=-1) > SLEEP_M) | (np.linalg.norm(angular, axis=-1) > SLEEP_RAD)
 
     def disturb(self, physics: Physics, step: int, rng: np.random.Generator) -> tuple[object, ...]:
-        """One substep from a disturbed state: the row of a `Disturbed`."""
+        """One substep from a disturbed state: the row of a `Disturbed`.
+
+        Args:
+            physics: a simulation of the episode's objects.
+            step: number of the substep, at least 1: velocities are those of the one before.
+            rng: draws the disturbance.
+        """
         linear, angular = self._linear[step - 1], self._angular[step - 1]
         awake = self._awake(linear, angular)[:, None]
         share = _MOST * rng.random((len(awake), 1))

@@ -33,6 +33,13 @@ class Lamp:
 def lambert(
     albedo: Float[np.ndarray, "S 3"], cosine: Float[np.ndarray, "S"], visible: Float[np.ndarray, "S"], lamp: Lamp
 ) -> Float[np.ndarray, "S 3"]:
-    """Radiance of matte surfaces; `cosine` is n . l, `visible` 1 where the light arrives and 0 in shadow."""
+    """Radiance of matte surfaces.
+
+    Args:
+        albedo: linear, in [0, 1].
+        cosine: n . l.
+        visible: 1 where the light arrives, 0 in shadow.
+        lamp: strengths of ambient and diffuse light.
+    """
     irradiance = lamp.ambient + lamp.diffuse * np.maximum(cosine, 0) * visible
     return albedo * irradiance[:, None]

@@ -73,7 +73,13 @@ class TracedMesh:
     def surface(
         self, faces: Int[np.ndarray, "S"], barycentric: Float[np.ndarray, "S 2"], directions: Float[np.ndarray, "S 3"]
     ) -> Surface:
-        """Interpolated normals and texture coordinates at hits of rays with these directions."""
+        """Interpolated normals and texture coordinates where rays hit.
+
+        Args:
+            faces: that were hit.
+            barycentric: weights of each face's second and third corner.
+            directions: of the rays in the object's frame.
+        """
         u, v = barycentric[:, :1], barycentric[:, 1:]
         weights = np.concatenate([1 - u - v, u, v], axis=1)[:, :, None]
         normals = (self._corner_normals[faces] * weights).sum(axis=1)
@@ -99,6 +105,12 @@ class TracedMesh:
         """Pixel rectangle (left, top, right, bottom; right and bottom excluded) that holds the mesh.
 
         None where it is out of view. The whole image where the mesh reaches behind the camera.
+
+        Args:
+            T_camera_object: pose in the camera's frame (OpenCV axes) [m].
+            intrinsics: camera matrix [px].
+            width: of the image [px].
+            height: of the image [px].
         """
         corners = np.stack(np.meshgrid(*self.bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
         points = T_camera_object.apply(corners)
@@ -116,7 +128,13 @@ class TracedMesh:
 def into_frame(
     pose: Pose, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"]
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3"]]:
-    """World rays in the frame of an object at `pose` (`T_world_object`), contiguous float32 as Embree wants them."""
+    """World rays in the frame of an object, contiguous float32 as Embree wants them.
+
+    Args:
+        pose: T_world_object.
+        origins: in the world [m].
+        directions: in the world, of any length, which they keep.
+    """
     rotation = quaternion_to_matrix(pose.quaternion).astype(np.float32)
     position = pose.position.astype(np.float32)
     return np.ascontiguousarray((origins - position) @ rotation), np.ascontiguousarray(directions @ rotation)

@@ -28,14 +28,14 @@ class Oracle:
 
     def install(self, patch) -> None:
         """Put it in the estimators' place."""
-        real = tasks.seen
+        real = tasks.take_frame
 
-        def seen(world, cameras, **more):
+        def take_frame(world, cameras, **more):
             frame = real(world, cameras, **more)
             self._truths[_key(frame.observation)] = frame.truth
             return frame
 
-        patch.setattr(tasks, "seen", seen)
+        patch.setattr(tasks, "take_frame", take_frame)
         patch.setattr(tasks, "PUSHED_M", 0.0)  # few steps push nothing far
         patch.setattr(parts, "estimate_first", self.first)
         patch.setattr(parts, "estimate_next", self.next)

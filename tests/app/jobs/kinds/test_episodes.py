@@ -176,7 +176,7 @@ def test_a_goal_image_is_read_from_the_inputs_as_its_own_camera_saw_it(place, st
         yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 
     monkeypatch.setattr(core, "estimate_goal", explained)
-    monkeypatch.setattr(core, "unmoved", lambda _models, _goal, found, _now: found)
+    monkeypatch.setattr(core, "prefer_current_poses", lambda _models, _goal, found, _now: found)
     goal = {"id": "g", "camera": camera_to_json(camera), "poses": None, "truth": entries(stage.world.truth())}
     told = list(episode_job(params(stage, **goal), place))
     assert (told[-1].outcome, told[-1].done) == ("reached", 0)

@@ -3,7 +3,7 @@ import pytest
 
 import osfcore.experiments.estimation.tasks as module
 from osfcore.errors import NoRoom
-from osfcore.experiments.estimation.tasks import episode, first_frame, goals, opened, seen
+from osfcore.experiments.estimation.tasks import episode, first_frame, goals, opened, take_frame
 from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
@@ -111,11 +111,11 @@ def test_what_fell_off_or_is_out_of_view_is_told(draw, library):
         position = state.poses.position.copy()
         position[0] = 0.9, 0.0, -0.7
         world.restore(SceneState(state.names, Pose(position, state.poses.quaternion), state.light, state.pusher))
-        assert seen(world, CAMERAS, masks=False).absent == ("off the table", "")
+        assert take_frame(world, CAMERAS, masks=False).absent == ("off the table", "")
         position[0] = -0.55, -0.55, 0.1
         world.restore(SceneState(state.names, Pose(position, state.poses.quaternion), state.light, state.pusher))
         camera = default_cameras(32)[2:3]
-        assert seen(world, camera, masks=False).absent[0] == "out of view"
+        assert take_frame(world, camera, masks=False).absent[0] == "out of view"
 
 
 def test_where_objects_do_not_fit_another_layout_is_tried(draw, library, monkeypatch):
