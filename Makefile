@@ -45,11 +45,9 @@ test-all: dev test-types
 	$(BIN)/pytest -n 2 --dist loadfile -m 'not soak and not e2e'
 	$(BIN)/pytest -m e2e
 
-# Shapes and types of arrays are checked while the tests run.
-TYPED := geometry metrics planning
+# Shapes and types of arrays are checked while the tests of the library run.
 test-types: dev
-	$(BIN)/python -m pytest -p tests.typecheck $(TYPED:%=tests/core/%) \
-	  --jaxtyping-packages=osfcore.geometry,osfcore.metrics,osfcore.planning,tests.typecheck.checked
+	$(BIN)/python -m pytest -n 2 --dist loadfile -p tests.typecheck tests/core
 
 coverage: dev
 	$(BIN)/pytest -n 2 --dist loadfile --cov=osfcore --cov=app --cov-report=term:skip-covered

@@ -90,7 +90,7 @@ class KiloQuery(nn.Module):
         weights = (wx[:, :, None, None] * wy[:, None, :, None] * wz[:, None, None, :]).reshape(-1, 8)
         return functional.embedding_bag(rows, self.rows, per_sample_weights=weights, mode="sum") * self.row_units
 
-    def sigma(self, g: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+    def sigma(self, g: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """Density [1/m] of the density feature."""
         return torch.relu(functional.softplus(g) - DENSITY_FLOOR) / self.voxel
 

@@ -32,7 +32,7 @@ class FreeSpace:
 
     clearance: Float[np.ndarray, "S S"]
 
-    def __init__(self, outlines: Sequence[Float[np.ndarray, "K 2"]]) -> None:
+    def __init__(self, outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> None:
         """Draw the objects.
 
         Args:

@@ -32,7 +32,7 @@ class Pushes:
     ends: Float[np.ndarray, "P 2"]
 
 
-def outline_points(outlines: Sequence[Float[np.ndarray, "K 2"]]) -> Float[np.ndarray, "n 2"]:
+def outline_points(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 2"]:
     """Points at most 5 mm apart all along the outlines of an object's convex parts [m]."""
     pushes = []
     for outline in outlines:

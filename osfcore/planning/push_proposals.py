@@ -28,7 +28,7 @@ _SPEEDS = (0.6, 1.0)  # of the highest
 _ORDERS = 6  # all of three objects
 _SPARE = 3  # times as many pushes are drawn as needed: some begin where there is no room
 
-Outlines = list[Float[np.ndarray, "K 2"]]  # of an object's convex parts
+Outlines = list[Float[np.ndarray, "_ 2"]]  # of an object's convex parts
 
 
 class PushProposals:

@@ -45,7 +45,7 @@ class ObjectShape:
     parts: tuple[Float32[np.ndarray, "_ 3"], ...] = ()
 
 
-def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "M 3"]] = ()) -> ObjectShape:
+def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "_ 3"]] = ()) -> ObjectShape:
     """The shape that a field describes.
 
     Args:

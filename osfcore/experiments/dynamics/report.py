@@ -101,7 +101,7 @@ def _row(scored: Sequence[Scored]) -> dict[str, Any]:
     }
 
 
-def _moved(scored: Sequence[Scored], who: str, horizon: int, *, deg: bool = False) -> list[Float[np.ndarray, "M"]]:
+def _moved(scored: Sequence[Scored], who: str, horizon: int, *, deg: bool = False) -> list[Float[np.ndarray, "_"]]:
     return [s.errors[who].of_moved(horizon, deg=deg) for s in scored]
 
 
@@ -160,12 +160,12 @@ def _at(scored: Scored, who: str, chosen: Bool[np.ndarray, "W N"], *, deg: bool 
     return (errors.deg if deg else errors.mm)[at][errors.moved[at] & errors.valid[at] & chosen]
 
 
-def _median(parts: Sequence[Float[np.ndarray, "M"]]) -> float | None:
+def _median(parts: Sequence[Float[np.ndarray, "_"]]) -> float | None:
     values = np.concatenate(parts) if parts else np.zeros(0)
     return _rounded(np.median(values)) if len(values) else None
 
 
-def _mean(parts: Sequence[Float[np.ndarray, "M"]]) -> float | None:
+def _mean(parts: Sequence[Float[np.ndarray, "_"]]) -> float | None:
     values = np.concatenate(parts) if parts else np.zeros(0)
     return _rounded(np.mean(values)) if len(values) else None
 

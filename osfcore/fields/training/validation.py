@@ -87,6 +87,6 @@ def dilated_mask(alpha: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
 
 
-def _decibels(squared_error: Float[np.ndarray, "n"]) -> float:
+def _decibels(squared_error: Float[np.ndarray, "*shape"]) -> float:
     """PSNR of values in [0, 1]; at most 100 dB."""
     return float(-10 * np.log10(max(float(np.mean(squared_error)), _MIN_ERROR)))

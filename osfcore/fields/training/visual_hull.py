@@ -216,7 +216,7 @@ def _region(views: Sequence[_View]) -> tuple[Float[np.ndarray, "2 3"], bool]:
     return centre + scale * box, True
 
 
-def _focus(planes: Sequence[Float[np.ndarray, "k 4"]]) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
+def _focus(planes: Sequence[Float[np.ndarray, "_ 4"]]) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
     """The point that violates the cones of the views least in sum, and which of them contain it."""
     rows = np.concatenate(planes)
     owner = np.repeat(np.arange(len(planes)), [len(p) for p in planes])

@@ -76,7 +76,7 @@ def crowd(shapes) -> SceneState:
 
 def moved_state(state: SceneState, angle: float, shift) -> SceneState:
     """The whole scene turned about the vertical and then shifted."""
-    q, shift = quaternion_exp(np.array([0, 0, angle])), np.array([*shift, 0.0])
+    q, shift = quaternion_exp(np.array([0.0, 0.0, angle])), np.array([*shift, 0.0])
     turned = quaternion_multiply(np.broadcast_to(q, state.poses.quaternion.shape), state.poses.quaternion)
     return SceneState(
         state.names, Pose(rotate(q, state.poses.position) + shift, turned), state.light, rotate(q, state.pusher) + shift

@@ -213,6 +213,7 @@ def bad(where, value) -> np.ndarray:
         ([[[10**400, 0, 0]]], "actions"),
     ],
 )
+@pytest.mark.wrong_arrays
 def test_actions_that_cannot_be_rolled_out_are_told_in_one_sentence(model, state, actions, words):
     with pytest.raises(InvalidInput, match=words) as caught:
         model.rollout(state, actions)

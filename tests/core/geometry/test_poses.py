@@ -81,6 +81,7 @@ def test_nearly_unit_quaternions_are_normalised_exactly():
 
 
 @pytest.mark.parametrize("bad", [[2.0, 0, 0, 0], [0.0, 0, 0, 0], [np.nan, 0, 0, 1], [1.0, 0, 0]])
+@pytest.mark.wrong_arrays
 def test_other_quaternions_are_refused(bad):
     with pytest.raises(InvalidInput, match="quaternion"):
         unit_quaternion(np.array(bad))

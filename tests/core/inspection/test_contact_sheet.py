@@ -37,6 +37,7 @@ def test_equal_images_count_as_100_db_and_not_as_infinity():
     assert psnr(smooth(), smooth() + 1e-7) == 100
 
 
+@pytest.mark.wrong_arrays
 def test_an_empty_mask_and_other_shapes_are_refused():
     with pytest.raises(InvalidInput, match="mask"):
         psnr(smooth(), smooth(), np.zeros((48, 64), bool))

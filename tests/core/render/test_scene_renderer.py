@@ -366,6 +366,7 @@ def test_no_pixels_at_all_and_all_of_them():
 
 
 @pytest.mark.parametrize("shape", [(32, 32), (2, 32, 32), (1, 24, 32), (1, 32, 32, 3)])
+@pytest.mark.wrong_arrays
 def test_pixels_of_another_shape_are_refused(shape):
     fields, scene = random_scene(2)
     with pytest.raises(InvalidInput, match="shape of the pixels to look at"):

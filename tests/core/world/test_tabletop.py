@@ -110,6 +110,7 @@ def test_steps_of_an_action_end_where_the_action_ends(library, world):
 
 
 @pytest.mark.parametrize("action", [[0.31, 0, 0], [0, 0, 0.1], [0, float("nan"), 0], [0, 0], "north"])
+@pytest.mark.wrong_arrays
 def test_bad_action_is_refused_and_nothing_moves(world, action):
     before = world.truth()
     with pytest.raises(InvalidInput):

@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 import trimesh
+from safetensors import safe_open
+from safetensors.numpy import save_file
 from scipy.spatial import ConvexHull
 
 from osfcore.dynamics.shapes.field_parts import field_mesh, field_parts, read_parts, write_parts
@@ -97,7 +99,10 @@ def test_broken_files_count_as_missing(tmp_path, length):
 @pytest.mark.parametrize("part", [np.zeros((4, 2)), np.zeros((0, 3)), np.full((4, 3), np.nan), np.zeros(3)])
 def test_files_of_anything_else_count_as_missing(tmp_path, part):
     path = tmp_path / "parts.safetensors"
-    write_parts(path, (part,), "abc")
+    write_parts(path, (np.zeros((4, 3), np.float32),), "abc")
+    with safe_open(path, "numpy") as file:
+        header = file.metadata()
+    save_file({"0": part.astype(np.float32)}, path, header)
     assert read_parts(path, "abc") is None
 
 
