@@ -48,7 +48,7 @@ OWNERS = {  # who alone may import a package
     "cma": ("osfcore.estimation.search.cma_es",),
     "coacd": ("osfcore.geometry.convex_parts",),
     "viser": ("app.viewer", "app.episodes.recording", "app.api.relay"),
-    "websockets": ("app.api.relay",),
+    "websockets": ("app.api.relay", "app.viewer.private_server"),
     "imageio_ffmpeg": ("app.episodes.frames",),
     "fastapi": ("app",),
     "uvicorn": ("app",),

@@ -18,6 +18,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
 from app.api import problems, relay
+from app.api.connection_timeouts import BodyTimeoutMiddleware
 from app.api.dependencies import ObjectCatalogue, Services
 from app.api.http_metrics import Metrics, MetricsMiddleware
 from app.api.routes import comparisons as neural
@@ -86,6 +87,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.settings, app.state.metrics = settings, Metrics()
     limit_of = partial(_body_limit, settings)
+    app.add_middleware(BodyTimeoutMiddleware)
     app.add_middleware(BodyLimitMiddleware, limit_of=limit_of)
     if settings.token is not None:
         app.add_middleware(TokenMiddleware, token=settings.token.get_secret_value())

@@ -7,17 +7,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
+from urllib.parse import urlsplit
 
 import websockets
-from fastapi import APIRouter, WebSocket
+from fastapi import APIRouter, HTTPException, Request, WebSocket
 from fastapi.responses import FileResponse
-from starlette.types import Message
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from app.api.dependencies import ServicesDep
+from app.api.dependencies import Services, ServicesDep
+from app.api.rate_limit import RateLimit
 from app.api.security import is_same_origin
+from app.api.viewer_messages import BURST, RATE, is_allowed
+from app.viewer.private_server import SECRET_HEADER
+from osfcore.errors import shown
 
 router = APIRouter(include_in_schema=False)
 _PASSED_CLOSE_CODES = (1000, 1001, 1002, 1011, 1012)
@@ -25,12 +30,40 @@ _INTERNAL_ERROR = 1011
 _OPEN_TIMEOUT_S = 5.0
 
 
+_LOOKS = ("hideViserLogo", "darkMode")  # what the page asks of viser's client
+_RECORDING = re.compile(r"/api/episodes/[A-Za-z0-9_-]+/files/recording\.viser")
+
+
 @router.get("/viewer")
 @router.get("/viewer/")
-def page(services: ServicesDep) -> FileResponse:
-    """The viewer's client, one file."""
+def page(request: Request, services: ServicesDep) -> FileResponse:
+    """The viewer's client, one file.
+
+    It obeys its address: `websocket` and `playbackPath` name where its messages come from, and messages may hold
+    scripts. So nothing but looks and this service's own recordings may be asked for.
+    """
+    for name, value in request.query_params.multi_items():
+        if name not in _LOOKS and not _is_own(name, value, request, services):
+            raise HTTPException(400, f"The 3D view cannot be opened with {shown(name)!r}; open it from the page.")
     # no-cache, because a client of another version than the server is refused by it
     return FileResponse(services.viewer.client_page, media_type="text/html", headers={"Cache-Control": "no-cache"})
+
+
+def _is_own(name: str, address: str, request: Request, services: Services) -> bool:
+    """Whether an address names this service's relay (viser writes it into the page's own) or one of its recordings."""
+    try:
+        parts = urlsplit(address)
+    except ValueError:
+        return False
+    scheme = {"ws": "http", "wss": "https"}.get(parts.scheme, parts.scheme)
+    is_here = parts.netloc.lower() == request.headers.get("host", "").lower()
+    is_known = f"{scheme}://{parts.netloc}" in services.settings.allowed_origins
+    if scheme not in ("http", "https") or parts.query or not (is_here or is_known):
+        return False
+    path = parts.path.removeprefix(request.scope.get("root_path", ""))
+    if name == "websocket":
+        return path.rstrip("/") == "/viewer" and scheme != parts.scheme
+    return name == "playbackPath" and scheme == parts.scheme and bool(_RECORDING.fullmatch(path))
 
 
 @router.websocket("/viewer")
@@ -45,6 +78,7 @@ async def relay(browser: WebSocket, services: ServicesDep) -> None:
         upstream = await connect(
             f"ws://127.0.0.1:{services.viewer.port}",
             subprotocols=offered or None,
+            additional_headers={SECRET_HEADER: services.viewer.server.secret},
             compression=None,
             max_size=None,
             proxy=None,
@@ -76,9 +110,13 @@ async def _pump_both(browser: WebSocket, upstream: ClientConnection) -> None:
 
 
 async def _to_viewer(browser: WebSocket, upstream: ClientConnection) -> None:
+    """Pass on what the page may send; end with whoever sends too much."""
+    limit = RateLimit(RATE, BURST)
     with contextlib.suppress(websockets.ConnectionClosed):
-        while (message := await browser.receive())["type"] == "websocket.receive":
-            await upstream.send(_payload(message))
+        while (message := await browser.receive())["type"] == "websocket.receive" and limit.take():
+            frame = message.get("bytes")
+            if frame is not None and is_allowed(frame):
+                await upstream.send(frame)
 
 
 async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
@@ -88,8 +126,3 @@ async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
                 await browser.send_text(message)
             else:
                 await browser.send_bytes(message)
-
-
-def _payload(message: Message) -> str | bytes:
-    data = message.get("bytes")
-    return message["text"] if data is None else data

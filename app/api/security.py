@@ -19,10 +19,11 @@ from app.api.problems import problem
 _UNSAFE_METHODS = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 _COMMON = "object-src 'none'; base-uri 'none'; frame-ancestors 'self'; form-action 'self'"
 _SITE_POLICY = f"default-src 'self'; img-src 'self' data: blob:; {_COMMON}"
-# The viewer's client is one file of inline script that starts workers and wasm from blobs.
+# The viewer's client is one file of inline script that starts workers and wasm from blobs, and fetches textures, wasm
+# and its lamp from blobs and data; it may connect to this service alone.
 _VIEWER_POLICY = (
-    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:;"
-    " style-src 'self' 'unsafe-inline'; worker-src 'self' blob: data:; connect-src 'self' data: blob: ws: wss:;"
+    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:;"
+    " style-src 'self' 'unsafe-inline'; worker-src 'self' blob: data:; connect-src 'self' data: blob:;"
     f" {_COMMON}"
 )
 _DOCS_POLICY = (

@@ -1,26 +1,36 @@
-"""An optional password: with OSF_TOKEN set, every request must bring it.
+"""An optional password: with a token set, every request must bring it.
 
-Programs send it as `Authorization: Bearer TOKEN`. A browser opens `/?token=TOKEN` once, which becomes a cookie.
+Programs send it as `Authorization: Bearer TOKEN`. A browser opens `/?token=TOKEN` once and gets a cookie: a random
+session, signed with a key made of the token, so that the token itself is kept nowhere, sessions outlive a restart, and
+another token ends them all.
 """
 
 from __future__ import annotations
 
 import hmac
+import secrets
+from collections import OrderedDict
 from urllib.parse import parse_qs
 
+from itsdangerous import BadSignature, TimestampSigner
 from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app.api.problems import problem
+from app.api.rate_limit import RateLimit
 
-COOKIE = "osf_token"
+COOKIE = "osf_session"
+_LIFE_S = 30 * 24 * 3600
 _OPEN = ("/api/health",)  # whoever runs the service may look whether it lives
 _REFUSED = "This service needs a token: open its page as /?token=TOKEN, or send the header Authorization: Bearer TOKEN."
+_TOO_MANY = "Too many wrong tokens have come in; wait a moment before the next one."
+_WRONG_PER_S, _WRONG_AT_ONCE = 0.2, 10.0  # from one address
+_MOST_ADDRESSES = 1000
 
 
 class TokenMiddleware:
-    """Refuses requests without the token.
+    """Refuses requests without the token or a session.
 
     Args:
         app: to protect.
@@ -30,6 +40,8 @@ class TokenMiddleware:
     def __init__(self, app: ASGIApp, *, token: str) -> None:
         self._app = app
         self._token = token.encode()
+        self._signer = TimestampSigner(self._token, salt="osf-session")
+        self._wrong: OrderedDict[str, RateLimit] = OrderedDict()  # by address of the client
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check and pass on one request."""
@@ -37,27 +49,62 @@ class TokenMiddleware:
             await self._app(scope, receive, send)
             return
         connection = HTTPConnection(scope)
-        if self._is_right(_presented(connection)):
+        login = _in_query(scope) if scope["type"] == "http" and scope["method"] == "GET" else None
+        given = _in_header(connection) if login is None else login
+        if self._is_session(connection.cookies.get(COOKIE, "")) and login is None:
             await self._app(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-        elif scope["method"] == "GET" and self._is_right(_in_query(scope)):
-            # The address without the token, so that it is neither kept in the history nor copied along.
-            answer = RedirectResponse(scope.get("root_path", "") + (scope["path"] or "/"), 303)
-            value = parse_qs(scope["query_string"].decode("latin-1"))["token"][0]
-            answer.set_cookie(COOKIE, value, httponly=True, samesite="strict", max_age=30 * 24 * 3600)
-            await answer(scope, receive, send)
+        elif given is not None and self._wrong_from(scope).is_empty:
+            await _refuse(429, _TOO_MANY, {"Retry-After": "5"})(scope, receive, send)
+        elif given is None or not hmac.compare_digest(given, self._token):
+            if given is not None:
+                self._wrong_from(scope).take()
+            await _refuse(401, _REFUSED, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
+        elif login is None:
+            await self._app(scope, receive, send)
         else:
-            await problem(401, _REFUSED, headers={"WWW-Authenticate": "Bearer"})(scope, receive, send)
+            await self._logged_in(scope)(scope, receive, send)
 
-    def _is_right(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode("utf-8", "replace"), self._token)
+    def _wrong_from(self, scope: Scope) -> RateLimit:
+        """The limit of wrong tokens from the address that a request comes from."""
+        address = (scope.get("client") or ("",))[0]
+        limit = self._wrong.setdefault(address, RateLimit(_WRONG_PER_S, _WRONG_AT_ONCE))
+        self._wrong.move_to_end(address)
+        if len(self._wrong) > _MOST_ADDRESSES:
+            self._wrong.popitem(last=False)
+        return limit
+
+    def _is_session(self, cookie: str) -> bool:
+        try:
+            self._signer.unsign(cookie, max_age=_LIFE_S)
+        except BadSignature:
+            return False
+        return True
+
+    def _logged_in(self, scope: Scope) -> RedirectResponse:
+        """To the address without the token, so that it is neither kept in the history nor copied along."""
+        path = "/" + scope["path"].lstrip("/\\")  # two slashes would lead to another host
+        answer = RedirectResponse(scope.get("root_path", "") + path, 303)
+        session = self._signer.sign(secrets.token_urlsafe(16)).decode()
+        is_https = scope["scheme"] == "https"
+        answer.set_cookie(COOKIE, session, max_age=_LIFE_S, httponly=True, samesite="strict", secure=is_https)
+        return answer
 
 
-def _presented(connection: HTTPConnection) -> str:
+def _refuse(status: int, sentence: str, headers: dict[str, str]) -> ASGIApp:
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await problem(status, sentence, headers=headers)(scope, receive, send)
+
+    return answer
+
+
+def _in_header(connection: HTTPConnection) -> bytes | None:
     scheme, _, token = connection.headers.get("authorization", "").partition(" ")
-    return token.strip() if scheme.lower() == "bearer" else connection.cookies.get(COOKIE, "")
+    return token.strip().encode("latin-1") if scheme.lower() == "bearer" else None  # as the bytes came
 
 
-def _in_query(scope: Scope) -> str:
-    return parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
+def _in_query(scope: Scope) -> bytes | None:
+    tokens = parse_qs(scope.get("query_string", b"").decode("latin-1"), errors="surrogateescape").get("token")
+    return tokens[0].encode("utf-8", "surrogateescape") if tokens else None

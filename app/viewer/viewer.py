@@ -32,6 +32,7 @@ from app.viewer.panels.neural_panel import NeuralPanel
 from app.viewer.panels.panel import Panel
 from app.viewer.panels.push_panel import PushPanel
 from app.viewer.playback import Playback
+from app.viewer.private_server import PrivateViser
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -39,15 +40,6 @@ from osfcore.geometry.poses import Pose
 PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
 PUSH_STEPS = 2
 _log = logging.getLogger(__name__)
-
-
-class LoopbackViser(viser.ViserServer):
-    """viser bound to loopback, unable to open a public tunnel."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse: any client could ask for this."""
-        del verbose
-        return None
 
 
 class Viewer:
@@ -79,7 +71,7 @@ class Viewer:
         self._neural = neural
         self._fields = fields
         self._commands = ThreadPoolExecutor(1, thread_name_prefix="viewer-commands")
-        self._server: LoopbackViser | None = None
+        self._server: PrivateViser | None = None
         self._undo: list[Callable[[], None]] = []
 
     @property
@@ -88,7 +80,7 @@ class Viewer:
         return Path(viser.__file__).parent / "client" / "build" / "index.html"
 
     @property
-    def server(self) -> LoopbackViser:
+    def server(self) -> PrivateViser:
         """The loopback server; only while it runs."""
         assert self._server is not None
         return self._server
@@ -100,8 +92,7 @@ class Viewer:
 
     def start(self) -> None:
         """Open the loopback server and draw what there is."""
-        with contextlib.redirect_stdout(io.StringIO()):  # the banner would tell the inner port
-            self._server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
+        self._server = PrivateViser()
         self._drawing = SceneNodes(self._server, self._runner.library, self._move_object, self._move_light)
         self._playback = Playback(self._drawing)
         self._add_controls(self._server)
@@ -129,7 +120,7 @@ class Viewer:
             self._server.stop()
         self._server = None
 
-    def _make_panels(self, server: LoopbackViser) -> tuple[Panel, ...]:
+    def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
         """The panels, in the order of their folders."""
         library, table, jobs = self._runner.library, self._drawing, self._runner.jobs
         neural = NeuralPanel(self._neural, table.state, self._fields)
@@ -165,7 +156,7 @@ class Viewer:
         current = self._runner.current
         return None if current is None else self._runner.scene(current)
 
-    def _add_controls(self, server: LoopbackViser) -> None:
+    def _add_controls(self, server: PrivateViser) -> None:
         gui = server.gui
         gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
         gui.set_panel_label("Scene")

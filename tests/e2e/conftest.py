@@ -18,6 +18,15 @@ FLAGS = (
 )
 
 
+def watch_errors(page):
+    """Add the page's script errors to `page.problems`.
+
+    But for one: viser's client carries a sorter of Gaussian splats, which we show none of; it makes functions from
+    strings, which the page's policy forbids.
+    """
+    page.on("pageerror", lambda error: page.problems.append(str(error)) if "unsafe-eval" not in str(error) else None)
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
     """Keep a picture of the page where a test fails."""

@@ -7,6 +7,7 @@ import urllib.request
 
 import pytest
 
+from tests.e2e.conftest import watch_errors
 from tests.live import free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
@@ -55,7 +56,7 @@ def service(library, tmp_path_factory):
 def page(browser, service):
     page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
     page.problems = []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    watch_errors(page)
     page.goto(service.url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
     yield page

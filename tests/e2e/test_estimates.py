@@ -14,6 +14,7 @@ from PIL import Image
 from app.cli.commands.collect import CollectObservationCommand
 from osfcore.io.observation_file import read_observation, write_observation
 from tests.app.services.test_image_sets import zipped
+from tests.e2e.conftest import watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -48,7 +49,7 @@ def folder(data_dir, tmp_path_factory):
 def page(browser, url):
     page = browser.new_page(viewport={"width": 1366, "height": 1000}, color_scheme="light")
     page.problems = []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    watch_errors(page)
     # viser takes a picture's address back even while the browser still loads the picture, where a newer one has come.
     own = lambda m: m.type == "error" and not m.location["url"].startswith("blob:")  # noqa: E731
     page.on("console", lambda m: page.problems.append(m.text) if own(m) else None)

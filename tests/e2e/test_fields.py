@@ -8,6 +8,7 @@ import pytest
 
 from tests.app.services.test_image_sets import zipped
 from tests.core.fields.sets import write_set
+from tests.e2e.conftest import watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -28,7 +29,7 @@ def url(library, tmp_path_factory):
 def page(browser, url):
     page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
     page.problems = []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    watch_errors(page)
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)

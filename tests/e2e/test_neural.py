@@ -12,6 +12,7 @@ from PIL import Image
 from app.viewer.nodes.scene_nodes import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
 from osfcore.geometry.cameras import Camera
 from tests.app.processes.fields import write_box, write_exact_table
+from tests.e2e.conftest import watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -39,7 +40,7 @@ def page(browser, url):
     page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
     page.set_default_timeout(1000 * DRAW_S)
     page.problems = []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    watch_errors(page)
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.e2e.conftest import watch_errors
 from tests.live import free_port, live_service, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
@@ -52,7 +53,7 @@ def tab(browser, service):
     """One page for the module; it notes errors and every request."""
     page = browser.new_page(viewport={"width": 1366, "height": 768}, color_scheme="light")
     page.problems, page.hosts = [], set()
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    watch_errors(page)
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.on("request", lambda r: page.hosts.add(urlsplit(r.url).netloc) if r.url.startswith(("http", "ws")) else None)
     page.goto(service.url)

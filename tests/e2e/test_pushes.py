@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.e2e.conftest import ARTIFACTS
+from tests.e2e.conftest import ARTIFACTS, watch_errors
 from tests.e2e.test_neural import call
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
@@ -37,7 +37,7 @@ def page(browser, url):
     page = browser.new_page(viewport={"width": 1366, "height": 1000}, color_scheme="light")
     page.set_default_timeout(1000 * LOAD_S)
     page.problems = []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    watch_errors(page)
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)

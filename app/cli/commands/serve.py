@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import ipaddress
 import logging
+import secrets
 import socket
 import sys
 from dataclasses import dataclass, field
@@ -20,7 +22,10 @@ if TYPE_CHECKING:
     import uvicorn
     from fastapi import FastAPI
 
+    from app.services.service_settings import Settings
+
 _BACKLOG = 128
+_MAX_FRAME_BYTES = 1 << 16  # from a browser to the 3D view
 _GRACE_S = 2  # for open requests after Ctrl-C
 
 
@@ -49,9 +54,10 @@ class Serve:
         with contextlib.closing(listener):
             Store(self.data_dir).close()  # tells now, in one sentence, if the data directory cannot be used
             url = _url(self.host, listener.getsockname()[1])
+            settings, login = _settings(self)
             logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
             with contextlib.suppress(KeyboardInterrupt):  # the server raises it again once everything has stopped
-                _server(self, url).run(sockets=[listener])
+                _server(settings, url + login).run(sockets=[listener])
         return {"url": url}
 
 
@@ -84,12 +90,13 @@ def bound_socket(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _server(serve: Serve, url: str) -> uvicorn.Server:
-    """A server that tells its address once it is ready, and ends event streams before it waits for them."""
-    import uvicorn
-    from pydantic import ValidationError
+def _settings(serve: Serve) -> tuple[Settings, str]:
+    """Settings from options and environment, and what an address needs to let one in.
 
-    from app.api.app_factory import create_app
+    Whoever lets other machines in has a token, if need be a new one, which is told with the address.
+    """
+    from pydantic import SecretStr, ValidationError
+
     from app.services.service_settings import Settings
 
     try:
@@ -98,6 +105,27 @@ def _server(serve: Serve, url: str) -> uvicorn.Server:
         first = error.errors()[0]
         name = "OSF_" + "_".join(str(part) for part in first["loc"]).upper()
         raise InvalidInput(name, repr(first["input"])[:60], f"valid ({first['msg']})") from None
+    if settings.token is None and not is_loopback(serve.host):
+        token = secrets.token_urlsafe(24)
+        return settings.model_copy(update={"token": SecretStr(token)}), f"/?token={token}"
+    return settings, ""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _server(settings: Settings, url: str) -> uvicorn.Server:
+    """A server that tells its address once it is ready, and ends event streams before it waits for them."""
+    import uvicorn
+
+    from app.api.app_factory import create_app
+    from app.api.connection_timeouts import PromptProtocol
+
     app = create_app(settings)
 
     class Server(uvicorn.Server):
@@ -119,7 +147,8 @@ def _server(serve: Serve, url: str) -> uvicorn.Server:
             lifespan="on",
             log_level="warning",
             access_log=False,
-            ws_max_size=64 << 20,
+            http=PromptProtocol,
+            ws_max_size=_MAX_FRAME_BYTES,
             ws_per_message_deflate=False,  # the viewer's frames are compressed already
             timeout_graceful_shutdown=_GRACE_S,
             proxy_headers=True,

@@ -1,13 +1,18 @@
 import collections
 import socket
+import urllib.error
+import urllib.request
 
+import msgspec
 import numpy as np
 import pytest
 import viser
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from app.viewer.private_server import SECRET_HEADER
 from tests.app.conftest import until
+from tests.app.viewer.conftest import uuid_of
 
 PROTOCOL = f"viser-v{viser.__version__}"
 
@@ -29,6 +34,72 @@ def test_the_client_page_is_served_and_not_kept(service):
         assert page.status_code == 200
         assert page.headers["content-type"].startswith("text/html")
         assert page.headers["cache-control"] == "no-cache"
+
+
+RECORDING = "http://localhost/api/episodes/e-1/files/recording.viser"
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        {"websocket": "ws://evil.example"},
+        {"playbackPath": "data:text/plain,x"},
+        {"playbackPath": "http://evil.example/api/episodes/e-1/files/recording.viser"},
+        {"playbackPath": "//evil.example/api/episodes/e-1/files/recording.viser"},
+        {"playbackPath": "http://localhost@evil.example/api/episodes/e-1/files/recording.viser"},
+        {"playbackPath": "http://localhost/api/goals/g/image.png"},
+        {"playbackPath": f"{RECORDING}?x"},
+        {"playbackPath": "http://localhost/api/episodes/e-1/files/../../../x/recording.viser"},
+        {"playbackPath": "http://["},
+        [("playbackPath", RECORDING), ("playbackPath", "data:,x")],
+        {"anything": "else"},
+    ],
+)
+def test_the_client_page_is_not_opened_for_messages_from_elsewhere(service, query):
+    answer = service.get("/viewer/", params=query)
+    assert answer.status_code == 400
+    assert "open it from the page" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("query", ["", "hideViserLogo&darkMode", f"hideViserLogo&playbackPath={RECORDING}"])
+def test_the_client_page_is_opened_with_looks_and_own_recordings(service, query):
+    assert service.get(f"/viewer/?{query}").status_code == 200
+
+
+@pytest.mark.parametrize("headers", [{}, {SECRET_HEADER: "guessed"}])
+def test_the_inner_port_is_closed_to_all_but_the_relay(live, headers):
+    address = f"127.0.0.1:{live.services.viewer.port}"
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://{address}", subprotocols=[PROTOCOL], additional_headers=headers, proxy=None)
+    assert refused.value.response.status_code == 403
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(urllib.request.Request(f"http://{address}/", headers=headers))
+
+
+def test_a_message_that_the_page_never_sends_changes_nothing(live):
+    button = live.services.viewer.server.gui.add_button("Test")
+    try:
+        with viewer_socket(live) as browser:
+            browser.recv(timeout=10)
+            for updates in ({"disabled": True}, {"update_cb": []}, {"value": True}):
+                browser.send(
+                    msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid_of(button), "updates": updates})
+                )
+            until(lambda: button.value)
+            assert not button.disabled
+    finally:
+        button.remove()
+
+
+def flood(browser):
+    for _ in range(20_000):
+        browser.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+    collections.deque(browser, maxlen=0)
+
+
+def test_a_flood_ends_the_connection(live):
+    with viewer_socket(live) as browser, pytest.raises(ConnectionClosed):
+        flood(browser)
 
 
 def test_frames_pass_with_the_protocol_of_the_client(live):

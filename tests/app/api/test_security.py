@@ -54,5 +54,7 @@ def test_every_answer_carries_headers(service):
         headers = service.get(path).headers
         assert "frame-ancestors 'self'" in headers["content-security-policy"]
         assert headers["x-content-type-options"] == "nosniff"
-    assert "unsafe-eval" in service.get("/viewer/").headers["content-security-policy"]
+    viewer = service.get("/viewer/").headers["content-security-policy"]
+    assert "connect-src 'self' data: blob:;" in viewer
+    assert "'unsafe-eval'" not in viewer
     assert "unsafe" not in service.get("/api/health").headers["content-security-policy"]

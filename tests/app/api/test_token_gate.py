@@ -49,8 +49,58 @@ def test_a_browser_opens_the_page_with_it_once_and_keeps_a_cookie(client):
     cookie = answer.headers["set-cookie"].lower()
     assert "httponly" in cookie
     assert "samesite=strict" in cookie
-    assert client.cookies[COOKIE] == TOKEN
+    assert TOKEN not in client.cookies[COOKIE]
+    assert "secure" not in cookie
     assert client.get("/").text == "inside"
+
+
+def test_each_session_is_another_and_one_is_signed(client):
+    sessions = {client.get(f"/?token={TOKEN}").cookies[COOKIE] for _ in range(2)}
+    assert len(sessions) == 2
+    for cookie in ("", TOKEN, sessions.pop()[:-1], "a.b.c"):
+        client.cookies.clear()
+        client.cookies.set(COOKIE, cookie)
+        assert client.get("/").status_code == 401
+
+
+def test_a_session_outlives_a_restart_but_not_another_token(client):
+    client.get(f"/?token={TOKEN}")
+    session = client.cookies[COOKIE]
+    for token, status in ((TOKEN, 200), ("another-one", 401)):
+        again = TestClient(TokenMiddleware(inside, token=token), base_url="http://localhost")
+        again.cookies.set(COOKIE, session)
+        assert again.get("/").status_code == status
+
+
+def test_behind_https_the_cookie_is_secure():
+    client = TestClient(TokenMiddleware(inside, token=TOKEN), base_url="https://localhost", follow_redirects=False)
+    assert "secure" in client.get(f"/?token={TOKEN}").headers["set-cookie"].lower()
+
+
+@pytest.mark.parametrize("path", ["//evil.example/x", "/%2Fevil.example/x", "/%5Cevil.example", "///evil.example"])
+def test_a_login_leads_nowhere_else(client, path):
+    location = client.get(f"http://localhost{path}?token={TOKEN}").headers["location"]
+    assert location.startswith("/")
+    assert not location.startswith(("//", "/\\"))
+
+
+@pytest.mark.parametrize("token", ["pässwörter", "密码密码密码密码", "a b+c%d&e=f"])
+def test_a_token_may_have_any_characters(token):
+    client = TestClient(TokenMiddleware(inside, token=token), base_url="http://localhost", follow_redirects=False)
+    assert client.get("/", headers={"Authorization": f"Bearer {token}".encode()}).status_code == 200
+    assert client.get("/", params={"token": token}).status_code == 303
+    assert client.get("/").status_code == 200
+
+
+def test_wrong_tokens_are_limited_and_sessions_are_not(client):
+    client.get(f"/?token={TOKEN}")
+    wrong = {"Authorization": "Bearer wrong-one"}
+    other = TestClient(client.app, base_url="http://localhost")
+    statuses = [other.get("/", headers=wrong).status_code for _ in range(20)]
+    assert statuses[0] == 401
+    assert statuses[-1] == 429
+    assert other.get("/", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 429
+    assert client.get("/").status_code == 200
 
 
 def test_a_wrong_token_in_the_address_sets_no_cookie(client):
@@ -67,8 +117,8 @@ def test_the_viewer_needs_it_too(client):
     with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect("/viewer"):
         pass
     assert refused.value.code == 1008
-    client.cookies.set(COOKIE, TOKEN)
-    with client.websocket_connect("/viewer"):
+    session = client.get(f"/?token={TOKEN}").cookies[COOKIE]
+    with client.websocket_connect("/viewer", headers={"Cookie": f"{COOKIE}={session}"}):
         pass
 
 

@@ -10,10 +10,15 @@ import pytest
 import viser
 from viser._gui_handles import GuiProgressBarHandle
 
-from app.viewer.viewer import LoopbackViser
+from app.viewer.private_server import PrivateViser
 from tests.app.conftest import until
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
+
+
+def uuid_of(element):
+    """By which a browser's messages name an element."""
+    return element._impl.uuid
 
 
 class ViewerDriver:
@@ -120,7 +125,7 @@ class ViewerDriver:
 @pytest.fixture(scope="session")
 def viser_server():
     with contextlib.redirect_stdout(io.StringIO()):
-        server = LoopbackViser(host="127.0.0.1", port=0, verbose=False)
+        server = PrivateViser()
     yield server
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()

@@ -3,7 +3,7 @@ import pytest
 
 from app.jobs.job import JobChanged, JobView
 from app.viewer.nodes.scene_nodes import VIEW_FROM
-from app.viewer.viewer import LoopbackViser
+from app.viewer.private_server import PrivateViser
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M
 from tests.app.conftest import until
 from tests.app.viewer.conftest import BOTTLE, BOX
@@ -81,7 +81,7 @@ def test_pushes_from_the_panel_move_the_pusher(live, browser, shown):
 
 def test_nobody_can_open_a_tunnel(live):
     server = live.services.viewer.server
-    assert isinstance(server, LoopbackViser)
+    assert isinstance(server, PrivateViser)
     assert server.request_share_url() is None
     assert server.get_host() == "127.0.0.1"
     assert tuple(server.initial_camera.position) == VIEW_FROM

@@ -1,0 +1,59 @@
+"""Which messages a browser may send to the 3D view: what its own page sends, and no more.
+
+viser takes any message from any client: one could disable buttons for all visitors, or upload files to a button. So
+the relay reads each frame (msgpack: a map with "type") and passes on the few kinds that this viewer answers to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+MAX_FRAME_BYTES = 1 << 14
+RATE, BURST = 200.0, 600.0  # messages a second; a camera that is dragged sends one a frame
+_MOST_TEXT = 200
+_CAMERA = frozenset({
+    "type", "wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction",
+})  # fmt: skip
+_FIELDS: Mapping[str, frozenset[str]] = {
+    "ViewerCameraMessage": _CAMERA,
+    "GuiUpdateMessage": frozenset({"type", "uuid", "updates"}),
+    "TransformControlsUpdateMessage": frozenset({"type", "name", "wxyz", "position", "owner"}),
+    "TransformControlsDragStartMessage": frozenset({"type", "name", "owner"}),
+    "TransformControlsDragEndMessage": frozenset({"type", "name", "owner"}),
+}
+
+
+def is_allowed(frame: bytes) -> bool:
+    """Whether a frame holds a message that the page sends, with the fields that it sends."""
+    if len(frame) > MAX_FRAME_BYTES:
+        return False
+    try:
+        message = msgspec.msgpack.decode(frame, type=dict[str, Any])
+    except (msgspec.DecodeError, RecursionError):
+        return False
+    kind = message.get("type")
+    if not isinstance(kind, str) or kind not in _FIELDS or not message.keys() <= _FIELDS[kind]:
+        return False
+    if kind == "GuiUpdateMessage":
+        updates = message.get("updates")
+        return isinstance(updates, dict) and updates.keys() == {"value"} and _is_value(updates["value"])
+    return all(_is_plain(value) for value in message.values())
+
+
+def _is_value(value: object) -> bool:
+    return _is_number(value) or (isinstance(value, str) and len(value) <= _MOST_TEXT)
+
+
+def _is_plain(value: object) -> bool:
+    """A number, a short text or a few numbers."""
+    if isinstance(value, list):
+        return len(value) <= 4 and all(_is_number(number) for number in value)
+    return _is_value(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value))

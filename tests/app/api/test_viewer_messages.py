@@ -1,0 +1,76 @@
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.api.rate_limit import RateLimit
+from app.api.viewer_messages import MAX_FRAME_BYTES, is_allowed
+
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 1, 2], "fov": 0.8, "near": 0.1, "far": 100,
+    "image_height": 480, "image_width": 640, "look_at": [0.0, 0, 0], "up_direction": [0.0, 0, 1],
+}  # fmt: skip
+HANDLE = {"type": "TransformControlsUpdateMessage", "name": "/a", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 1]}
+
+
+def encoded(message):
+    return msgspec.msgpack.encode(message)
+
+
+def pressed(**updates):
+    return {"type": "GuiUpdateMessage", "uuid": "a", "updates": updates}
+
+
+@pytest.mark.parametrize(
+    "message",
+    [CAMERA, HANDLE, pressed(value=True), pressed(value=0.5), pressed(value="+x"),
+     {"type": "TransformControlsDragEndMessage", "name": "/a", "owner": ""}],
+)  # fmt: skip
+def test_what_the_page_sends_is_allowed(message):
+    assert is_allowed(encoded(message))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        pressed(update_cb=[]),
+        pressed(value=True, disabled=True),
+        pressed(value="x" * 10_000),
+        pressed(value=["x"] * 100),
+        pressed(value=float("nan")),
+        pressed(),
+        HANDLE | {"position": [float("inf"), 0, 0]},
+        HANDLE | {"scale": 3},
+        HANDLE | {"name": "x" * 1000},
+        {"type": "FileTransferStartUpload", "source_component_uuid": "a", "transfer_uuid": "b", "size_bytes": 1},
+        {"type": "RunJavascriptMessage", "source": "alert(1)"},
+        {"type": "ShareUrlRequest"},
+        {"type": ["ViewerCameraMessage"]},
+        {},
+        [],
+        "text",
+    ],
+)
+def test_everything_else_is_not(message):
+    assert not is_allowed(encoded(message))
+
+
+def test_large_frames_are_not():
+    padded = encoded(CAMERA) + b"\0" * MAX_FRAME_BYTES
+    assert not is_allowed(padded)
+
+
+@given(frame=st.binary(max_size=200))
+def test_noise_is_not(frame):
+    assert not is_allowed(frame)
+
+
+def test_tokens_come_back_with_time_up_to_the_burst():
+    now = 0.0
+    limit = RateLimit(2.0, 3.0, clock=lambda: now)
+    assert [limit.take() for _ in range(4)] == [True, True, True, False]
+    now = 1.0
+    assert [limit.take() for _ in range(3)] == [True, True, False]
+    now = 100.0
+    assert [limit.take() for _ in range(4)] == [True, True, True, False]
+    assert limit.is_empty
