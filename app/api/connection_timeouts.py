@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 
+import h11
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -18,6 +19,7 @@ class PromptProtocol(H11Protocol):
     """HTTP/1.1, with a deadline for each header."""
 
     _deadline: asyncio.TimerHandle | None = None
+    _is_handed_over = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Expect a request soon."""
@@ -34,9 +36,14 @@ class PromptProtocol(H11Protocol):
         self._forget()
         super().connection_lost(exc)
 
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """Hand the connection over: it may now be silent for as long as it likes."""
+        super().handle_websocket_upgrade(event)
+        self._is_handed_over = True
+
     def _expect(self) -> None:
         is_idle = self.cycle is None or self.cycle.response_complete
-        if not is_idle:
+        if self._is_handed_over or not is_idle:
             self._forget()
         elif self._deadline is None and not self.transport.is_closing():
             self._deadline = self.loop.call_later(HEAD_S, self._close)
