@@ -38,6 +38,8 @@ STATUS_OF_KIND = {
     "ProcessUnavailable": 503,
     "ProcessHangs": 503,
     "ProcessBusy": 503,
+    "ProcessFrozen": 503,
+    "TooManyStreams": 503,
     "CannotStore": 507,
     "UploadNotStored": 507,
     "CannotWrite": 507,
@@ -45,6 +47,7 @@ STATUS_OF_KIND = {
     "InternalError": 500,
     "NotFound": 404,
 }
+_MOST_POINTERS = 20  # mistakes that are told of one request
 _TITLES = {
     400: "Bad request",
     401: "Token needed",
@@ -130,9 +133,10 @@ async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, RequestValidationError)
-    pointers = [_pointer(entry, error.body) for entry in error.errors()]
+    entries = error.errors()
+    pointers = [_pointer(entry, error.body) for entry in entries[:_MOST_POINTERS]]
     first = pointers[0] if pointers else ProblemPointer(pointer="#", detail="unreadable")
-    more = f" (and {len(pointers) - 1} more)" if len(pointers) > 1 else ""
+    more = f" (and {len(entries) - 1} more)" if len(entries) > 1 else ""
     return problem(422, f"{first.pointer or first.parameter}: {first.detail}{more}", pointers)
 
 

@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 class JobTable:
-    """Jobs by identifier, oldest first. Callers hold one lock around every call.
+    """Jobs by identifier, oldest first. Callers hold one lock around every call that changes something.
 
     Args:
         store: where they are kept.
@@ -43,7 +43,7 @@ class JobTable:
 
     def all(self) -> list[Job]:
         """All jobs with their places in the queue, oldest first."""
-        return [self._with_position(job) for job in self._jobs.values()]
+        return [self._with_position(job) for job in list(self._jobs.values())]
 
     def get(self, job: str) -> Job:
         """One job with its place in the queue.
@@ -57,7 +57,11 @@ class JobTable:
 
     def queue(self) -> list[Job]:
         """Jobs that wait, the next one first."""
-        return [job for job in self._jobs.values() if job.state == "queued"]
+        return [job for job in list(self._jobs.values()) if job.state == "queued"]
+
+    def live(self, kind: str) -> list[Job]:
+        """Jobs of a kind that wait, run or pause, oldest first."""
+        return [job for job in list(self._jobs.values()) if job.kind == kind and not job.is_finished]
 
     def add(self, job: Job) -> None:
         """Keep a new job, the last of all."""
@@ -94,7 +98,8 @@ class JobTable:
     def _with_position(self, job: Job) -> Job:
         if job.state != "queued":
             return job
-        return replace(job, position=1 + [other.id for other in self.queue()].index(job.id))
+        waiting = [other.id for other in self.queue()]  # read without a lock, so it may have begun just now
+        return replace(job, position=1 + waiting.index(job.id)) if job.id in waiting else job
 
     def _keep(self, job: Job) -> None:
         shown = self._with_position(job)

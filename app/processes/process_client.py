@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import itertools
 import logging
@@ -172,7 +171,10 @@ class ProcessClient:
 
     async def call_async(self, command: object) -> Any:  # noqa: ANN401
         """The same without blocking the event loop."""
-        return await asyncio.wrap_future(await asyncio.to_thread(self.submit, command))
+        is_there = self._keeps_running or self._outbox is not None  # else starting it takes a while
+        return await asyncio.wrap_future(
+            self.submit(command) if is_there else await asyncio.to_thread(self.submit, command)
+        )
 
     # Requests
 
@@ -265,9 +267,13 @@ class ProcessClient:
         return lost
 
     def _listen(self, process: SpawnProcess, connection: Connection) -> None:
-        with contextlib.suppress(EOFError, OSError):
+        try:
             while True:
                 self._take(connection.recv())
+        except (EOFError, OSError):
+            pass
+        except Exception:  # this thread must not end before it has brought the process to its end
+            _log.exception("a message of the %s could not be read", self._who)
         lost = self._forget(process, connection)
         if self._stopping.is_set():
             return
@@ -301,4 +307,7 @@ class ProcessClient:
             case Overtaken(number):
                 self._settle(number)
             case _:
-                self._on_event(message)
+                try:
+                    self._on_event(message)
+                except Exception:
+                    _log.exception("what the %s told could not be used", self._who)

@@ -244,9 +244,8 @@ class Goals:
         Raises:
             NoDraft: if there is none.
         """
-        with self._drafting:
-            self._require_draft()
-            return self._draft_png
+        self._require_draft()
+        return self._draft_png
 
     def keep_draft(self, name: str) -> GoalRecord:
         """Keep the draft as a goal, and end it.

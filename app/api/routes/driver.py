@@ -5,11 +5,12 @@ from typing import Annotated
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.common import Input
 
-router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems())
+router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems(), route_class=BoundedRoute)
 Visitor = Annotated[
     str, Field(min_length=1, max_length=64, pattern="^[A-Za-z0-9_-]+$", description="What a page calls itself.")
 ]

@@ -9,12 +9,13 @@ from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.requests import ClientDisconnect
 
-from app.api.bodies import JSON, kind_of, parsed, whole_body
+from app.api.bodies import JSON, SMALL_BODY_BYTES, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep
+from app.api.lanes import urgent
 from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
-from app.api.routes.events import followed
+from app.api.routes.events import StreamDep, followed
 from app.api.schemas.common import Seed
 from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
 from app.jobs.job import Job
@@ -38,7 +39,9 @@ router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
 View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")]
 
 
-def _known_job(services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]) -> Job:
+async def _known_job(
+    services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]
+) -> Job:
     with named_in_path():
         return services.estimates.get(estimate)
 
@@ -77,8 +80,8 @@ async def create(
         except ClientDisconnect:
             raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
     else:
-        request_body = await _body(request, kind, services.settings.max_body_bytes)
-        job = await asyncio.to_thread(services.estimates.of_scene, request_body.asked(), request_body.scene)
+        request_body = await _body(request, kind)
+        job = await services.lanes.slow.run(services.estimates.of_scene, request_body.asked(), request_body.scene)
     response.headers["Location"] = f"{UPLOAD_PATH}/{job.id}"
     return await asyncio.to_thread(_out, services.estimates, job)
 
@@ -96,14 +99,16 @@ def get(services: ServicesDep, job: FoundDep) -> EstimateOut:
 
 
 @router.delete("/{estimate}", responses=problems(404, 409), response_model_exclude_unset=True)
+@urgent
 def cancel(services: ServicesDep, job: FoundDep) -> EstimateOut:
     """End an estimate, within a second; what it was given is removed. It stays listed as cancelled."""
     return _out(services.estimates, services.runner.jobs.cancel(job.id))
 
 
-@router.get("/{estimate}/events", response_class=EventSourceResponse, responses=problems(404))
-async def follow(services: ServicesDep, job: FoundDep) -> AsyncIterator[ServerSentEvent]:
+@router.get("/{estimate}/events", response_class=EventSourceResponse, responses=problems(404, 503))
+async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> AsyncIterator[ServerSentEvent]:
     """Follow one estimate: "job" events as at /api/events, from how it is now to its end."""
+    del counted
     async for event in followed(services, job):
         yield event
 
@@ -133,9 +138,9 @@ def _out(estimates: Estimates, job: Job) -> EstimateOut:
     return EstimateOut.of_job(job, estimates.steps(job), estimates.result(job), estimates.simulation_errors(job))
 
 
-async def _body(request: Request, kind: str, max_bytes: int) -> EstimateIn:
+async def _body(request: Request, kind: str) -> EstimateIn:
     """The JSON of a request; nothing at all asks for the defaults."""
-    body = await whole_body(request, max_bytes)
+    body = await whole_body(request, SMALL_BODY_BYTES)
     if not body and not kind:
         return EstimateIn.model_validate({})
     if kind != JSON:

@@ -8,9 +8,10 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query
+from fastapi import APIRouter, Depends, Header, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
@@ -32,6 +33,14 @@ FRAME_INTERVAL_S = 0.2
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
+
+
+async def _counted(services: ServicesDep) -> AsyncIterator[None]:
+    with services.event_texts.stream():
+        yield
+
+
+StreamDep = Annotated[None, Depends(_counted)]
 
 
 class Mailbox:
@@ -78,9 +87,10 @@ class Mailbox:
         self.arrived.set()
 
 
-@router.get("/events", response_class=EventSourceResponse)
+@router.get("/events", response_class=EventSourceResponse, responses=problems(503))
 async def stream(
     services: ServicesDep,
+    counted: StreamDep,
     frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
     visitor: Annotated[
         str | None,
@@ -89,6 +99,7 @@ async def stream(
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow what happens: "job", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
+    del counted
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
     is_watching = has_arrived = False
@@ -107,7 +118,7 @@ async def stream(
             last = min(int(last_event_id[:19]), _MAX_EVENT)
             for number, fields in await run_in_threadpool(services.store.events_after, last):
                 last = number
-                yield job_event(number, job_from_fields(fields))
+                yield job_event(services, number, job_from_fields(fields))
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
     finally:
@@ -133,7 +144,7 @@ async def _follow(
                 case DriverChanged():
                     yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
-                    yield job_event(letter.event, letter.job)
+                    yield job_event(services, letter.event, letter.job)
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
             yield _draft_event(services, changed)
@@ -144,7 +155,8 @@ async def _follow(
         if mailbox.frames is not None and now >= frame_at:
             taken, mailbox.frames, frame_at = mailbox.frames, None, now + FRAME_INTERVAL_S
             if wants_frames:
-                yield ServerSentEvent(event="frame", data=_frame(taken))
+                text = services.event_texts.of(taken, partial(_frame, taken))
+                yield ServerSentEvent(event="frame", raw_data=text)
         mailbox.arrived.clear()
         due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)
         timeout = min([_LOOK_INTERVAL_S, *(max(at - time.monotonic(), 0.001) for at in due)])
@@ -163,19 +175,26 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
     leave = services.runner.hub.subscribe(mailbox.put)
     try:
         now = services.runner.jobs.get(job.id)  # again, now that nothing is missed
-        yield job_event(0, now)
+        yield job_event(services, 0, now)
         while not now.is_finished and not services.closing.is_set():
             letter = await mailbox.next_job(job.id)
             if letter is not None:
                 now = letter.job
-                yield job_event(letter.event, now)
+                yield job_event(services, letter.event, now)
     finally:
         leave()
 
 
-def job_event(number: int, job: Job) -> ServerSentEvent:
-    """A job as an event; the number is 0 where nothing came after it that could be asked for."""
-    return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
+def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:
+    """A job as an event.
+
+    Args:
+        services: of the app.
+        number: of the event; 0 where nothing came after it that could be asked for.
+        job: as it was then.
+    """
+    text = services.event_texts.of(job, partial(JobOut.of, job))
+    return ServerSentEvent(event="job", id=str(number) if number else None, raw_data=text)
 
 
 def _scene_event(services: Services) -> ServerSentEvent:
@@ -183,7 +202,8 @@ def _scene_event(services: Services) -> ServerSentEvent:
     record = next((r for r in services.runner.scenes() if r.id == current), None)
     if record is None:
         return ServerSentEvent(event="scene", raw_data="null")
-    return ServerSentEvent(event="scene", data=services.scene_out(record))
+    text = services.event_texts.of(record, partial(services.scene_out, record))
+    return ServerSentEvent(event="scene", raw_data=text)
 
 
 def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:

@@ -8,8 +8,9 @@ from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from app.api.bodies import JSON, kind_of, parsed, whole_body
+from app.api.bodies import JSON, SMALL_BODY_BYTES, BoundedRoute, kind_of, parsed, whole_body
 from app.api.dependencies import Services, ServicesDep
+from app.api.lanes import slow
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
@@ -32,7 +33,7 @@ _BODY = {
         },
     }
 }
-router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems())
+router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems(), route_class=BoundedRoute)
 
 
 def _known_goal(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
@@ -65,8 +66,8 @@ async def create(
             seen_by = None if camera is None else _camera(camera)
             record = await run_in_threadpool(services.goals.receive, data, name, seen_by)
         elif kind == JSON:
-            body = parsed(GoalIn, await whole_body(request, services.settings.max_body_bytes))
-            record = await run_in_threadpool(_made, services, body)
+            body = parsed(GoalIn, await whole_body(request, SMALL_BODY_BYTES))
+            record = await services.lanes.slow.run(_made, services, body)
         else:
             allowed = f"{' or '.join(PHOTOS)} for a photo, or {JSON}"
             raise HTTPException(
@@ -85,6 +86,7 @@ def list_all(services: ServicesDep) -> GoalList:
 
 
 @router.post("/draft", status_code=status.HTTP_201_CREATED, responses=problems(409, 503))
+@slow
 def begin(services: ServicesDep, body: DraftIn) -> DraftOut:
     """Begin to compose a goal, from where the objects are now. All visitors see the same draft."""
     return _draft_out(services, services.goals.begin_draft(body.scene))
@@ -100,12 +102,14 @@ def draft(services: ServicesDep) -> DraftOut:
 
 
 @router.patch("/draft", responses=problems(404, 409, 503))
+@slow
 def lay_out(services: ServicesDep, body: DraftPatch) -> DraftOut:
     """Put objects of the draft elsewhere; where they cannot be, `problem` says so."""
     return _draft_out(services, services.goals.move_draft(body.named_poses()))
 
 
 @router.delete("/draft", status_code=status.HTTP_204_NO_CONTENT)
+@slow
 def drop(services: ServicesDep) -> None:
     """End composing without keeping anything."""
     services.goals.drop_draft()
@@ -118,6 +122,7 @@ def draft_image(services: ServicesDep) -> Response:
 
 
 @router.post("/draft/save", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 507))
+@slow
 def save(services: ServicesDep, body: DraftKeep, response: Response) -> GoalOut:
     """Keep the draft as a goal, and end composing."""
     record = services.goals.keep_draft(body.name)

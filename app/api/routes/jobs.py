@@ -5,14 +5,16 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path, Response, status
 from fastapi.responses import FileResponse
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
+from app.api.lanes import urgent
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
 from app.jobs.job import Job, check_file_name
 from app.jobs.kinds.fields import PREVIEW
 
-router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems())
+router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems(), route_class=BoundedRoute)
 FileName = Annotated[str, Path(description="One of the job's files.")]
 JobId = Annotated[str, Path(description="Identifier of a job.")]
 _FILE = {
@@ -44,6 +46,7 @@ async def get(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.delete("/{job}", responses=problems(404, 409))
+@urgent
 def cancel(services: ServicesDep, job: JobId) -> JobOut:
     """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
     _known_job(services, job)
@@ -51,6 +54,7 @@ def cancel(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.post("/{job}/pause", responses=problems(404, 409))
+@urgent
 def pause(services: ServicesDep, job: JobId) -> JobOut:
     """Let a running job rest after its current step. It keeps its turn."""
     _known_job(services, job)
@@ -58,6 +62,7 @@ def pause(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.post("/{job}/resume", responses=problems(404, 409))
+@urgent
 def resume(services: ServicesDep, job: JobId) -> JobOut:
     """Let a paused job go on."""
     _known_job(services, job)

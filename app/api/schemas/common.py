@@ -61,7 +61,8 @@ class Problem(BaseModel):
 class Health(BaseModel):
     """Whether and how the service runs."""
 
-    status: Literal["ok"]
+    status: Literal["ok", "degraded"]
+    problems: list[str] = Field(description="What is wrong now, a sentence each; it goes when its cause is gone.")
     version: str
     uptime_s: float = Field(description="Since the start [s].")
     objects_available: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 from app.api.schemas.common import Input, LightIn, ObjectName, Position, Quaternion, Vector3, Velocity
 from osfcore.geometry.light import Light
@@ -15,7 +15,7 @@ from osfcore.geometry.states import MAX_OBJECTS, SceneState
 
 MAX_SEQUENCES_IN = 1000
 _OVERHEAD = (0.0, 0.0, 1.0)
-Sequence = Annotated[list[Velocity], Field(min_length=1, max_length=MAX_HORIZON)]
+Sequence = Annotated[list[Velocity], Field(min_length=1, max_length=MAX_HORIZON), FailFast()]
 _STATE_EXAMPLE = {
     "objects": [{"name": "006_mustard_bottle", "position": [0.0, 0.0, 0.095], "quaternion": [1.0, 0.0, 0.0, 0.0]}],
     "light": {"position": [0.3, -0.4, 0.8]},
