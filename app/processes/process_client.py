@@ -26,7 +26,7 @@ Status = Literal["starting", "ready", "restarting"]
 MAX_PENDING = 64
 ANSWER_S = 180.0  # compiling on a busy machine takes longest
 WARM_ANSWER_S = 60.0  # once everything is compiled
-_RESTART_PAUSES_S = (0.0, 1.0, 5.0, 30.0)  # longer and longer while it keeps dying without answering anything
+_RESTART_PAUSES_S = (0.0, 1.0, 2.0, 5.0)  # longer and longer while it keeps dying without answering anything
 _log = logging.getLogger(__name__)
 
 
