@@ -253,7 +253,10 @@ class Estimates:
         if step is not None and not 1 <= step <= len(steps):
             raise UnknownName("step", str(step), [f"1 to {len(steps)}"])
         state = state_of_step(steps[-1 if step is None else step - 1])
-        return CompareView(uuid.uuid4().hex, state, camera, image.read_bytes())
+        try:
+            return CompareView(uuid.uuid4().hex, state, camera, image.read_bytes())
+        except FileNotFoundError:
+            raise NoImages(job.id, "they have been removed from the data directory") from None
 
     def _observed(self, job: Job, view: int) -> tuple[Camera, Path]:
         names = job.params["cameras"]

@@ -299,6 +299,9 @@ def test_images_are_of_cameras_and_steps_that_exist(estimates, runner):
     assert latest.observed == estimates.observed(job, 1).read_bytes()
     with pytest.raises(UnknownName, match="no step named '3'"):
         estimates.comparison(job, 1, 3)
+    estimates.observed(job, 1).unlink()
+    with pytest.raises(NoImages, match="have been removed"):
+        estimates.comparison(job, 1)
     with pytest.raises(NoImages, match="it was cancelled"):
         estimates.observed(runner.jobs.finish(job, "cancelled"), 0)
 
