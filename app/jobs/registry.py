@@ -76,7 +76,7 @@ class Jobs:
         self._serve = serve
         self._start_process = start_process
         self._changed = threading.Condition(threading.RLock())
-        self._table = JobTable(store, publish)
+        self._table = JobTable(store, data_dir, publish)
         self._run: JobProcess | None = None
         self._is_stopping = False
         self._thread: threading.Thread | None = None

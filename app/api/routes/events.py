@@ -25,6 +25,7 @@ from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
+from app.storage.paths import without_places
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
@@ -127,7 +128,7 @@ async def _follow(
             letter = mailbox.letters.popleft()
             match letter:
                 case Notice():
-                    yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
+                    yield _notice_event(services, letter)
                 case GoalsChanged():
                     yield ServerSentEvent(event="goals", raw_data="null")
                 case DriverChanged():
@@ -176,6 +177,11 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
 def job_event(number: int, job: Job) -> ServerSentEvent:
     """A job as an event; the number is 0 where nothing came after it that could be asked for."""
     return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
+
+
+def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
+    text = without_places(notice.text, services.settings.data_dir)
+    return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
 
 
 def _scene_event(services: Services) -> ServerSentEvent:
