@@ -197,6 +197,7 @@ def test_an_uploaded_folder_is_taken_in_with_its_prior(estimates, runner, tmp_pa
     data = archive(tmp_path, seen(views=1, masks=False), prior_json=(tmp_path / "prior.json").read_text())
     goal = upload(estimates, data, Asked("goal"))
     assert (runner.jobs.inputs(goal.id) / "prior.json").is_file()
+    write_estimated(runner.jobs.folder(job.id) / STATE, believed((MUSTARD, BOX)))  # another order
     later = upload(estimates, archive(tmp_path, seen(masks=False)), Asked("next", prior=job.id))
     assert (runner.jobs.inputs(later.id) / "prior.json").is_file()
     assert left_over(tmp_path) == []
