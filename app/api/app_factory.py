@@ -55,6 +55,7 @@ from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.storage.database import Store
 from app.storage.paths import static_folder
+from app.storage.photos import PhotoReader
 from app.viewer import Viewer
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -127,7 +128,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         predictor = ProcessClient(predictor_main, (settings.data_dir,), "predictor of pushes")
         stack.push_async_callback(run_in_threadpool, predictor.stop)
         prediction_service = Predictions(runner, fields.names, predictor)
-        goal_service = Goals(runner, settings.data_dir, settings.max_goals)
+        photos = PhotoReader()
+        stack.push_async_callback(run_in_threadpool, photos.stop)
+        goal_service = Goals(runner, settings.data_dir, settings.max_goals, photos)
         await run_in_threadpool(goal_service.start)
         episode_service = Episodes(runner, fields, goal_service)
         viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)

@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from app.api.schemas.common import Problem, ProblemPointer
+from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
 
 _log = logging.getLogger(__name__)
@@ -108,17 +109,18 @@ def status_of(error: OsfError) -> int:
 
 
 def install(app: FastAPI) -> None:
-    """Make the app answer every error as a problem."""
+    """Make the app answer every error as a problem; `app.state.settings` tells which places no sentence may name."""
     app.add_exception_handler(OsfError, _on_osf_error)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(Exception, _on_defect)
 
 
-async def _on_osf_error(_: Request, error: Exception) -> ProblemResponse:
+async def _on_osf_error(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, OsfError)
     status = status_of(error)
-    return problem(status, str(error), headers={"Retry-After": "2"} if status in (429, 503) else None)
+    detail = without_places(str(error), request.app.state.settings.data_dir)
+    return problem(status, detail, headers={"Retry-After": "2"} if status in (429, 503) else None)
 
 
 async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:

@@ -6,9 +6,11 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from app.jobs.job import Job, JobChanged, JobView, job_fields, job_from_fields
 from app.storage.database import Store
+from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
 
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
@@ -20,11 +22,13 @@ class JobTable:
 
     Args:
         store: where they are kept.
+        data_dir: whose place what is told of jobs does not name.
         publish: told of every change; progress is thinned out.
     """
 
-    def __init__(self, store: Store, publish: Callable[[JobChanged | JobView], None]) -> None:
+    def __init__(self, store: Store, data_dir: Path, publish: Callable[[JobChanged | JobView], None]) -> None:
         self._store = store
+        self._data_dir = data_dir
         self._publish = publish
         self._jobs: dict[str, Job] = {}
         self._numbers: dict[str, int] = {}
@@ -43,7 +47,7 @@ class JobTable:
 
     def all(self) -> list[Job]:
         """All jobs with their places in the queue, oldest first."""
-        return [self._with_position(job) for job in list(self._jobs.values())]
+        return [self._told(job) for job in list(self._jobs.values())]
 
     def get(self, job: str) -> Job:
         """One job with its place in the queue.
@@ -53,7 +57,7 @@ class JobTable:
         """
         if job not in self._jobs:
             raise UnknownName("job", job, list(self._jobs)[-5:])
-        return self._with_position(self._jobs[job])
+        return self._told(self._jobs[job])
 
     def queue(self) -> list[Job]:
         """Jobs that wait, the next one first."""
@@ -95,14 +99,17 @@ class JobTable:
         for job in self.queue():
             self._keep(job)
 
-    def _with_position(self, job: Job) -> Job:
+    def _told(self, job: Job) -> Job:
+        """A job with its place in the queue and without those of this machine."""
+        error = None if job.error is None else without_places(job.error, self._data_dir)
+        told = replace(job, note=without_places(job.note, self._data_dir), error=error)
         if job.state != "queued":
-            return job
+            return told
         waiting = [other.id for other in self.queue()]  # read without a lock, so it may have begun just now
-        return replace(job, position=1 + waiting.index(job.id)) if job.id in waiting else job
+        return replace(told, position=1 + waiting.index(job.id)) if job.id in waiting else told
 
     def _keep(self, job: Job) -> None:
-        shown = self._with_position(job)
+        shown = self._told(job)
         number = 0
         try:
             self._store.save_job(job.id, self._numbers[job.id], job_fields(job))

@@ -66,7 +66,7 @@ class Jobs:
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
         self._changed = threading.Condition(threading.RLock())
-        self._table = JobTable(store, publish)
+        self._table = JobTable(store, data_dir, publish)
         self._loop = JobLoop(self._changed, self._table, data_dir, publish, serve, start_process)
 
     def start(self) -> None:

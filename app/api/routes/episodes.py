@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow, urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
 from app.api.routes.events import StreamDep, followed
@@ -137,11 +138,12 @@ async def frame(
 @router.get("/{episode}/files/{name}", response_class=FileResponse, responses={**problems(404, 409, 507), **_FILE})
 def file(
     services: ServicesDep, job: FoundDep, name: Annotated[str, Path(description="One of the episode's files.")]
-) -> FileResponse:
+) -> OpenFile:
     """Download what an episode has left: report, table of steps, goal image, video, and a recording for the viewer."""
     with named_in_path():
         path = services.episodes.file(job, name)
-    return FileResponse(path, media_type=_MEDIA_TYPES[path.suffix], content_disposition_type="inline", filename=name)
+    gone = f"{name} of episode {job.id} has been removed from the data directory."
+    return OpenFile(path, gone, media_type=_MEDIA_TYPES[path.suffix], filename=name, disposition="inline")
 
 
 def _out(services: Services, job: Job) -> EpisodeOut:

@@ -5,13 +5,13 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response, status
-from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.requests import ClientDisconnect
 
 from app.api.bodies import JSON, SMALL_BODY_BYTES, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep
 from app.api.lanes import urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
@@ -129,9 +129,14 @@ async def image(
     """Show what a camera saw, and what it would see if a step's guess were true."""
     with named_in_path():
         if kind == "observed":
-            return FileResponse(await asyncio.to_thread(services.estimates.observed, job, view), media_type="image/png")
+            return await asyncio.to_thread(_observed, services.estimates, job, view)
         order = await asyncio.to_thread(services.estimates.comparison, job, view, step)
     return compared_png(await compared(services, order), kind)
+
+
+def _observed(estimates: Estimates, job: Job, view: int) -> OpenFile:
+    gone = f"The images of estimate {job.id} have been removed from the data directory."
+    return OpenFile(estimates.observed(job, view), gone, media_type="image/png")
 
 
 def _out(estimates: Estimates, job: Job) -> EstimateOut:

@@ -26,6 +26,7 @@ from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
+from app.storage.paths import without_places
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
@@ -138,7 +139,7 @@ async def _follow(
             letter = mailbox.letters.popleft()
             match letter:
                 case Notice():
-                    yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
+                    yield _notice_event(services, letter)
                 case GoalsChanged():
                     yield ServerSentEvent(event="goals", raw_data="null")
                 case DriverChanged():
@@ -195,6 +196,11 @@ def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:
     """
     text = services.event_texts.of(job, partial(JobOut.of, job))
     return ServerSentEvent(event="job", id=str(number) if number else None, raw_data=text)
+
+
+def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
+    text = without_places(notice.text, services.settings.data_dir)
+    return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
 
 
 def _scene_event(services: Services) -> ServerSentEvent:

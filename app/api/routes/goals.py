@@ -11,6 +11,7 @@ from starlette.requests import ClientDisconnect
 from app.api.bodies import JSON, SMALL_BODY_BYTES, BoundedRoute, kind_of, parsed, whole_body
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow
+from app.api.open_file import OpenFile
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
@@ -137,12 +138,11 @@ def get(record: FoundDep) -> GoalOut:
 
 
 @router.get("/{goal}/image.png", response_class=FileResponse, responses={**problems(404), **PNG})
-def image(services: ServicesDep, record: FoundDep) -> FileResponse:
+def image(services: ServicesDep, record: FoundDep) -> OpenFile:
     """Show a goal."""
     path = services.goals.image(record.id)
-    if not path.is_file():
-        raise NotFound(f"The image of goal {record.id} has been removed from the data directory.")
-    return FileResponse(path, media_type="image/png")
+    gone = f"The image of goal {record.id} has been removed from the data directory."
+    return OpenFile(path, gone, media_type="image/png")
 
 
 @router.delete("/{goal}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))

@@ -8,7 +8,8 @@ from fastapi.responses import FileResponse
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import urgent
-from app.api.problems import NotFound, named_in_path
+from app.api.open_file import OpenFile
+from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
 from app.jobs.job import Job, check_file_name
@@ -70,24 +71,22 @@ def resume(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.get("/{job}/files/{name}", response_class=FileResponse, responses={**problems(404), **_FILE})
-def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
+def file(services: ServicesDep, job: JobId, name: FileName) -> OpenFile:
     """Download what a job has made."""
     known_job = _known_job(services, job)
     with named_in_path():
         path = services.runner.jobs.folder(job) / check_file_name(known_job, name)
-    if not path.is_file():
-        raise NotFound(f"{name} of job {job} has been removed from the data directory.")
-    return FileResponse(path, filename=name, media_type="application/octet-stream")
+    gone = f"{name} of job {job} has been removed from the data directory."
+    return OpenFile(path, gone, media_type="application/octet-stream", filename=name)
 
 
 @router.get("/{job}/preview.png", response_class=FileResponse, responses={**problems(404), **PNG})
-def preview(services: ServicesDep, job: JobId) -> FileResponse:
+def preview(services: ServicesDep, job: JobId) -> OpenFile:
     """Show one unseen image of a field in training: the truth, the field's, and their difference times four."""
     _known_job(services, job)
     path = services.runner.jobs.folder(job) / PREVIEW
-    if not path.is_file():
-        raise NotFound(f"Job {job} has no preview; training a field makes one, some seconds after it has begun.")
-    return FileResponse(path, media_type="image/png", headers={"Cache-Control": "no-store"})
+    gone = f"Job {job} has no preview; training a field makes one, some seconds after it has begun."
+    return OpenFile(path, gone, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
 def _known_job(services: Services, job: str) -> Job:
