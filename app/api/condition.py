@@ -22,7 +22,8 @@ def problems(runner: Runner, data_dir: Path) -> tuple[str, ...]:
         data_dir: where everything is stored.
     """
     disk = _disk_problem(data_dir)
-    return runner.problems if disk is None else (*runner.problems, disk)
+    found = runner.problems()
+    return found if disk is None else (*found, disk)
 
 
 def _disk_problem(data_dir: Path) -> str | None:

@@ -21,6 +21,7 @@ from osfcore.errors import InvalidInput, OsfError
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
 _TEND_S = 1.0
+_PROBE_S = 5.0
 _DOWN = "The simulation has stopped and is being restarted."
 _RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
@@ -47,6 +48,7 @@ class Runner(Scenes):
         self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
+        self._probed_at = self._started
         self._is_over = threading.Event()
         self._tending: threading.Thread | None = None
 
@@ -122,9 +124,11 @@ class Runner(Scenes):
         except OsfError as error:
             self.hub.publish(Notice("warning", f"No first scene could be made. {error}"))
 
-    @property
     def problems(self) -> tuple[str, ...]:
-        """What is wrong now, in sentences for people; nothing once its causes are gone."""
+        """What is wrong now, in sentences for people; nothing once its causes are gone. Tries to write now and then."""
+        if time.monotonic() - self._probed_at > _PROBE_S:
+            self._probed_at = time.monotonic()
+            self._store.probe()
         is_down = self.simulation_status == "restarting"
         found = (_DOWN if is_down else None, self.jobs.problem, self._store.problem)
         return tuple(sentence for sentence in found if sentence is not None)
