@@ -24,6 +24,9 @@ def problems(runner: Runner, data_dir: Path) -> tuple[str, ...]:
     found = [runner.jobs.problem, _disk_problem(data_dir)]
     if runner.simulation_status == "restarting":
         found.append("The simulation has stopped and is being restarted.")
+    if runner.unwritten:
+        changed = "one scene or job" if runner.unwritten == 1 else f"{runner.unwritten} scenes and jobs"
+        found.append(f"What has become of {changed} could not be stored; it is tried again.")
     return tuple(sentence for sentence in found if sentence is not None)
 
 

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from app.jobs.job import INPUTS
-from app.storage.database import CannotStore
+from app.storage.durable import put_in_place
+from app.storage.schema import CannotStore
 
 _TEMPORARY_PREFIX = ".new-"
 
@@ -55,6 +56,10 @@ class JobFolders:
         place = self.inputs(job)
         try:
             place.parent.mkdir(parents=True)
-            inputs.rename(place)
+            put_in_place(inputs, place)
         except OSError as error:
-            raise CannotStore(place, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
+
+    def remove(self, job: str) -> None:
+        """Remove the folder of a job that was not accepted, if it has one."""
+        shutil.rmtree(self.folder(job), ignore_errors=True)

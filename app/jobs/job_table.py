@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
 
 from app.jobs.job import Job, JobChanged, JobView, job_fields, job_from_fields
 from app.storage.database import Store
-from osfcore.errors import OsfError, UnknownName
+from osfcore.errors import UnknownName
 
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
-_log = logging.getLogger(__name__)
 
 
 class JobTable:
@@ -33,8 +31,7 @@ class JobTable:
 
     def load(self) -> None:
         """Take over what the store holds."""
-        for number, fields in self._store.jobs():
-            job = job_from_fields(fields)
+        for number, job in self._store.jobs(job_from_fields):
             self._jobs[job.id], self._numbers[job.id] = job, number
 
     def __getitem__(self, job: str) -> Job:
@@ -64,9 +61,16 @@ class JobTable:
         return [job for job in list(self._jobs.values()) if job.kind == kind and not job.is_finished]
 
     def add(self, job: Job) -> None:
-        """Keep a new job, the last of all."""
-        self._numbers[job.id] = 1 + max(self._numbers.values(), default=0)
-        self.set(job)
+        """Keep a new job, the last of all.
+
+        Raises:
+            CannotStore: if the disk refuses; then there is no such job.
+        """
+        number = 1 + max(self._numbers.values(), default=0)
+        shown = replace(job, position=1 + len(self.queue()))
+        event = self._store.save_job(job.id, number, job_fields(job), job_fields(shown))
+        self._numbers[job.id], self._jobs[job.id] = number, job
+        self._publish(JobChanged(event, shown))
 
     def set(self, job: Job) -> None:
         """Keep and publish a job's new state."""
@@ -86,7 +90,8 @@ class JobTable:
             self.set(job)
 
     def flush_progress(self) -> None:
-        """Publish progress that was held back, once its time has come."""
+        """Publish progress that was held back, once its time has come, and write what the disk refused before."""
+        self._store.retry()
         if self._held_back is not None:
             self.set_progress(self._held_back)
 
@@ -102,11 +107,8 @@ class JobTable:
         return replace(job, position=1 + waiting.index(job.id)) if job.id in waiting else job
 
     def _keep(self, job: Job) -> None:
-        shown = self._with_position(job)
-        number = 0
-        try:
-            self._store.save_job(job.id, self._numbers[job.id], job_fields(job))
-            number = self._store.add_event(job_fields(shown))
-        except OsfError as error:  # a full disk must not stop the jobs
-            _log.error("job %s: %s", job.id, error)
-        self._publish(JobChanged(number, shown))
+        shown, number = self._with_position(job), self._numbers[job.id]
+        event = self._store.save_job(  # a full disk must not stop the jobs
+            job.id, number, job_fields(job), job_fields(shown), can_wait=True
+        )
+        self._publish(JobChanged(event, shown))

@@ -135,15 +135,19 @@ class Jobs:
 
         Raises:
             QueueFull: if too many wait already.
-            CannotStore: if the inputs cannot be put in place.
+            CannotStore: if the disk refuses the job or its inputs; then nothing of it is left.
         """
         with self._changed:
             if len(self._table.queue()) >= self._max_queued:
                 raise QueueFull(self._max_queued)
             job = Job(uuid.uuid4().hex[:12], kind, params)
-            if inputs is not None:
-                self._folders.take(job.id, inputs)
-            self._table.add(job)
+            try:
+                if inputs is not None:
+                    self._folders.take(job.id, inputs)
+                self._table.add(job)
+            except OsfError:
+                self._folders.remove(job.id)
+                raise
             self._changed.notify_all()
             return self.get(job.id)
 

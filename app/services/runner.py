@@ -45,6 +45,9 @@ class Runner(Scenes):
         sweep(self._settings.data_dir / "fields")
         super().start()
         self.jobs.start()
+        for entry in self._store.set_aside:
+            _log.warning(entry.sentence)
+            self.hub.publish(Notice("warning", entry.sentence))
         self.ensure_demo_scene()
 
     def stop(self) -> None:
@@ -56,6 +59,11 @@ class Runner(Scenes):
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene, if one does: then only that job may change it."""
         return self.jobs.holder(scene)
+
+    @property
+    def unwritten(self) -> int:
+        """How many scenes and jobs have changed in ways that the disk has refused so far."""
+        return self._store.unwritten
 
     @property
     def uptime_s(self) -> float:

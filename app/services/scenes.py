@@ -34,7 +34,7 @@ from app.processes.sim_process import simulation_main
 from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.scene_images import SceneImages
 from app.services.service_settings import Settings
-from app.storage.database import Store, now_utc
+from app.storage.database import CannotStore, Store, now_utc
 from osfcore.errors import InvalidInput, MissingAssets, OsfError, UnknownName
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import Light
@@ -83,18 +83,16 @@ class Scenes:
         self._lock = threading.RLock()
         self._records: dict[str, SceneRecord] = {}
         self._current: str | None = None
-        self._watchers = 0
+        self._watchers = self._scenes_in_the_making = 0
         self._images = SceneImages(
             settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._simulation.call_async
         )
-        self._scenes_in_the_making = 0
 
     def start(self) -> None:
         """Take over the scenes that the store holds, and start the simulation."""
-        records, self._current = self._store.scenes()
+        records, current = self._store.scenes()
         self._records = {record.id: record for record in records}
-        if self._current is None and records:
-            self._current = records[-1].id
+        self._current = current or next(reversed(self._records), None)
         self._simulation.start()
 
     def stop(self) -> None:
@@ -160,21 +158,17 @@ class Scenes:
             if len(self._records) + self._scenes_in_the_making >= self._settings.max_scenes:
                 raise TooManyScenes(self._settings.max_scenes)
             self._scenes_in_the_making += 1
-        command = CreateScene(
-            id=uuid.uuid4().hex[:12],
-            seed=secrets.randbelow(MAX_SEED) if seed is None else seed,
-            created_at=now_utc(),
-            image_size=image_size,
-            names=names,
-            count=count,
-            light=light,
-            poses=None if poses is None else _stacked([pose for _, pose in poses]),
-        )
+        seed = secrets.randbelow(MAX_SEED) if seed is None else seed
+        stacked = None if poses is None else _stacked([pose for _, pose in poses])
+        command = CreateScene(uuid.uuid4().hex[:12], seed, now_utc(), image_size, names, count, light, stacked)
         try:
             record: SceneRecord = self._simulation.call(command)
             with self._lock:
                 self._store.save_scene(record)
                 self._records[record.id] = record
+        except CannotStore:
+            self._simulation.submit(DropScene(command.id))
+            raise
         finally:
             with self._lock:
                 self._scenes_in_the_making -= 1
@@ -293,8 +287,8 @@ class Scenes:
         record: SceneRecord = self._simulation.call(command)
         with self._lock:
             latest = self._records.get(command.id)
-            if latest is not None:
-                self._store.save_scene(latest)
+            if latest is not None:  # a push is not undone by a full disk, and must not be asked for twice
+                self._store.save_scene(latest, can_wait=True)
         return record
 
     def _show(self, scene: str | None) -> None:

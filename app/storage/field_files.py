@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
+from app.storage.durable import sync, sync_tree
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 
@@ -41,12 +41,12 @@ def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
     place = workshop(data_dir, name)
     text = json.dumps(order, sort_keys=True)
     try:
-        if not (place / _ORDER).is_file() or (place / _ORDER).read_text(encoding="utf-8") != text:
+        if not (place / _ORDER).is_file() or (place / _ORDER).read_bytes() != text.encode():
             clear_workshop(data_dir, name)
             place.mkdir(parents=True)
-            (place / _ORDER).write_text(text, encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CannotWrite(place, getattr(error, "strerror", None) or str(error)) from error
+            (place / _ORDER).write_bytes(text.encode())
+    except OSError as error:
+        raise CannotWrite(place, error.strerror or str(error)) from error
     return place
 
 
@@ -69,7 +69,7 @@ def install(made: Path, place: Path) -> None:
             folder.mkdir(mode=0o755)
             for name in (FIELD_FILE, METRICS_FILE):
                 shutil.copyfile(made / name, folder / name)
-                _sync(folder / name)
+            sync_tree(folder)
             _swap(folder, place)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -110,7 +110,7 @@ def _swap(folder: Path, place: Path) -> None:
     """Rename a folder to its place; the older one is put aside first, and returns if that fails."""
     if not place.exists():
         folder.rename(place)
-        _sync(place.parent)
+        sync(place.parent)
         return
     aside = Path(tempfile.mkdtemp(prefix=_ASIDE_PREFIX, dir=place.parent))
     older = aside / place.name
@@ -121,15 +121,7 @@ def _swap(folder: Path, place: Path) -> None:
         except OSError:
             older.rename(place)
             raise
-        _sync(place.parent)
+        sync(place.parent)
     finally:
         if place.exists():  # else the older one is all there is, and the next start puts it back
             shutil.rmtree(aside, ignore_errors=True)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

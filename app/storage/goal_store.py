@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from app.storage.database import CannotStore
+from app.storage.durable import put_in_place
+from app.storage.schema import CannotStore
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -124,9 +125,9 @@ class GoalStore:
                 folder.mkdir(parents=True)
                 (folder / IMAGE).write_bytes(png)
                 (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
-                folder.rename(self._root / record.id)
+                put_in_place(folder, self._root / record.id)
         except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -142,7 +143,7 @@ class GoalStore:
         try:
             (self._root / goal).rename(trash)
         except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         shutil.rmtree(trash, ignore_errors=True)
 
 
