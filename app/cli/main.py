@@ -10,6 +10,7 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 from app.cli.commands.assets import Assets
+from app.cli.commands.backup import Backup, Restore
 from app.cli.commands.bench import Bench
 from app.cli.commands.check import Check
 from app.cli.commands.collect import Collect
@@ -47,6 +48,8 @@ Commands = Annotated[
     | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
+    | Annotated[Backup, tyro.conf.subcommand("backup", description="Write all that the service keeps to one zip.")]
+    | Annotated[Restore, tyro.conf.subcommand("restore", description="Make a data directory from a backup.")]
     | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

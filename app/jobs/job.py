@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from app.storage.database import now_utc
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import InvalidInput, OsfError, UnknownName, shown
 from osfcore.io.json_codec import decode
 
+Kind = Literal[
+    "collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field", "estimate", "episode"
+]
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files
 FINISHED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
@@ -102,12 +105,15 @@ def job_fields(job: Job) -> dict[str, Any]:
 
 
 def job_from_fields(fields: dict[str, Any]) -> Job:
-    """The inverse of `job_fields`; fields of other versions of this program are left alone.
+    """The inverse of `job_fields`; what another version has added is left out, and what it lacks has its default.
 
     Raises:
-        InvalidInput: if they do not make a job.
+        InvalidInput: if it makes no sense.
     """
-    return decode(Job, {name: fields[name] for name in Job.__dataclass_fields__ if name in fields}, "job")
+    job = decode(Job, fields, "job")
+    if job.kind not in get_args(Kind):
+        raise InvalidInput("kind of job", shown(job.kind), f"one of {', '.join(get_args(Kind))}")
+    return job
 
 
 def ended(job: Job, state: State, **changes: Any) -> Job:  # noqa: ANN401  any field of Job

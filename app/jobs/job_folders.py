@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from app.jobs.job import INPUTS
-from app.storage.database import CannotStore
 from app.storage.durable import put_in_place
+from app.storage.schema import CannotStore
 
 _TEMPORARY_PREFIX = ".new-"
 
@@ -58,4 +58,8 @@ class JobFolders:
             place.parent.mkdir(parents=True)
             put_in_place(inputs, place)
         except OSError as error:
-            raise CannotStore(place, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
+
+    def remove(self, job: str) -> None:
+        """Remove the folder of a job that was not accepted, if it has one."""
+        shutil.rmtree(self.folder(job), ignore_errors=True)

@@ -26,7 +26,7 @@ from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
 
 StartProcess = Callable[[Job, Path, Path, Callable[[object], None]], JobProcess]
-_RETRY_S = 1.0  # after a failure of the loop itself
+_RETRY_S = 1.0  # after a failure of the loop itself, and of writing what the disk has refused
 _log = logging.getLogger(__name__)
 
 
@@ -90,8 +90,9 @@ class JobLoop:
         """Wait for a job and do it; one that an earlier failure has left is brought to its end."""
         if self.run is None:
             with self._changed:
-                self._changed.wait_for(lambda: self._is_stopping or bool(self._table.queue()))
-                if self._is_stopping:
+                self._changed.wait_for(lambda: self._is_stopping or bool(self._table.queue()), _RETRY_S)
+                self._table.flush_progress()
+                if self._is_stopping or not self._table.queue():
                     return
                 job = self._table.queue()[0]
                 try:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobView, job_fields, job_from_fields
-from app.storage.database import CannotStore, Store
+from app.storage.database import Store
 from app.storage.paths import without_places
-from osfcore.errors import OsfError, UnknownName
+from osfcore.errors import UnknownName
 
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
-_log = logging.getLogger(__name__)
 
 
 class JobTable:
@@ -39,7 +38,6 @@ class JobTable:
     ) -> None:
         self._store = store
         self._check = check
-        self._unwritten: set[str] = set()  # jobs whose latest change is not stored
         self._data_dir = data_dir
         self._publish = publish
         self._jobs: dict[str, Job] = {}
@@ -49,14 +47,13 @@ class JobTable:
 
     def load(self) -> None:
         """Take over what the store holds."""
-        for number, fields in self._store.jobs():
-            try:
-                job = job_from_fields(fields)
-                self._check(job)
-            except (OsfError, TypeError, KeyError, AttributeError) as error:
-                self._store.set_aside("job", str(fields.get("id")), str(error))
-            else:
-                self._jobs[job.id], self._numbers[job.id] = job, number
+        for number, job in self._store.jobs(self._readable):
+            self._jobs[job.id], self._numbers[job.id] = job, number
+
+    def _readable(self, fields: dict[str, Any]) -> Job:
+        job = job_from_fields(fields)
+        self._check(job)
+        return job
 
     def __getitem__(self, job: str) -> Job:
         """One job as it is stored."""
@@ -88,12 +85,12 @@ class JobTable:
         """Keep a new job, the last of all.
 
         Raises:
-            CannotStore: if it cannot be stored; then there is none.
+            CannotStore: if the disk refuses; then there is no such job.
         """
         number = 1 + max(self._numbers.values(), default=0)
         shown = replace(job, position=1 + len(self.queue()))
         event = self._store.save_job(job.id, number, job_fields(job), job_fields(shown))
-        self._jobs[job.id], self._numbers[job.id] = job, number
+        self._numbers[job.id], self._jobs[job.id] = number, job
         self._publish(JobChanged(event, shown))
 
     def set(self, job: Job) -> None:
@@ -114,7 +111,8 @@ class JobTable:
             self.set(job)
 
     def flush_progress(self) -> None:
-        """Publish progress that was held back, once its time has come."""
+        """Publish progress that was held back, once its time has come, and write what the disk refused before."""
+        self._store.retry()
         if self._held_back is not None:
             self.set_progress(self._held_back)
 
@@ -133,20 +131,8 @@ class JobTable:
         return replace(told, position=1 + waiting.index(job.id)) if job.id in waiting else told
 
     def _keep(self, job: Job) -> None:
-        shown = self._told(job)
-        event = 0
-        try:
-            event = self._store.save_job(job.id, self._numbers[job.id], job_fields(job), job_fields(shown))
-            self._unwritten.discard(job.id)
-        except CannotStore as error:
-            if not self._unwritten:
-                _log.error("job %s: %s", job.id, error)
-            self._unwritten.add(job.id)
+        shown, number = self._told(job), self._numbers[job.id]
+        event = self._store.save_job(  # a full disk must not stop the jobs
+            job.id, number, job_fields(job), job_fields(shown), can_wait=True
+        )
         self._publish(JobChanged(event, shown))
-
-    def write_again(self) -> None:
-        """Store what could not be stored before, as far as the disk takes it now."""
-        for name in tuple(self._unwritten):
-            self._keep(self._jobs[name])
-            if name in self._unwritten:
-                return

@@ -23,7 +23,7 @@ from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, after
 from app.processes.messages.job_messages import ChangeJob, PauseJob, ResumeJob, StepJob
 from app.processes.messages.scene_messages import Command
-from app.storage.database import CannotStore, Store
+from app.storage.database import Store
 from osfcore.errors import OsfError
 
 _RETRY_S = 1.0  # after the job loop has failed
@@ -84,11 +84,6 @@ class Jobs:
         """End the running job, which counts as failed. Calling it again does nothing."""
         self._loop.stop()
 
-    def write_again(self) -> None:
-        """Store what could not be stored before, as far as the disk takes it now."""
-        with self._changed:
-            self._table.write_again()
-
     @property
     def problem(self) -> str | None:
         """Why no job goes on, for people; None if all is well."""
@@ -142,18 +137,18 @@ class Jobs:
 
         Raises:
             QueueFull: if too many wait already.
-            CannotStore: if the job, or its inputs, cannot be stored; then there is none.
+            CannotStore: if the disk refuses the job or its inputs; then nothing of it is left.
         """
         with self._changed:
             if len(self._table.queue()) >= self._max_queued:
                 raise QueueFull(self._max_queued)
             job = Job(uuid.uuid4().hex[:12], kind, params)
-            if inputs is not None:
-                self._folders.take(job.id, inputs)
             try:
+                if inputs is not None:
+                    self._folders.take(job.id, inputs)
                 self._table.add(job)
-            except CannotStore:
-                shutil.rmtree(self.folder(job.id), ignore_errors=True)
+            except OsfError:
+                self._folders.remove(job.id)
                 raise
             self._changed.notify_all()
             return self.get(job.id)

@@ -6,8 +6,6 @@ from typing import Any
 
 from app.jobs.job import Job
 from app.jobs.kinds.episodes import settings_of
-from app.jobs.worker import KINDS
-from osfcore.errors import InvalidInput, shown
 from osfcore.io.json_codec import Entry, Text, decode
 
 
@@ -51,14 +49,12 @@ _PARAMS = {"collect_object": _Named, "train_field": _Training, "estimate": _Esti
 
 
 def check_stored(job: Job) -> None:
-    """Refuse a job of a kind, or with parameters, of another version.
+    """Refuse a job with parameters of another version.
 
     Raises:
         InvalidInput: if it is one.
         TypeError: if settings of an episode are unknown to this version.
     """
-    if job.kind not in KINDS:
-        raise InvalidInput("kind of the job", shown(job.kind), f"one of {', '.join(KINDS)}")
     params = _PARAMS.get(job.kind)
     if params is not None:
         decode(params, job.params, "job")

@@ -137,7 +137,7 @@ class ImageSets:
         try:
             (self._root / set_id).rename(trash)
         except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         shutil.rmtree(trash, ignore_errors=True)
 
     async def receive(self, chunks: AsyncIterator[bytes], file_name: str) -> SetRecord:
@@ -171,7 +171,7 @@ class ImageSets:
                 self._check_room()
                 put_in_place(folder, self._root / record.id)
         except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
 
 
 def examine(folder: Path) -> Examined:

@@ -10,7 +10,7 @@ from app.processes.messages.scene_messages import SceneRecord
 from app.services.goals import Goals
 from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord
-from osfcore.errors import OsfError, UnknownName
+from osfcore.errors import UnknownName
 from osfcore.geometry.light import Light
 
 
@@ -96,7 +96,7 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light)
     try:
         goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light)
-    except OsfError:
+    except BaseException:
         runner.delete_scene(scene.id)
         raise
     return scene, goal

@@ -20,9 +20,7 @@ from app.storage.field_files import sweep
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
-_TEND_S = 1.0
-_PROBE_S = 5.0
-_DOWN = "The simulation has stopped and is being restarted."
+_PROBE_S = 5.0  # between two tries whether the disk takes something
 _RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
 
@@ -48,9 +46,7 @@ class Runner(Scenes):
         self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
-        self._probed_at = self._started
-        self._is_over = threading.Event()
-        self._tending: threading.Thread | None = None
+        self._probed_at, self._refusal = -_PROBE_S, None
 
     def start(self) -> None:
         """Take over what the store holds, start simulation and jobs, make a first scene if there is none."""
@@ -58,17 +54,13 @@ class Runner(Scenes):
         sweep(self._settings.data_dir / "fields")
         super().start()
         self.jobs.start()
-        self._tending = threading.Thread(target=self._tend, name="tend", daemon=True)
-        self._tending.start()
-        for sentence in self._store.oddities:
-            self.hub.publish(Notice("warning", sentence))
+        for entry in self._store.set_aside:
+            _log.warning(entry.sentence)
+            self.hub.publish(Notice("warning", entry.sentence))
         self.ensure_demo_scene()
 
     def stop(self) -> None:
         """End all processes. Calling it again does nothing."""
-        self._is_over.set()
-        if self._tending is not None:
-            self._tending.join()
         self.sets.stop()
         self.jobs.stop()
         super().stop()
@@ -76,6 +68,19 @@ class Runner(Scenes):
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene, if one does: then only that job may change it."""
         return self.jobs.holder(scene)
+
+    @property
+    def unwritten(self) -> int:
+        """How many scenes and jobs have changed in ways that the disk has refused so far."""
+        return self._store.unwritten
+
+    def storing_problem(self) -> str | None:
+        """Why nothing can be stored now, for people; None if all is well. Tries it now and then."""
+        if time.monotonic() - self._probed_at > _PROBE_S:
+            self._probed_at, self._refusal = time.monotonic(), self._store.probe()
+        if self._refusal is None or not self.unwritten:
+            return self._refusal
+        return f"{self._refusal} {self.unwritten} changes of scenes and jobs wait for it."
 
     @property
     def uptime_s(self) -> float:
@@ -113,7 +118,7 @@ class Runner(Scenes):
         """Make the first scene as soon as there are objects, in the background; does nothing if there is a scene."""
         with self._lock:
             count = min(DEMO_OBJECTS, len(self.library.names()))
-            if not self._demo_due or self._table.all() or count == 0:
+            if not self._demo_due or self._records or count == 0:
                 return
             self._demo_due = False
         threading.Thread(target=self._make_demo_scene, args=(count,), name="demo-scene", daemon=True).start()
@@ -124,27 +129,7 @@ class Runner(Scenes):
         except OsfError as error:
             self.hub.publish(Notice("warning", f"No first scene could be made. {error}"))
 
-    def problems(self) -> tuple[str, ...]:
-        """What is wrong now, in sentences for people; nothing once its causes are gone. Tries to write now and then."""
-        if time.monotonic() - self._probed_at > _PROBE_S:
-            self._probed_at = time.monotonic()
-            self._store.probe()
-        is_down = self.simulation_status == "restarting"
-        found = (_DOWN if is_down else None, self.jobs.problem, self._store.problem)
-        return tuple(sentence for sentence in found if sentence is not None)
-
     # Inside
-
-    def _tend(self) -> None:
-        """Store what a disk has refused, again and again until it takes it."""
-        while not self._is_over.wait(_TEND_S):
-            try:
-                if self._store.problem is not None:
-                    self._store.probe()
-                    self.jobs.write_again()
-                    self.write_again()
-            except Exception:  # this thread lives as long as the service
-                _log.exception("what had to be stored again could not be")
 
     def _serve(self, command: Command) -> Any:  # noqa: ANN401  each command says what answers it
         """Carry out what a job asks for with its own scene."""

@@ -1,34 +1,30 @@
 """What outlives the service: scenes, jobs and job events, in one SQLite file of the data directory.
 
 One process at a time: a lock file keeps a second service out, which would take the first one's jobs for dead.
+What was accepted is on the disk before its caller hears of it. What has happened anyway, such as a push, is remembered
+while the disk refuses, and written with the next write or `retry` that it takes.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import fcntl
 import json
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any, Literal
-
-from pydantic import FiniteFloat, StrictInt
+from typing import IO, Any
 
 from app.processes.messages.scene_messages import SceneRecord
-from app.storage.schema import SCHEMA_VERSION, open_database
+from app.storage.rows import SCENE_COLUMNS, SENSELESS, SetAside, job_of_row, scene_of_row, scene_row, set_aside_row
+from app.storage.schema import FILE, SCHEMA_VERSION, CannotStore, UnusableDatabase, open_database, put_aside
 from osfcore.errors import OsfError
-from osfcore.geometry.states import SceneState
-from osfcore.io.json_codec import Text, decode, encode
-from osfcore.io.scene_file import StateJson
+from osfcore.io.json_codec import decode
 
-FILE = "service.sqlite3"
+Statement = tuple[str, tuple[Any, ...]]
 _log = logging.getLogger(__name__)
 
 
@@ -39,16 +35,19 @@ class DataDirectoryInUse(OsfError):
         super().__init__(f"Another service uses the data directory {data_dir}; stop it or choose another one.")
 
 
-class CannotStore(OsfError):
-    """The data directory cannot be written."""
-
-    def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(f"{path} cannot be written ({reason}); free some space or choose another data directory.")
-
-
 def now_utc() -> str:
     """The time in UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def check_data_dir(data_dir: Path) -> None:
+    """Tell now what would keep a `Store` from opening; a file that it would put aside is left to it.
+
+    Raises:
+        DataDirectoryInUse, CorruptFile, CannotStore: as `Store`.
+    """
+    with _claim(data_dir), contextlib.suppress(UnusableDatabase):
+        open_database(data_dir / FILE).close()
 
 
 class Store:
@@ -62,230 +61,234 @@ class Store:
         DataDirectoryInUse: if another service has it.
         CorruptFile: if the file is another program's; it is left as it is.
         CannotStore: if the directory cannot be written.
-
-    Attributes:
-        problem: why the latest write failed, for people; None if it did not.
-        oddities: what had to be put aside since the start, a sentence each.
     """
 
     def __init__(self, data_dir: Path, max_events: int = 1000) -> None:
         self._path = data_dir / FILE
         self._max_events = max_events
         self._lock = threading.Lock()
-        self._lock_file = self._claim(data_dir)
+        self._waiting: dict[str, tuple[Statement, ...]] = {}  # what the disk refused, oldest first
+        self._set_aside: list[SetAside] = []
+        self._lock_file = _claim(data_dir)
         try:
-            self._database, put_aside = self._open()
+            self._database = self._open()
         except BaseException:
             self._lock_file.close()
             raise
-        self.problem: str | None = None
-        self.oddities: list[str] = [] if put_aside is None else [put_aside]
 
     def close(self) -> None:
         """Close the file and let others use the directory. Calling it again does nothing."""
+        self.retry()
         with self._lock:
+            self._waiting.clear()
             self._database.close()
             self._lock_file.close()
 
-    @staticmethod
-    def _claim(data_dir: Path) -> IO[str]:
-        try:
-            data_dir.mkdir(parents=True, exist_ok=True)
-            file = (data_dir / "service.lock").open("w")
-        except OSError as error:
-            raise CannotStore(data_dir, error.strerror or str(error)) from error
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.close()
-            raise DataDirectoryInUse(data_dir) from error
-        return file
+    @property
+    def set_aside(self) -> tuple[SetAside, ...]:
+        """What was found to make no sense since this was opened."""
+        return tuple(self._set_aside)
 
-    def _open(self) -> tuple[sqlite3.Connection, str | None]:
+    @property
+    def unwritten(self) -> int:
+        """How many scenes and jobs have changed in ways that the disk has refused so far."""
+        return len(self._waiting)
+
+    def retry(self) -> None:
+        """Write what waits, if there is any and the disk takes it now."""
+        if self._waiting:
+            with contextlib.suppress(CannotStore):
+                self._write()
+
+    def probe(self) -> str | None:
+        """Write what waits, or what changes nothing; returns why the disk refuses, None if it does not."""
+        try:
+            self._write((f"PRAGMA user_version = {SCHEMA_VERSION}", ()))
+        except CannotStore as error:
+            return str(error)
+        return None
+
+    def _open(self) -> sqlite3.Connection:
         try:
             return open_database(self._path)
-        except (sqlite3.Error, OSError) as error:
-            raise CannotStore(self._path, str(error)) from error
+        except UnusableDatabase as error:
+            place = put_aside(self._path, error.label)
+            database = open_database(self._path)
+            self._set_aside.append(SetAside("database", place.name, "", error.reason, now_utc()))
+            with contextlib.suppress(sqlite3.DatabaseError):  # the file is there, and that is what counts
+                database.execute(*_note(self._set_aside[-1]))
+            return database
 
-    @contextmanager
-    def _transaction(self, begin: str) -> Iterator[sqlite3.Connection]:
+    def _write(self, *statements: Statement, waits_as: str | None = None) -> int:
+        """Carry out statements in one transaction, after those that wait; returns the last row's number.
+
+        Args:
+            statements: SQL with its values.
+            waits_as: what they are remembered under if the disk refuses, instead of older ones; None to raise.
+
+        Raises:
+            CannotStore: if the disk refuses.
+        """
+        with self._lock:
+            if waits_as is not None:
+                self._waiting.pop(waits_as, None)
+            try:
+                number = self._commit([*(one for group in self._waiting.values() for one in group), *statements])
+            except CannotStore as error:
+                if waits_as is None:
+                    raise
+                if not self._waiting:
+                    _log.error("%s It is tried again until it can be written.", error)
+                self._waiting[waits_as] = statements
+                return 0
+            self._waiting.clear()
+            return number
+
+    def _commit(self, statements: list[Statement]) -> int:
+        number = 0
+        try:
+            self._database.execute("BEGIN IMMEDIATE")
+            for sql, values in statements:
+                number = self._database.execute(sql, values).lastrowid or number
+            self._database.execute("COMMIT")
+        except sqlite3.DatabaseError as error:
+            with contextlib.suppress(sqlite3.DatabaseError):  # some failures have ended the transaction already
+                self._database.execute("ROLLBACK")
+            raise CannotStore(Path(FILE), str(error)) from error
+        return number
+
+    def _read(self, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._lock:
             try:
-                self._database.execute(begin)
-                try:
-                    yield self._database
-                    self._database.execute("COMMIT")
-                except BaseException:
-                    if self._database.in_transaction:
-                        self._database.execute("ROLLBACK")
-                    raise
+                return self._database.execute(sql, values).fetchall()
             except sqlite3.DatabaseError as error:
-                raise CannotStore(self._path, str(error)) from error
-
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        try:
-            with self._transaction("BEGIN IMMEDIATE") as database:
-                yield database
-        except CannotStore as error:
-            self.problem = str(error)
-            raise
-        self.problem = None
-
-    def probe(self) -> None:
-        """Write something that changes nothing, to see whether the database can be written again."""
-        with contextlib.suppress(CannotStore), self._writing() as database:
-            database.execute("DELETE FROM events WHERE id < 0")
-            database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+                raise CannotStore(Path(FILE), str(error)) from error
 
     # Scenes
 
-    def save_scene(self, record: SceneRecord) -> None:
-        """Insert or update a scene."""
-        row = (
-            record.id,
-            record.seed,
-            record.created_at,
-            record.image_size,
-            json.dumps(encode(StateJson.of(record.initial))),
-            json.dumps(encode(StateJson.of(record.state))),
-            record.time_s,
-            record.revision,
+    def save_scene(self, record: SceneRecord, *, can_wait: bool = False) -> None:
+        """Insert or update a scene.
+
+        Args:
+            record: the scene as it is now.
+            can_wait: remember it, if the disk refuses, and write it later.
+
+        Raises:
+            CannotStore: if the disk refuses and it cannot wait.
+        """
+        sql = (
+            f"INSERT INTO scenes ({', '.join(SCENE_COLUMNS)}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+            " ON CONFLICT (id) DO UPDATE SET state = excluded.state, time_s = excluded.time_s,"
+            " revision = excluded.revision"
         )
-        with self._writing() as database:
-            database.execute(
-                "INSERT INTO scenes (id, seed, created_at, image_size, initial, state, time_s, revision)"
-                " VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET state = excluded.state,"
-                " time_s = excluded.time_s, revision = excluded.revision",
-                row,
-            )
+        self._write((sql, scene_row(record)), waits_as=f"scene {record.id}" if can_wait else None)
 
     def delete_scene(self, scene: str) -> None:
-        """Forget a scene."""
-        with self._writing() as database:
-            database.execute("DELETE FROM scenes WHERE id = ?", (scene,))
+        """Forget a scene.
+
+        Raises:
+            CannotStore: if the disk refuses.
+        """
+        self._write(("DELETE FROM scenes WHERE id = ?", (scene,)))
 
     def set_current(self, scene: str | None) -> None:
-        """Remember which scene is shown."""
-        with self._writing() as database:
-            database.execute("UPDATE scenes SET is_current = (id IS ?)", (scene,))
+        """Remember which scene is shown, later if the disk refuses now."""
+        self._write(("UPDATE scenes SET is_current = (id IS ?)", (scene,)), waits_as="current scene")
 
     def scenes(self) -> tuple[tuple[SceneRecord, ...], str | None]:
-        """All scenes, oldest first, and the one that is shown; rows that make no sense are set aside."""
-        with self._transaction("BEGIN") as database:
-            rows = database.execute(
-                "SELECT id, seed, created_at, image_size, initial, state, time_s, revision, is_current"
-                " FROM scenes ORDER BY created_at, rowid"
-            ).fetchall()
-        records = []
-        for row in rows:
+        """All scenes, oldest first, and the one that is shown; what makes no sense is set aside."""
+        records, current = [], None
+        for rowid, is_current, *values in self._read(
+            f"SELECT rowid, is_current, {', '.join(SCENE_COLUMNS)} FROM scenes ORDER BY created_at, rowid"
+        ):
+            row = dict(zip(SCENE_COLUMNS, values, strict=True))
             try:
-                records.append(_record_from_row(row))
-            except (TypeError, ValueError, RecursionError) as error:
-                self.set_aside("scene", str(row[0]), str(error))
-        return tuple(records), next((row[0] for row in rows if row[8]), None)
+                records.append(scene_of_row(row))
+            except SENSELESS as error:
+                self._put_aside("scene", rowid, row, error)
+                continue
+            current = records[-1].id if is_current else current
+        return tuple(records), current
 
     # Jobs and events
 
-    def save_job(self, job: str, number: int, fields: dict[str, Any], event: dict[str, Any] | None = None) -> int:
-        """Insert or update a job, and remember how it was, both or neither.
+    def save_job(
+        self,
+        job: str,
+        number: int,
+        fields: dict[str, Any],
+        event: dict[str, Any] | None = None,
+        *,
+        can_wait: bool = False,
+    ) -> int:
+        """Insert or update a job, and remember that it changed; old events are dropped.
 
         Args:
             job: identifier.
             number: orders the jobs; an update leaves it.
             fields: as JSON.
-            event: as in `add_event`; None for no event.
+            event: how it is told of, as JSON; None for the fields.
+            can_wait: remember it, if the disk refuses, and write it later.
 
         Returns:
-            The event's number; 0 without an event.
+            The event's number; 0 if it has to wait.
 
         Raises:
-            CannotStore: if the disk is full.
+            CannotStore: if the disk refuses and it cannot wait.
         """
-        with self._writing() as database:
-            database.execute(
+        return self._write(
+            (
                 "INSERT INTO jobs VALUES (?, ?, ?) ON CONFLICT (id) DO UPDATE SET job = excluded.job",
                 (job, number, json.dumps(fields)),
-            )
-            return 0 if event is None else self._add_event(database, event)
+            ),
+            ("INSERT INTO events (job) VALUES (?)", (json.dumps(fields if event is None else event),)),
+            ("DELETE FROM events WHERE id <= last_insert_rowid() - ?", (self._max_events,)),
+            waits_as=f"job {job}" if can_wait else None,
+        )
 
-    def jobs(self) -> tuple[tuple[int, dict[str, Any]], ...]:
-        """Numbers and fields of all jobs, oldest first; rows that are no JSON objects are set aside."""
-        with self._transaction("BEGIN") as database:
-            rows = database.execute("SELECT id, number, job FROM jobs ORDER BY number").fetchall()
-        jobs = []
-        for job, number, text in rows:
-            try:
-                jobs.append((int(number), _fields(text)))
-            except (TypeError, ValueError, RecursionError) as error:
-                self.set_aside("job", str(job), str(error))
-        return tuple(jobs)
-
-    def add_event(self, fields: dict[str, Any]) -> int:
-        """Remember how a job was; returns the event's number. Old events are dropped."""
-        with self._writing() as database:
-            return self._add_event(database, fields)
-
-    def _add_event(self, database: sqlite3.Connection, fields: dict[str, Any]) -> int:
-        number = database.execute("INSERT INTO events (job) VALUES (?)", (json.dumps(fields),)).lastrowid or 0
-        database.execute("DELETE FROM events WHERE id <= ?", (number - self._max_events,))
-        return number
-
-    def events_after(self, number: int) -> tuple[tuple[int, dict[str, Any]], ...]:
-        """Events later than `number`, as far as they are kept and make sense, in order."""
-        with self._transaction("BEGIN") as database:
-            rows = database.execute("SELECT id, job FROM events WHERE id > ? ORDER BY id", (number,)).fetchall()
-        events = []
-        for event, text in rows:
-            with contextlib.suppress(TypeError, ValueError, RecursionError):
-                events.append((event, _fields(text)))
-        return tuple(events)
-
-    def set_aside(self, kind: Literal["scene", "job"], name: str, reason: str) -> None:
-        """Move a row that makes no sense to where nobody reads it, and tell of it.
+    def jobs(self, parse: Callable[[dict[str, Any]], Any] = dict) -> tuple[tuple[int, Any], ...]:
+        """Numbers of all jobs, and what `parse` makes of their fields, oldest first.
 
         Args:
-            kind: which table it is in.
-            name: identifier of the row.
-            reason: why it makes no sense.
+            parse: raises an OsfError for what makes no sense; then the job is set aside.
         """
-        sentence = f"A stored {kind} ({name[:40]}) makes no sense to this version and was set aside: {reason[:200]}"
-        self.oddities.append(sentence)
-        _log.warning("%s", sentence)
-        table = {"scene": "scenes", "job": "jobs"}[kind]
-        with contextlib.suppress(CannotStore), self._writing() as database:  # else the next start tries again
-            cursor = database.execute(f"SELECT * FROM {table} WHERE id = ?", (name,))
-            names = [column[0] for column in cursor.description]
-            for row in cursor.fetchall():
-                text = json.dumps(dict(zip(names, row, strict=True)), default=repr)
-                database.execute("INSERT INTO set_aside VALUES (?, ?, ?, ?, ?)", (kind, name, text, reason, now_utc()))
-            database.execute(f"DELETE FROM {table} WHERE id = ?", (name,))
+        found = []
+        for rowid, job, number, text in self._read("SELECT rowid, id, number, job FROM jobs ORDER BY number, rowid"):
+            try:
+                found.append((decode(int, number, "number"), parse(job_of_row(text, job))))
+            except SENSELESS as error:
+                self._put_aside("job", rowid, {"id": job, "number": number, "job": text}, error)
+        return tuple(found)
+
+    def events_after(self, number: int, parse: Callable[[dict[str, Any]], Any] = dict) -> tuple[tuple[int, Any], ...]:
+        """Events later than `number`, as far as they are kept and `parse` understands them, in order."""
+        found = []
+        for event, text in self._read("SELECT id, job FROM events WHERE id > ? ORDER BY id", (number,)):
+            with contextlib.suppress(*SENSELESS):
+                found.append((event, parse(job_of_row(text))))
+        return tuple(found)
+
+    def _put_aside(self, kind: str, rowid: int, row: dict[str, Any], error: Exception) -> None:
+        entry = SetAside(kind, str(row["id"]), json.dumps(row, default=repr), str(error).rstrip("."), now_utc())
+        self._set_aside.append(entry)
+        with contextlib.suppress(CannotStore):  # the next start finds the row again
+            self._write(_note(entry), (f"DELETE FROM {kind}s WHERE rowid = ?", (rowid,)))
 
 
-def _fields(text: str) -> dict[str, Any]:
-    fields = json.loads(text)
-    if not isinstance(fields, dict):
-        raise TypeError("it is no JSON object")
-    return fields
+def _claim(data_dir: Path) -> IO[str]:
+    """The lock file of a data directory, held until it is closed."""
+    try:
+        data_dir.mkdir(parents=True, exist_ok=True)
+        file = (data_dir / "service.lock").open("w")
+    except OSError as error:
+        raise CannotStore(data_dir, error.strerror or str(error)) from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise DataDirectoryInUse(data_dir) from error
+    return file
 
 
-@dataclass(frozen=True, slots=True)
-class _SceneRow:
-    id: Text
-    seed: StrictInt
-    created_at: Text
-    image_size: StrictInt
-    time_s: FiniteFloat
-    revision: StrictInt
-
-
-def _record_from_row(row: tuple[Any, ...]) -> SceneRecord:
-    scene, seed, created_at, image_size, initial, state, time_s, revision, _ = row
-    facts = (scene, seed, created_at, image_size, time_s, revision)
-    names = (field.name for field in dataclasses.fields(_SceneRow))
-    checked = decode(_SceneRow, dict(zip(names, facts, strict=True)), "scene")
-    return SceneRecord(**dataclasses.asdict(checked), initial=_state_from_json(initial), state=_state_from_json(state))
-
-
-def _state_from_json(text: str) -> SceneState:
-    return decode(StateJson, json.loads(text), "state").state()
+def _note(entry: SetAside) -> Statement:
+    return "INSERT INTO set_aside (kind, id, row, reason, at) VALUES (?, ?, ?, ?, ?)", set_aside_row(entry)

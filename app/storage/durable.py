@@ -1,7 +1,6 @@
-"""Putting files in place so that they are there after a loss of power, whole.
+"""Putting files in place so that they are there after a power failure, too.
 
-A rename is atomic but not durable: what was renamed may come back empty, or not at all, unless files and folders were
-written through to the disk before and after.
+A rename alone is not enough: the disk may keep the new name and lose what was written under it, or the other way round.
 """
 
 from __future__ import annotations
@@ -11,11 +10,7 @@ from pathlib import Path
 
 
 def sync(path: Path) -> None:
-    """Write a file's content, or a folder's names, through to the disk.
-
-    Raises:
-        OSError: if the disk refuses.
-    """
+    """Wait until a file's contents, or a folder's list of names, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -23,24 +18,23 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def sync_tree(folder: Path) -> None:
-    """The same for a folder and all that is in it."""
-    for place, _, files in os.walk(folder):
-        for name in files:
-            sync(Path(place) / name)
-        sync(Path(place))
+def sync_tree(made: Path) -> None:
+    """The same for a file, or for a folder with all that is in it."""
+    for folder, _, names in os.walk(made):
+        for name in names:
+            sync(Path(folder, name))
+        sync(Path(folder))
+    if made.is_file():
+        sync(made)
 
 
-def put_in_place(folder: Path, place: Path) -> None:
-    """Give a folder its final name, for good.
-
-    Args:
-        folder: made elsewhere on the same disk, complete.
-        place: does not exist, or is an empty folder.
+def put_in_place(made: Path, place: Path) -> None:
+    """Rename a file or folder to where it counts as there; on return it outlives a power failure.
 
     Raises:
-        OSError: if that is not possible; then `folder` is left as it is.
+        OSError: if the disk refuses; then it is not in place, or not for certain.
     """
-    sync_tree(folder)
-    folder.rename(place)
+    sync_tree(made)
+    made.rename(place)
     sync(place.parent)
+    sync(place.parent.parent)  # the folder itself may be new

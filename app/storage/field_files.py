@@ -41,12 +41,12 @@ def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
     place = workshop(data_dir, name)
     text = json.dumps(order, sort_keys=True)
     try:
-        if not (place / _ORDER).is_file() or (place / _ORDER).read_text(encoding="utf-8") != text:
+        if not (place / _ORDER).is_file() or (place / _ORDER).read_bytes() != text.encode():
             clear_workshop(data_dir, name)
             place.mkdir(parents=True)
-            (place / _ORDER).write_text(text, encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CannotWrite(place, getattr(error, "strerror", None) or str(error)) from error
+            (place / _ORDER).write_bytes(text.encode())
+    except OSError as error:
+        raise CannotWrite(place, error.strerror or str(error)) from error
     return place
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from app.storage.database import CannotStore
 from app.storage.durable import put_in_place
+from app.storage.schema import CannotStore
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -127,7 +127,7 @@ class GoalStore:
                 (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
                 put_in_place(folder, self._root / record.id)
         except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -143,7 +143,7 @@ class GoalStore:
         try:
             (self._root / goal).rename(trash)
         except OSError as error:
-            raise CannotStore(self._root, error.strerror or str(error)) from error
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         shutil.rmtree(trash, ignore_errors=True)
 
 

@@ -51,7 +51,7 @@ async def save(chunks: AsyncIterator[bytes], file: Path) -> None:
                     waiting.clear()
             await run_in_threadpool(sink.write, bytes(waiting))
     except OSError as error:
-        raise CannotStore(file.parent.parent, error.strerror or str(error)) from error
+        raise CannotStore(Path(file.parent.parent.name), error.strerror or str(error)) from error
 
 
 class Examiner(Generic[Found]):

@@ -1,4 +1,4 @@
-"""Unpacking a zip that somebody uploaded as an image set or observation, without trusting anything in it."""
+"""Unpacking a zip that somebody gave us, such as an image set or observation, without trusting anything in it."""
 
 from __future__ import annotations
 
@@ -20,32 +20,33 @@ MAX_FILES = 20_000
 MAX_RATIO = 100  # unpacked to packed: PNGs do not shrink, and lists of numbers shrink to a fifth
 _SMALL_BYTES = 10_000_000  # below this no ratio hurts
 _MAX_NAME_BYTES = 200
-_MAX_DEPTH = 8
 _CHUNK_BYTES = 1 << 20
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, struct.error, ValueError, OverflowError)
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
+class ArchiveKind:
     """What an archive may hold.
 
     Attributes:
         what: it is called.
         marker: a file that tells where in the archive it lies.
         kept: the folders that belong to it; all that lies beside the marker if empty.
-        expected: what was to be sent, for people.
+        expected: what was to be given, for people.
+        max_depth: of folders in it.
     """
 
     what: str
     marker: PurePosixPath
     kept: tuple[str, ...]
     expected: str
+    max_depth: int = 8
 
 
-_IMAGE_SET = _Kind(
+_IMAGE_SET = ArchiveKind(
     "image set", PurePosixPath("train/anno.json"), ("train", "test"), "a zipped image set with train and test"
 )
-_OBSERVATION = _Kind(
+_OBSERVATION = ArchiveKind(
     "observation", PurePosixPath("observation.json"), (), "a zipped observation folder with the images that it names"
 )
 
@@ -70,7 +71,7 @@ def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_file
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
-    return _unpack(archive, out, _IMAGE_SET, max_bytes, max_files)
+    return unpack(archive, out, _IMAGE_SET, max_bytes, max_files)
 
 
 def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
@@ -90,10 +91,27 @@ def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, 
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
-    return _unpack(archive, out, _OBSERVATION, max_bytes, max_files)
+    return unpack(archive, out, _OBSERVATION, max_bytes, max_files)
 
 
-def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: int) -> Path:
+def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
+    """Unpack what belongs to a kind of archive, under the same guards.
+
+    Args:
+        archive: a .zip file.
+        out: folder to write; must not exist or be empty.
+        kind: what it has to hold.
+        max_bytes: of the unpacked archive.
+        max_files: in the archive.
+
+    Returns:
+        `out`, the folder that holds the marker.
+
+    Raises:
+        CorruptFile: if it is no zip, damaged, locked, a bomb, of another kind, or leads elsewhere.
+        InvalidInput: if `out` is there and not empty.
+        CannotWrite: if the disk is full or cannot be written.
+    """
     archive, out = Path(archive), Path(out).absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
@@ -101,9 +119,11 @@ def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: in
         with archive.open("rb") as raw:
             check_directory(raw, max_files)
             with zipfile.ZipFile(raw) as file:
-                members = _members(archive, file, max_bytes)
+                members = _members(archive, file, kind, max_bytes)
                 wanted = _wanted(archive, members, kind)
                 _write(archive, file, wanted, out)
+    except FileNotFoundError as error:
+        raise CorruptFile(archive, "there is no such file") from error
     except _DAMAGE as error:
         if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
             raise
@@ -113,7 +133,9 @@ def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: in
     return out
 
 
-def _members(archive: Path, file: zipfile.ZipFile, max_bytes: int) -> dict[PurePosixPath, zipfile.ZipInfo]:
+def _members(
+    archive: Path, file: zipfile.ZipFile, kind: ArchiveKind, max_bytes: int
+) -> dict[PurePosixPath, zipfile.ZipInfo]:
     """The plain files of an archive by their path, all of which lead inside."""
     infos = file.infolist()
     size = sum(info.file_size for info in infos)
@@ -125,7 +147,7 @@ def _members(archive: Path, file: zipfile.ZipFile, max_bytes: int) -> dict[PureP
         raise CorruptFile(archive, f"{packed / 1e6:.1f} MB unpack to {size / 1e6:.0f} MB, {expected}")
     members: dict[PurePosixPath, zipfile.ZipInfo] = {}
     for info in infos:
-        path = _safe_path(archive, info)
+        path = _safe_path(archive, info, kind.max_depth)
         if info.is_dir():
             continue
         if path in members:
@@ -136,14 +158,14 @@ def _members(archive: Path, file: zipfile.ZipFile, max_bytes: int) -> dict[PureP
     return members
 
 
-def _safe_path(archive: Path, info: zipfile.ZipInfo) -> PurePosixPath:
+def _safe_path(archive: Path, info: zipfile.ZipInfo, max_depth: int) -> PurePosixPath:
     name = info.filename.replace("\\", "/")  # some Windows tools write backslashes
     place = f"it holds {info.filename[:100]!r}"
     path, windows = PurePosixPath(name), PureWindowsPath(name)
     if path.is_absolute() or windows.drive or windows.root or ".." in path.parts:
         raise CorruptFile(archive, f"{place}, a name that leads out of the archive")
     is_long = any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts)
-    if is_long or not 1 <= len(path.parts) <= _MAX_DEPTH or not name.isprintable():
+    if is_long or not 1 <= len(path.parts) <= max_depth or not name.isprintable():
         raise CorruptFile(archive, f"{place}, a name that is too long, too deep or not printable")
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
@@ -154,7 +176,7 @@ def _safe_path(archive: Path, info: zipfile.ZipInfo) -> PurePosixPath:
 
 
 def _wanted(
-    archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: _Kind
+    archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: ArchiveKind
 ) -> dict[PurePosixPath, zipfile.ZipInfo]:
     """What lies beside the file that marks the place and is to be kept, by its path from there."""
     depth = len(kind.marker.parts)

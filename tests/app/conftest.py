@@ -4,6 +4,7 @@ import contextlib
 import http.client
 import json
 import os
+import resource
 import shutil
 import socket
 import threading
@@ -30,6 +31,17 @@ def until(condition, timeout_s=20.0):
             return value
         time.sleep(0.02)
     pytest.fail(f"did not happen within {timeout_s:g} s")
+
+
+@contextlib.contextmanager
+def full_disk():
+    """While open, this process can write to no file: what a full disk does, without one."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def running(library, data_dir, **settings):

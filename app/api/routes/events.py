@@ -117,9 +117,9 @@ async def stream(
         last = 0
         if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
             last = min(int(last_event_id[:19]), _MAX_EVENT)
-            for number, fields in await run_in_threadpool(services.store.events_after, last):
+            for number, job in await run_in_threadpool(services.store.events_after, last, job_from_fields):
                 last = number
-                yield job_event(services, number, job_from_fields(fields))
+                yield job_event(services, number, job)
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
     finally:

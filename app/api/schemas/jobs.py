@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, model_validator
 
 from app.api.schemas.common import ImageSize, Input, ObjectName, Seed
-from app.jobs.job import Job, State
+from app.jobs.job import Job, Kind, State
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
 from osfcore.geometry.states import MAX_OBJECTS
 
@@ -113,9 +113,7 @@ class JobOut(BaseModel):
     """A job as it is now."""
 
     id: str
-    kind: Literal[
-        "collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field", "estimate", "episode"
-    ]
+    kind: Kind
     params: dict[str, Any]
     state: State
     position: int | None = Field(description="Place in the queue, 1 is next; null when not queued.")

@@ -48,11 +48,11 @@ class Serve:
 
     def run(self) -> dict[str, Any]:
         """Serve until interrupted."""
-        from app.storage.database import Store
+        from app.storage.database import check_data_dir
 
         listener = bound_socket(self.host, self.port)
         with contextlib.closing(listener):
-            Store(self.data_dir).close()  # tells now, in one sentence, if the data directory cannot be used
+            check_data_dir(self.data_dir)  # tells now, in one sentence, if it cannot be used
             url = _url(self.host, listener.getsockname()[1])
             settings, login = _settings(self)
             logging.basicConfig(level=logging.WARNING, stream=sys.stderr)

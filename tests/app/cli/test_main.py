@@ -15,7 +15,18 @@ def osf(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     "command",
-    [(), ("assets",), ("collect",), ("collect", "pushes"), ("check",), ("serve",), ("train", "field"), ("estimate",)],
+    [
+        (),
+        ("assets",),
+        ("collect",),
+        ("collect", "pushes"),
+        ("check",),
+        ("serve",),
+        ("train", "field"),
+        ("estimate",),
+        ("backup",),
+        ("restore",),
+    ],
 )
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as stop:

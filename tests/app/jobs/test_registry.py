@@ -24,7 +24,7 @@ from app.processes.messages.scene_messages import TakeImage
 from app.storage.database import CannotStore, Store
 from app.storage.field_files import workshop
 from osfcore.errors import UnknownName
-from tests.app.conftest import until
+from tests.app.conftest import full_disk, until
 
 TABLE = ("collect_table", {"images": 60, "size": 16, "seed": 0})
 LONG = ("collect_table", {"images": 5000, "size": 16, "seed": 0})
@@ -477,3 +477,48 @@ def test_a_failure_of_the_loop_is_told_and_jobs_go_on_once_its_cause_is_gone(pla
     played.end_with({})
     until_state(jobs, job, "done")
     until(lambda: jobs.problem is None)
+
+
+def test_a_job_that_cannot_be_stored_is_not_accepted_and_leaves_nothing(played, open_jobs, store, data_dir):
+    jobs, events = open_jobs(start_process=played.start)
+    running = begun(jobs)
+    events.clear()
+    (data_dir / "given").mkdir()
+    with full_disk(), pytest.raises(CannotStore, match="service.sqlite3 cannot be written"):
+        jobs.submit("episode", {"scene": "s2"}, data_dir / "given")
+    assert [job.id for job in jobs.all()] == [running.id]
+    assert [fields["id"] for _, fields in store.jobs()] == [running.id]
+    assert [path.name for path in (data_dir / "collections").iterdir()] == [running.id]
+    assert events == []
+    accepted = jobs.submit("episode", {"scene": "s2"})
+    assert accepted.position == events[-1].job.position == 1
+
+
+def test_a_job_goes_on_while_the_disk_is_full_and_its_end_is_stored_once_there_is_room(played, open_jobs, store):
+    jobs, events = open_jobs(start_process=played.start)
+    job = begun(jobs)
+    with full_disk():
+        played.send(JobStep(1, 3, "Pushing", {"steps": 1}))
+        until(lambda: jobs.get(job.id).done == 1)
+        played.end_with({"n": 1})
+        until_state(jobs, job, "done")
+        assert store.unwritten == 1
+        assert events[-1].event == 0
+        assert [fields["state"] for _, fields in store.jobs()] == ["running"]
+    until(lambda: store.unwritten == 0)  # nothing else happens, no job runs
+    ((_, fields),) = store.jobs()
+    assert (fields["state"], fields["result"]) == ("done", {"n": 1})
+    assert store.events_after(0)[-1][1]["state"] == "done"
+
+
+def test_a_stored_job_that_makes_no_sense_does_not_stop_the_start(played, open_jobs, store):
+    store.save_job("a", 1, {"id": "a", "kind": "dance", "params": {}})
+    store.save_job("b", 2, {"id": "b", "kind": "episode"})
+    store.save_job("c", 3, {"id": "c", "kind": "episode", "params": {}, "state": "dreaming"})
+    store.save_job("d", 4, {"id": "d", "kind": "episode", "params": {}, "state": "done", "mood": "added later"})
+    jobs, _ = open_jobs(start_process=played.start)
+    (job,) = jobs.all()
+    assert (job.id, job.state, job.files, job.note) == ("d", "done", (), "Waiting")
+    assert [(entry.kind, entry.id) for entry in store.set_aside] == [("job", "a"), ("job", "b"), ("job", "c")]
+    assert "'params'" in store.set_aside[1].reason
+    assert jobs.submit("episode", {}).id not in ("a", "b", "c", "d")

@@ -1,4 +1,5 @@
 import contextlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,7 +100,15 @@ def test_a_preset_is_asked_for_as_it_is_described(one):
     assert drawn[:4] == ("s", one.goal_seed, one.moved, one.title)
 
 
-@pytest.mark.parametrize("error", [CannotStore("goals", "No space left on device"), TooManyScenes(3)])
+@pytest.mark.parametrize(
+    "error",
+    [
+        CannotStore(Path("goals"), "No space left on device"),
+        TooManyScenes(3),
+        RuntimeError("defect"),
+        KeyboardInterrupt(),
+    ],
+)
 def test_without_its_goal_no_table_is_left(error):
     service = Service(error)
     with pytest.raises(type(error)):

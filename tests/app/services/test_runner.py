@@ -1,4 +1,5 @@
 import asyncio
+import contextlib
 import multiprocessing
 import os
 import shutil
@@ -10,18 +11,19 @@ import numpy as np
 import pytest
 
 from app.jobs.job import JobChanged, TrainingAlready
-from app.processes.messages.scene_messages import SceneChanged, TakeImage
+from app.processes.messages.scene_messages import DropScene, SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
 from app.services.runner import Runner
 from app.services.scenes import SceneHeld, TooManyScenes
 from app.services.service_settings import Settings
-from app.storage.database import Store
+from app.storage.database import CannotStore, Store
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.objects.asset_library import AssetLibrary
-from tests.app.conftest import until
+from tests.app.conftest import full_disk, until
 from tests.app.jobs.test_registry import LONG, TABLE
+from tests.app.storage.test_database import record
 
 BOX = "003_cracker_box"
 
@@ -231,3 +233,68 @@ def test_a_field_that_was_put_aside_by_a_killed_service_is_back_after_the_next_s
     open_runner(demo_scene=False)
     assert (data_dir / "fields" / "mug" / "field.safetensors").read_bytes() == b"weights"
     assert not aside.parent.exists()
+
+
+class PlayedSimulation:
+    """A simulation whose part is played by the test; knows the scenes that it was not told to drop."""
+
+    status = "ready"
+
+    def __init__(self, *_, **__):
+        self.scenes = set()
+
+    def start(self):
+        pass
+
+    stop = start
+
+    def call(self, command):
+        self.scenes.add(command.id)
+        return record(command.id)
+
+    call_async = call
+
+    def submit(self, command):
+        if isinstance(command, DropScene):
+            self.scenes.remove(command.id)
+
+
+def test_a_scene_that_cannot_be_stored_is_nowhere(open_runner, monkeypatch):
+    simulations = []
+    monkeypatch.setattr(
+        "app.services.scenes.ProcessClient", lambda *_, **__: simulations.append(PlayedSimulation()) or simulations[-1]
+    )
+    runner = open_runner(demo_scene=False)
+    shown = runner.create_scene(names=(BOX,), seed=3)
+    runner.events.clear()
+    with full_disk(), pytest.raises(CannotStore):
+        runner.create_scene(names=(BOX,), seed=4)
+    assert simulations[-1].scenes == {shown.id}
+    assert [scene.id for scene in runner.scenes()] == [runner.current] == [shown.id]
+    assert (runner.events, runner.unwritten) == ([], 0)
+    assert [scene.id for scene in open_runner(demo_scene=False).scenes()] == [shown.id]
+
+
+def test_a_push_that_cannot_be_stored_has_happened_and_is_stored_later(open_runner):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    with full_disk():
+        moved = runner.act(scene.id, [(0.1, 0, 0)])
+        runner.activate(scene.id)
+        assert runner.unwritten == 2
+    assert moved.time_s > scene.time_s
+    assert runner.scene(scene.id).time_s == moved.time_s
+    until(lambda: runner.unwritten == 0)
+    again = open_runner(demo_scene=False)
+    assert again.scene(scene.id).time_s == moved.time_s
+
+
+def test_what_is_set_aside_at_the_start_is_told(open_runner, data_dir, caplog):
+    with contextlib.closing(Store(data_dir)) as store:
+        store.save_job("a", 1, {"id": "a"})
+    runner = open_runner(demo_scene=False)
+    (notice,) = [event for event in runner.events if isinstance(event, Notice)]
+    assert notice.level == "warning"
+    assert "job a makes no sense" in notice.text
+    assert notice.text in caplog.text
+    assert runner.jobs.all() == ()

@@ -27,6 +27,15 @@ def test_the_same_order_finds_what_it_left_and_another_does_not(tmp_path):
     assert not workshop(tmp_path, "mug").exists()
 
 
+def test_an_order_that_cannot_be_read_counts_as_another_one(tmp_path):
+    shop = open_workshop(tmp_path, "mug", {"seed": 0})
+    (shop / "field.partial").write_bytes(b"x")
+    (shop / "order.json").write_bytes(b"\xff\xfe")
+    assert not (open_workshop(tmp_path, "mug", {"seed": 0}) / "field.partial").exists()
+    (shop / "field.partial").write_bytes(b"x")
+    assert (open_workshop(tmp_path, "mug", {"seed": 0}) / "field.partial").exists()
+
+
 def test_a_field_takes_its_place_and_the_older_ones_in_one_piece(tmp_path, made):
     place = tmp_path / "fields" / "mug"
     install(made, place)

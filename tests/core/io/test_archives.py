@@ -154,7 +154,7 @@ def test_archives_without_a_set_or_with_two_are_told(pristine_set, tmp_path):
     (tmp_path / "notes.zip").write_text("hello")
     with pytest.raises(CorruptFile, match="no zip archive"):
         unpack_set(tmp_path / "notes.zip", tmp_path / "out")
-    with pytest.raises(CorruptFile, match="no zip archive"):
+    with pytest.raises(CorruptFile, match="there is no such file"):
         unpack_set(tmp_path / "gone.zip", tmp_path / "out")
 
 

@@ -1,0 +1,76 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from app.jobs.job_folders import JobFolders
+from app.storage.durable import put_in_place
+from app.storage.field_files import install
+from app.storage.goal_store import GoalStore
+from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from tests.app.storage.test_goal_store import PNG, goal
+
+
+@pytest.fixture
+def synced(monkeypatch):
+    """What was written to the disk and what was renamed, in order: inodes, and names of places."""
+    found, fsync, rename = [], os.fsync, Path.rename
+
+    def noting_fsync(descriptor):
+        found.append(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    def noting_rename(self, target):
+        found.append(Path(target).name)
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", noting_fsync)
+    monkeypatch.setattr(Path, "rename", noting_rename)
+    return found
+
+
+def is_safe(synced, place):
+    """Whether all of a place was on the disk before it took its name, and the name after."""
+    at = len(synced) - 1 - synced[::-1].index(place.name)
+    inside = {place.stat().st_ino, *(path.stat().st_ino for path in place.rglob("*"))}
+    return inside <= set(synced[:at]) and place.parent.stat().st_ino in synced[at:]
+
+
+def test_everything_is_on_the_disk_before_its_name_is(tmp_path, synced):
+    made = tmp_path / "made" / "deep"
+    made.mkdir(parents=True)
+    (made / "a").write_text("a")
+    (made.parent / "b").write_text("b")
+    (tmp_path / "places").mkdir()
+    put_in_place(made.parent, tmp_path / "places" / "p")
+    assert is_safe(synced, tmp_path / "places" / "p")
+    assert tmp_path.stat().st_ino in synced[synced.index("p") :]
+    (tmp_path / "file").write_text("x")
+    put_in_place(tmp_path / "file", tmp_path / "places" / "f")
+    assert is_safe(synced, tmp_path / "places" / "f")
+
+
+def test_goals_outlive_a_power_failure(tmp_path, synced):
+    GoalStore(tmp_path / "goals", 3).keep(goal("a"), PNG)
+    assert is_safe(synced, tmp_path / "goals" / "a")
+
+
+def test_inputs_of_a_job_outlive_a_power_failure(tmp_path, synced):
+    folders = JobFolders(tmp_path)
+    with folders.new_inputs() as folder:
+        folder.mkdir(parents=True)
+        (folder / "goal.png").write_bytes(PNG)
+        folders.take("j", folder)
+    assert is_safe(synced, folders.inputs("j"))
+    assert (tmp_path / "collections").stat().st_ino in synced
+
+
+def test_fields_outlive_a_power_failure_also_those_that_replace_one(tmp_path, synced):
+    made, place = tmp_path / "made", tmp_path / "fields" / "mug"
+    made.mkdir()
+    for name in (FIELD_FILE, METRICS_FILE):
+        (made / name).write_text("{}")
+    for _ in range(2):
+        synced.clear()
+        install(made, place)
+        assert is_safe(synced, place)
