@@ -12,10 +12,10 @@ from pydantic import ValidationError
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow, urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
 from app.api.routes.events import StreamDep, followed
-from app.api.routes.open_file import OpenFile
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part

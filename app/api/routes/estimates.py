@@ -11,11 +11,11 @@ from starlette.requests import ClientDisconnect
 from app.api.bodies import JSON, SMALL_BODY_BYTES, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep
 from app.api.lanes import urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
 from app.api.routes.events import StreamDep, followed
-from app.api.routes.open_file import OpenFile
 from app.api.schemas.common import Seed
 from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
 from app.jobs.job import Job

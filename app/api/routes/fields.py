@@ -7,9 +7,9 @@ from fastapi.responses import FileResponse
 from starlette.requests import ClientDisconnect
 
 from app.api.dependencies import Services, ServicesDep
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
-from app.api.routes.open_file import OpenFile
 from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo

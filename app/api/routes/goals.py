@@ -11,9 +11,9 @@ from starlette.requests import ClientDisconnect
 from app.api.bodies import JSON, SMALL_BODY_BYTES, BoundedRoute, kind_of, parsed, whole_body
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow
+from app.api.open_file import OpenFile
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
-from app.api.routes.open_file import OpenFile
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
 from app.services.goals import Draft, NoDraft
 from app.storage.goal_store import GoalRecord

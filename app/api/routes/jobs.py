@@ -8,9 +8,9 @@ from fastapi.responses import FileResponse
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
-from app.api.routes.open_file import OpenFile
 from app.api.schemas.jobs import JobIn, JobList, JobOut
 from app.jobs.job import Job, check_file_name
 from app.jobs.kinds.fields import PREVIEW

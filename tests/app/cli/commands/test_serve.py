@@ -4,6 +4,7 @@ import os
 import re
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
@@ -112,13 +113,25 @@ def test_without_objects_the_page_starts_and_says_how_to_get_them(serve, tmp_pat
     assert "osf assets fetch" in err
 
 
-def test_a_damaged_database_stops_it_in_one_sentence(serve, data_dir):
+def test_a_damaged_database_is_put_aside_and_told(serve, data_dir):
     (data_dir / FILE).write_bytes(b"no database" * 1000)
+    process = serve(data_dir)
+    assert get(address(process), "/api/health") == 200
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert f"{FILE}.damaged" in err
+    assert "Traceback" not in err
+    assert (data_dir / f"{FILE}.damaged").read_bytes() == b"no database" * 1000
+
+
+def test_another_programs_database_stops_it_in_one_sentence(serve, data_dir):
+    with contextlib.closing(sqlite3.connect(data_dir / FILE)) as database:
+        database.execute("CREATE TABLE other (x)")
     process = serve(data_dir)
     out, err = process.communicate(timeout=30)
     assert out == ""
     assert err.splitlines()[-1].startswith("osfcore.errors.CorruptFile")
-    assert "damaged" in err
+    assert "another program" in err
 
 
 def test_a_senseless_setting_is_told(data_dir, monkeypatch):

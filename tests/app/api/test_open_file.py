@@ -10,8 +10,8 @@ from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from app.api import problems
+from app.api.open_file import OpenFile
 from app.api.problems import NotFound
-from app.api.routes.open_file import OpenFile
 from app.services.service_settings import Settings
 from osfcore.io.files import write_atomically
 from tests.app.api.test_problems import is_problem
