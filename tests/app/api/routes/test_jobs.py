@@ -6,7 +6,7 @@ import h5py
 import pytest
 
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import LONG, until
+from tests.app.conftest import LONG, full_disk, until
 
 TABLE = {"kind": "collect_table", "params": {"images": 60, "size": 16}}
 
@@ -84,3 +84,13 @@ def test_what_cannot_be_is_refused_at_once(service, body, words):
 @pytest.mark.parametrize(("method", "tail"), [("get", ""), ("delete", ""), ("post", "/pause"), ("get", "/files/x")])
 def test_missing_jobs_are_not_found(service, method, tail):
     is_problem(getattr(service, method)(f"/api/jobs/none{tail}"), 404)
+
+
+def test_a_job_that_cannot_be_stored_is_not_answered_202(service, services):
+    before = service.get("/api/jobs").json()
+    with full_disk():
+        answer = service.post("/api/jobs", json=TABLE)
+    detail = is_problem(answer, 507)["detail"]
+    assert "service.sqlite3 cannot be written" in detail
+    assert str(services.settings.data_dir) not in detail
+    assert service.get("/api/jobs").json() == before

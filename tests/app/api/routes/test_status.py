@@ -6,7 +6,7 @@ from app.api.schemas.episodes import SettingsIn
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import until
+from tests.app.conftest import full_disk, until
 
 
 def test_health_tells_version_objects_and_stage(service, library):
@@ -54,3 +54,12 @@ def test_the_bounds_are_those_of_the_settings_themselves(service):
         for beyond in (whole(bounds[1] * 2), whole(bounds[0] / 2)):
             with pytest.raises(InvalidInput):
                 settings_of(nested({name: beyond}))
+
+
+def test_health_tells_of_what_could_not_be_stored_until_it_is(service, scene):
+    with full_disk():
+        assert service.post(f"/api/scenes/{scene['id']}/actions", json={"actions": [[0.05, 0, 0]]}).status_code == 200
+        health = service.get("/api/health").json()
+    assert health["status"] == "degraded"
+    assert "What has become of one scene or job could not be stored" in " ".join(health["problems"])
+    until(lambda: "could not be stored" not in " ".join(service.get("/api/health").json()["problems"]))
