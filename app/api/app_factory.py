@@ -36,7 +36,7 @@ from app.api.routes import (
     scenes,
     status,
 )
-from app.api.schemas.common import FrameEvent, NoticeEvent, Problem
+from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
 from app.api.security import BodyLimitMiddleware, SecurityMiddleware
@@ -170,7 +170,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-        for model in (Problem, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
+        for model in (Problem, ForgottenEvent, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
             schemas[model.__name__] = own

@@ -87,12 +87,38 @@ class JobChanged:
     job: Job
 
 
+@dataclass(frozen=True, slots=True)
+class JobForgotten:
+    """A job is gone, with all its files; `event` as in `JobChanged`."""
+
+    event: int
+    job: Job
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class JobView:
     """What a running job lets the live view draw; it is neither kept nor told to pages."""
 
     job: Job
     view: object
+
+
+JobEvent = JobChanged | JobForgotten | JobView
+
+
+@dataclass(frozen=True, slots=True)
+class JobPage:
+    """Some of the jobs.
+
+    Attributes:
+        jobs: newest first.
+        total: how many there are in all.
+        next: where the next page begins, see `JobTable.page`; None at the end.
+    """
+
+    jobs: tuple[Job, ...]
+    total: int
+    next: int | None
 
 
 def job_fields(job: Job) -> dict[str, Any]:

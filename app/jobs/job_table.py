@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import islice
 
-from app.jobs.job import Job, JobChanged, JobView, job_fields, job_from_fields
+from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
 from app.storage.database import Store
 from osfcore.errors import OsfError, UnknownName
 
@@ -23,7 +25,7 @@ class JobTable:
         publish: told of every change; progress is thinned out.
     """
 
-    def __init__(self, store: Store, publish: Callable[[JobChanged | JobView], None]) -> None:
+    def __init__(self, store: Store, publish: Callable[[JobEvent], None]) -> None:
         self._store = store
         self._publish = publish
         self._jobs: dict[str, Job] = {}
@@ -43,17 +45,33 @@ class JobTable:
 
     def all(self) -> list[Job]:
         """All jobs with their places in the queue, oldest first."""
-        return [self._with_position(job) for job in self._jobs.values()]
+        return self._with_positions(self._jobs.values())
 
-    def get(self, job: str) -> Job:
+    def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
+        """Some of the jobs, newest first.
+
+        Args:
+            limit: how many at most.
+            before: only jobs with smaller numbers; jobs that come or go meanwhile shift nothing.
+            kind: only jobs of it.
+        """
+        found = [job for job in reversed(self._jobs.values()) if kind in (None, job.kind)]
+        start = 0 if before is None else bisect_right(found, -before, key=lambda job: -self._numbers[job.id])
+        shown = found[start : start + limit]
+        is_last = start + limit >= len(found)
+        return JobPage(tuple(self._with_positions(shown)), len(found), None if is_last else self._numbers[shown[-1].id])
+
+    def get(self, job: str, kind: str | None = None) -> Job:
         """One job with its place in the queue.
 
         Raises:
-            UnknownName: if there is none of this name.
+            UnknownName: if there is none of this name and kind.
         """
-        if job not in self._jobs:
-            raise UnknownName("job", job, list(self._jobs)[-5:])
-        return self._with_position(self._jobs[job])
+        found = self._jobs.get(job)
+        if found is None or kind not in (None, found.kind):
+            known = (other.id for other in reversed(self._jobs.values()) if kind in (None, other.kind))
+            raise UnknownName(kind or "job", job[:80], islice(known, 5))
+        return self._with_position(found)
 
     def queue(self) -> list[Job]:
         """Jobs that wait, the next one first."""
@@ -61,8 +79,18 @@ class JobTable:
 
     def add(self, job: Job) -> None:
         """Keep a new job, the last of all."""
-        self._numbers[job.id] = 1 + max(self._numbers.values(), default=0)
+        self._numbers[job.id] = 1 + next(reversed(self._numbers.values()), 0)
         self.set(job)
+
+    def forget(self, job: Job) -> None:
+        """Keep a job no longer.
+
+        Raises:
+            CannotStore: if the disk refuses; then it is kept.
+        """
+        event = self._store.forget_job(job.id)
+        del self._jobs[job.id], self._numbers[job.id]
+        self._publish(JobForgotten(event, job))
 
     def set(self, job: Job) -> None:
         """Keep and publish a job's new state."""
@@ -95,6 +123,10 @@ class JobTable:
         if job.state != "queued":
             return job
         return replace(job, position=1 + [other.id for other in self.queue()].index(job.id))
+
+    def _with_positions(self, jobs: Iterable[Job]) -> list[Job]:
+        places = {job.id: place for place, job in enumerate(self.queue(), 1)}
+        return [replace(job, position=places[job.id]) if job.id in places else job for job in jobs]
 
     def _keep(self, job: Job) -> None:
         shown = self._with_position(job)

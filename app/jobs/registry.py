@@ -5,18 +5,17 @@ A service that stops fails the job it was running; waiting ones go on after the 
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import threading
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import INPUTS, Job, JobChanged, JobView, State, WrongJobState, ended
+from app.jobs.job import Job, JobEvent, JobView, State, WrongJobState, ended
+from app.jobs.job_archive import TEMPORARY_PREFIX, JobArchive
 from app.jobs.job_process import JobProcess
-from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, Outcome, after
 from app.processes.messages.job_messages import (
     ChangeJob,
@@ -34,7 +33,6 @@ from app.storage.database import CannotStore, Store, now_utc
 from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
 
-_TEMPORARY_PREFIX = ".new-"
 _ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
 
 
@@ -45,7 +43,7 @@ class QueueFull(OsfError):
         super().__init__(f"{limit} jobs are waiting already, which is the most; wait for one or cancel one.")
 
 
-class Jobs:
+class Jobs(JobArchive):
     """All jobs of one data directory.
 
     Args:
@@ -62,28 +60,25 @@ class Jobs:
         self,
         store: Store,
         data_dir: Path,
-        publish: Callable[[JobChanged | JobView], None],
+        publish: Callable[[JobEvent], None],
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
         start_process: Callable[[Job, Path, Path, Callable[[object], None]], JobProcess] = JobProcess,
     ) -> None:
+        super().__init__(store, data_dir / "collections", publish)
         self._data_dir = data_dir
-        self._root = data_dir / "collections"
-        self._publish = publish
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
         self._serve = serve
         self._start_process = start_process
-        self._changed = threading.Condition(threading.RLock())
-        self._table = JobTable(store, publish)
         self._run: JobProcess | None = None
         self._is_stopping = False
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Take over what the store holds, remove what was left half done, and begin to work."""
-        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
+        for folder in self._root.glob(f"{TEMPORARY_PREFIX}*"):
             shutil.rmtree(folder, ignore_errors=True)
         self._table.load()
         for job in self._table.all():
@@ -103,46 +98,11 @@ class Jobs:
 
     # What pages and programs ask for
 
-    def all(self) -> tuple[Job, ...]:
-        """All jobs, newest first."""
-        with self._changed:
-            return tuple(reversed(self._table.all()))
-
-    def get(self, job: str) -> Job:
-        """One job.
-
-        Raises:
-            UnknownName: if there is none of this name.
-        """
-        with self._changed:
-            return self._table.get(job)
-
-    def live(self, kind: str) -> tuple[Job, ...]:
-        """Jobs of a kind that wait, run or pause."""
-        return tuple(job for job in self.all() if job.kind == kind and not job.is_finished)
-
-    def folder(self, job: str) -> Path:
-        """Where a job's outputs are."""
-        return self._root / job
-
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
         with self._changed:
             job = self._table[self._run.id] if self._run else None
             return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
-
-    def inputs(self, job: str) -> Path:
-        """Where a job's inputs are, if it was given any."""
-        return self.folder(job) / INPUTS
-
-    @contextlib.contextmanager
-    def new_inputs(self) -> Iterator[Path]:
-        """Where a folder of inputs may be made for `submit`; what no job has taken is removed."""
-        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
 
     def submit(self, kind: str, params: dict[str, Any], inputs: Path | None = None) -> Job:
         """Put a job into the queue.

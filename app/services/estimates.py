@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from starlette.concurrency import run_in_threadpool
 
-from app.jobs.job import Job
+from app.jobs.job import Job, JobPage
 from app.jobs.kinds.estimates import OBSERVATION, PRIOR, STATE, STEPS, TRUTH, Mode, read_steps, state_of_step
 from app.processes.messages.neural_messages import CompareView
 from app.services.fields import FieldCatalogue, MissingFields
@@ -199,16 +199,17 @@ class Estimates:
         """All estimates, newest first."""
         return tuple(job for job in self._runner.jobs.all() if job.kind == KIND)
 
+    def page(self, limit: int, before: int | None = None) -> JobPage:
+        """Some of the estimates, newest first, see `JobTable.page`."""
+        return self._runner.jobs.page(limit, before, KIND)
+
     def get(self, estimate: str) -> Job:
         """One estimate.
 
         Raises:
             UnknownName: if there is none of this name.
         """
-        known = [job.id for job in self.all()]
-        if estimate not in known:
-            raise UnknownName("estimate", estimate, known[:5])
-        return self._runner.jobs.get(estimate)
+        return self._runner.jobs.get(estimate, KIND)
 
     def steps(self, job: Job) -> tuple[dict[str, Any], ...]:
         """What was told of each step so far, see `read_steps`."""

@@ -7,7 +7,7 @@ import threading
 import time
 from typing import Any
 
-from app.jobs.job import Job, JobChanged, JobView, SetInUse, TrainingAlready, check_params
+from app.jobs.job import Job, JobChanged, JobEvent, SetInUse, TrainingAlready, check_params
 from app.jobs.registry import Jobs
 from app.processes.messages.scene_messages import Act, Command
 from app.services.event_hub import Notice
@@ -122,7 +122,7 @@ class Runner(Scenes):
             if job.params["name"] == name:
                 raise TrainingAlready(name, job.id)
 
-    def _on_job(self, event: JobChanged | JobView) -> None:
+    def _on_job(self, event: JobEvent) -> None:
         self.hub.publish(event)
         if isinstance(event, JobChanged) and event.job.kind == "fetch_assets" and event.job.state == "done":
             self.ensure_demo_scene()

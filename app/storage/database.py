@@ -217,6 +217,18 @@ class Store:
             rows = database.execute("SELECT number, job FROM jobs ORDER BY number").fetchall()
         return tuple((number, json.loads(text)) for number, text in rows)
 
+    def forget_job(self, job: str) -> int:
+        """Delete a job with its events; returns the number of the event that says so.
+
+        Raises:
+            CannotStore: if the disk refuses; then nothing is deleted.
+        """
+        with self._transaction() as database:
+            database.execute("DELETE FROM jobs WHERE id = ?", (job,))
+            database.execute("DELETE FROM events WHERE json_extract(job, '$.id') = ?", (job,))
+            fields = json.dumps({"forgotten": job})
+            return database.execute("INSERT INTO events (job) VALUES (?)", (fields,)).lastrowid or 0
+
     def add_event(self, fields: dict[str, Any]) -> int:
         """Remember how a job was; returns the event's number. Old events are dropped."""
         with self._transaction() as database:

@@ -10,8 +10,9 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import ValidationError
 
 from app.api.dependencies import Services, ServicesDep
+from app.api.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.api.problems import named_in_path
-from app.api.routes import PNG, problems
+from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.routes.events import followed
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
 from app.episodes.file_names import REPORT_FILE
@@ -55,12 +56,11 @@ def create(services: ServicesDep, body: EpisodeIn, response: Response) -> Episod
 
 
 @router.get("")
-def list_all(services: ServicesDep) -> EpisodeList:
-    """List all episodes, newest first, without their steps."""
-    episodes = services.episodes
-    return EpisodeList(
-        episodes=[EpisodeOut.of_job(job, episodes.settings(job), None, episodes.files(job)) for job in episodes.all()]
-    )
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> EpisodeList:
+    """List episodes, newest first, without their steps."""
+    episodes, page = services.episodes, services.episodes.page(limit, after)
+    listed = [EpisodeOut.of_job(job, episodes.settings(job), None, episodes.files(job)) for job in page.jobs]
+    return EpisodeList(episodes=listed, total=page.total, next=page.next)
 
 
 @router.get("/{episode}", responses=problems(404, 409))
@@ -69,9 +69,12 @@ def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     return _out(services, job)
 
 
-@router.delete("/{episode}", responses=problems(404, 409))
-def cancel(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+@router.delete("/{episode}", response_model=EpisodeOut, responses={**problems(404, 409, 507), **FORGOTTEN})
+def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EpisodeOut | Response:
     """End an episode, within a second. The steps that it has done are kept."""
+    if forget:
+        services.runner.jobs.forget(job.id)
+        return Response(status_code=status.HTTP_204_NO_CONTENT)
     return _out(services, services.runner.jobs.cancel(job.id))
 
 

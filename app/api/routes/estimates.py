@@ -11,8 +11,9 @@ from starlette.requests import ClientDisconnect
 
 from app.api.bodies import JSON, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep
+from app.api.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.api.problems import named_in_path
-from app.api.routes import problems
+from app.api.routes import FORGOTTEN, Forget, problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
 from app.api.routes.events import followed
 from app.api.schemas.common import Seed
@@ -84,9 +85,11 @@ async def create(
 
 
 @router.get("")
-def list_all(services: ServicesDep) -> EstimateList:
-    """List all estimates, newest first, without steps and results."""
-    return EstimateList(estimates=[EstimateOut.of_job(job, (), None, None) for job in services.estimates.all()])
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> EstimateList:
+    """List estimates, newest first, without steps and results."""
+    page = services.estimates.page(limit, after)
+    listed = [EstimateOut.of_job(job, (), None, None) for job in page.jobs]
+    return EstimateList(estimates=listed, total=page.total, next=page.next)
 
 
 @router.get("/{estimate}", responses=problems(404, 409), response_model_exclude_unset=True)
@@ -95,9 +98,17 @@ def get(services: ServicesDep, job: FoundDep) -> EstimateOut:
     return _out(services.estimates, job)
 
 
-@router.delete("/{estimate}", responses=problems(404, 409), response_model_exclude_unset=True)
-def cancel(services: ServicesDep, job: FoundDep) -> EstimateOut:
+@router.delete(
+    "/{estimate}",
+    response_model=EstimateOut,
+    responses={**problems(404, 409, 507), **FORGOTTEN},
+    response_model_exclude_unset=True,
+)
+def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EstimateOut | Response:
     """End an estimate, within a second; what it was given is removed. It stays listed as cancelled."""
+    if forget:
+        services.runner.jobs.forget(job.id)
+        return Response(status_code=status.HTTP_204_NO_CONTENT)
     return _out(services.estimates, services.runner.jobs.cancel(job.id))
 
 

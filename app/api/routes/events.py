@@ -8,7 +8,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
@@ -17,14 +17,15 @@ from starlette.concurrency import run_in_threadpool
 from app.api.dependencies import Services, ServicesDep
 from app.api.routes import problems
 from app.api.routes.driver import DriverOut
-from app.api.schemas.common import FrameEvent, NoticeEvent
+from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent
 from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
-from app.jobs.job import Job, JobChanged, job_from_fields
+from app.jobs.job import Job, JobChanged, JobForgotten, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
+from osfcore.errors import UnknownName
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
@@ -32,6 +33,7 @@ FRAME_INTERVAL_S = 0.2
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
+Letter = JobChanged | JobForgotten | Notice | GoalsChanged | DriverChanged
 
 
 class Mailbox:
@@ -40,7 +42,7 @@ class Mailbox:
     def __init__(self, current: str | None) -> None:
         self._loop = asyncio.get_running_loop()
         self._current = current
-        self.letters: deque[JobChanged | Notice | GoalsChanged | DriverChanged] = deque(maxlen=_MAX_WAITING)
+        self.letters: deque[Letter] = deque(maxlen=_MAX_WAITING)
         self.draft: DraftChanged | None = None
         self.is_scene_new = True
         self.frames: FramesTaken | None = None
@@ -64,7 +66,7 @@ class Mailbox:
 
     def _put(self, event: object) -> None:
         match event:
-            case JobChanged() | Notice() | GoalsChanged() | DriverChanged():
+            case JobChanged() | JobForgotten() | Notice() | GoalsChanged() | DriverChanged():
                 self.letters.append(event)
             case DraftChanged():
                 self.draft = event
@@ -88,7 +90,7 @@ async def stream(
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: "job", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
+    """Follow what happens: "job", "forgotten", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
     is_watching = has_arrived = False
@@ -107,7 +109,7 @@ async def stream(
             last = min(int(last_event_id[:19]), _MAX_EVENT)
             for number, fields in await run_in_threadpool(services.store.events_after, last):
                 last = number
-                yield job_event(number, job_from_fields(fields))
+                yield _replayed(number, fields)
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
     finally:
@@ -134,6 +136,8 @@ async def _follow(
                     yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
                     yield job_event(letter.event, letter.job)
+                case JobForgotten() if letter.event > last:
+                    yield _replayed(letter.event, {"forgotten": letter.job.id})
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
             yield _draft_event(services, changed)
@@ -162,7 +166,9 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
     mailbox = Mailbox(None)
     leave = services.runner.hub.subscribe(mailbox.put)
     try:
-        now = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        with contextlib.suppress(UnknownName):  # one that was just removed for good ends as it was
+            job = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        now = job
         yield job_event(0, now)
         while not now.is_finished and not services.closing.is_set():
             letter = await mailbox.next_job(job.id)
@@ -176,6 +182,13 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
 def job_event(number: int, job: Job) -> ServerSentEvent:
     """A job as an event; the number is 0 where nothing came after it that could be asked for."""
     return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
+
+
+def _replayed(number: int, fields: dict[str, Any]) -> ServerSentEvent:
+    """What the store keeps of an event, as it was told."""
+    if "forgotten" in fields:
+        return ServerSentEvent(event="forgotten", id=str(number), data=ForgottenEvent(job=fields["forgotten"]))
+    return job_event(number, job_from_fields(fields))
 
 
 def _scene_event(services: Services) -> ServerSentEvent:

@@ -7,6 +7,7 @@ from fastapi.responses import FileResponse
 from starlette.requests import ClientDisconnect
 
 from app.api.dependencies import Services, ServicesDep
+from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
@@ -49,9 +50,10 @@ async def upload_set(
 
 
 @router.get("/sets")
-def list_sets(services: ServicesDep) -> SetList:
+def list_sets(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> SetList:
     """List the uploaded image sets, oldest first."""
-    return SetList(sets=[SetOut.of(record) for record in services.runner.sets.all()])
+    shown, total, following = page(services.runner.sets.all(), limit, after, newest_first=False)
+    return SetList(sets=[SetOut.of(record) for record in shown], total=total, next=following)
 
 
 @router.get("/sets/{set_id}", responses=problems(404))

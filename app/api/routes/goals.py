@@ -10,6 +10,7 @@ from starlette.requests import ClientDisconnect
 
 from app.api.bodies import JSON, kind_of, parsed, whole_body
 from app.api.dependencies import Services, ServicesDep
+from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
@@ -79,9 +80,10 @@ async def create(
 
 
 @router.get("")
-def list_all(services: ServicesDep) -> GoalList:
-    """List all goals, newest first."""
-    return GoalList(goals=[GoalOut.of(record) for record in services.goals.all()])
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> GoalList:
+    """List goals, newest first."""
+    shown, total, following = page(services.goals.all(), limit, after, newest_first=True)
+    return GoalList(goals=[GoalOut.of(record) for record in shown], total=total, next=following)
 
 
 @router.post("/draft", status_code=status.HTTP_201_CREATED, responses=problems(409, 503))

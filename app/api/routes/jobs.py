@@ -6,8 +6,9 @@ from fastapi import APIRouter, Body, Path, Response, status
 from fastapi.responses import FileResponse
 
 from app.api.dependencies import Services, ServicesDep
+from app.api.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.api.problems import NotFound, named_in_path
-from app.api.routes import PNG, problems
+from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
 from app.jobs.job import Job, check_file_name
 from app.jobs.kinds.fields import PREVIEW
@@ -32,9 +33,10 @@ def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Resp
 
 
 @router.get("")
-async def list_all(services: ServicesDep) -> JobList:
-    """List all jobs, newest first."""
-    return JobList(jobs=[JobOut.of(job) for job in services.runner.jobs.all()])
+async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> JobList:
+    """List jobs, newest first."""
+    page = services.runner.jobs.page(limit, after)
+    return JobList(jobs=[JobOut.of(job) for job in page.jobs], total=page.total, next=page.next)
 
 
 @router.get("/{job}", responses=problems(404))
@@ -43,10 +45,13 @@ async def get(services: ServicesDep, job: JobId) -> JobOut:
     return JobOut.of(_known_job(services, job))
 
 
-@router.delete("/{job}", responses=problems(404, 409))
-def cancel(services: ServicesDep, job: JobId) -> JobOut:
+@router.delete("/{job}", response_model=JobOut, responses={**problems(404, 409, 507), **FORGOTTEN})
+def cancel(services: ServicesDep, job: JobId, forget: Forget = False) -> JobOut | Response:
     """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
     _known_job(services, job)
+    if forget:
+        services.runner.jobs.forget(job)
+        return Response(status_code=status.HTTP_204_NO_CONTENT)
     return JobOut.of(services.runner.jobs.cancel(job))
 
 

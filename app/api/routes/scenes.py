@@ -5,6 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response, status
 
 from app.api.dependencies import Services, ServicesDep
+from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
@@ -35,10 +36,13 @@ def create(services: ServicesDep, body: SceneIn, response: Response) -> SceneOut
 
 
 @router.get("")
-async def list_all(services: ServicesDep) -> SceneList:
-    """List all scenes, oldest first."""
+async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> SceneList:
+    """List scenes, oldest first."""
     runner = services.runner
-    return SceneList(scenes=[services.scene_out(record) for record in runner.scenes()], current=runner.current)
+    shown, total, following = page(runner.scenes(), limit, after, newest_first=False)
+    return SceneList(
+        scenes=[services.scene_out(record) for record in shown], current=runner.current, total=total, next=following
+    )
 
 
 @router.get("/{scene}", responses=problems(404))

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from app.api.paging import PageOut
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.scenes import MAX_SEED
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, default_cameras, goal_camera
@@ -221,7 +222,7 @@ def _cameras(size: int) -> list[CameraJson]:
     return [CameraJson.of(camera) for camera in (*default_cameras(size), goal_camera(size))]
 
 
-class SceneList(BaseModel):
+class SceneList(PageOut):
     """All scenes, oldest first."""
 
     scenes: list[SceneOut]
@@ -234,6 +235,12 @@ class FrameEvent(BaseModel):
     scene: str
     revision: int
     cameras: dict[str, str] = Field(description="Camera name to JPEG data URL.")
+
+
+class ForgottenEvent(BaseModel):
+    """A job was removed for good, the data of a "forgotten" event."""
+
+    job: str
 
 
 class NoticeEvent(BaseModel):

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field
 
+from app.api.paging import JobPageOut
 from app.api.schemas.common import Input, Seed
 from app.api.schemas.goals import Poses, SceneRef
 from app.jobs.job import Job, State
@@ -198,7 +199,7 @@ class EpisodeOut(BaseModel):
         )
 
 
-class EpisodeList(BaseModel):
+class EpisodeList(JobPageOut):
     """Episodes, newest first, without their steps."""
 
     episodes: list[EpisodeOut]

@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from app.api.paging import JobPageOut
 from app.api.schemas.common import Input, Seed
 from app.jobs.job import Job, State
 from app.jobs.kinds.estimates import Mode
@@ -131,7 +132,7 @@ class EstimateOut(BaseModel):
         )
 
 
-class EstimateList(BaseModel):
+class EstimateList(JobPageOut):
     """Estimates, newest first, without their steps."""
 
     estimates: list[EstimateOut]

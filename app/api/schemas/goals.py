@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, model_validator
 
+from app.api.paging import PageOut
 from app.api.schemas.common import Input, LightIn, ObjectPose, SceneObject, Seed
 from app.services.goals import Draft
 from app.storage.goal_store import GoalRecord, Source
@@ -94,7 +95,7 @@ class GoalOut(BaseModel):
         )
 
 
-class GoalList(BaseModel):
+class GoalList(PageOut):
     """Goals, newest first."""
 
     goals: list[GoalOut]

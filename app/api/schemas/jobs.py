@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
+from app.api.paging import JobPageOut
 from app.api.schemas.common import ImageSize, Input, ObjectName, Seed
 from app.jobs.job import Job, State
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
@@ -136,7 +137,7 @@ class JobOut(BaseModel):
         return JobOut.model_validate(job, from_attributes=True)
 
 
-class JobList(BaseModel):
+class JobList(JobPageOut):
     """Jobs, newest first."""
 
     jobs: list[JobOut]
