@@ -1,5 +1,5 @@
 // The goal: an image of how the table should look. Uploaded, drawn at random, composed, or one of the earlier ones.
-import { get, post, remove, upload } from "./api.js";
+import { getAll, post, remove, upload } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { mayDrive } from "./driver.js";
@@ -20,8 +20,8 @@ export function takeGoal(goal) {
 }
 
 export async function refreshGoals() {
-  const answer = await tellFailure(() => get("goals"));
-  if (answer) set("goals", answer.goals);
+  const goals = await tellFailure(() => getAll("goals", "goals"));
+  if (goals) set("goals", goals);
 }
 
 /** Keeps the goal that was chosen if it is there still and fits the table; else takes the newest made for it. */
