@@ -35,6 +35,7 @@ from app.api.routes import (
     presets,
     scenes,
     status,
+    storage,
 )
 from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
@@ -66,7 +67,7 @@ _DESCRIPTION = (
 
 _ROUTES = (
     status, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs,
-    driver, events,
+    driver, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"

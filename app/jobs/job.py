@@ -35,6 +35,20 @@ class SetInUse(OsfError):
         super().__init__(f"Job {job} needs image set {set_id}; wait for it or cancel it first.")
 
 
+class SceneNeeded(OsfError):
+    """A scene that a job needs to go on, or to begin."""
+
+    def __init__(self, scene: str, job: Job) -> None:
+        super().__init__(f"Job {job.id} is {job.state} and needs scene {scene}; cancel it first.")
+
+
+class WorkshopInUse(OsfError):
+    """Files of a training that goes on, or waits."""
+
+    def __init__(self, name: str, job: Job) -> None:
+        super().__init__(f"Job {job.id} is {job.state} and trains the field {name} from these files; cancel it first.")
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """A job as it is now.

@@ -84,6 +84,7 @@ class Episodes:
             MissingFields: if an object cannot be recognised.
             InvalidInput: if a setting is out of range, or the poses are not those of the scene's objects.
             QueueFull: if too many jobs wait.
+            StorageFull: if nothing more may be written.
         """
         check_seed(asked.seed)
         scene = asked.scene or self._runner.current
@@ -102,7 +103,7 @@ class Episodes:
                 "settings": settings,
                 "goal": self._goal(asked, scene, names, folder),
             }
-            job = self._runner.jobs.submit(KIND, params, folder)
+            job = self._runner.submit_with_inputs(KIND, params, folder)
         self._goals.drop_draft()  # what is composed cannot be moved while the episode has the scene
         return job
 

@@ -150,9 +150,10 @@ class Estimates:
             InvalidInput: if it does not fit the mode.
             UnknownName: if an object in it cannot be recognised, or the earlier estimate is unknown.
             NoPrior: if an earlier estimate is needed and there is none.
-            QueueFull: if too many jobs wait.
+            QueueFull, StorageFull: if too many jobs wait, or nothing more may be written.
         """
         check_seed(asked.seed)
+        await run_in_threadpool(self._runner.storage.check_room)
         with self._runner.jobs.new_inputs() as folder:
             await save(chunks, folder / _ARCHIVE)
             uploaded = await self._examiner.examine(folder)
@@ -173,7 +174,7 @@ class Estimates:
         self, asked: Asked, of: dict[str, Any], names: tuple[str, ...], cameras: tuple[str, ...], folder: Path
     ) -> Job:
         params = {"mode": asked.mode, "seed": asked.seed, "of": of, "names": list(names), "cameras": list(cameras)}
-        return self._runner.jobs.submit(KIND, params, folder)
+        return self._runner.submit_with_inputs(KIND, params, folder)
 
     def _prior(self, asked: Asked, names: tuple[str, ...], scene: str | None) -> EstimatedState:
         """The estimate to begin with, its objects in the order of `names`."""

@@ -117,6 +117,7 @@ class Goals:
             CannotStore: if that is not allowed.
         """
         self._store.remove(goal)
+        self._runner.storage.outdate()
         self._runner.hub.publish(GoalsChanged())
 
     def receive(self, data: bytes, name: str, camera: Camera | None = None) -> GoalRecord:
@@ -131,7 +132,7 @@ class Goals:
             PhotoRefused: if it cannot be used.
             InvalidInput: if its sides are not in the proportion of the camera's.
             TooManyGoals: if there are too many.
-            CannotStore: if the disk is full.
+            StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
         with self._decoding:
             pixels = read_photo(data)
@@ -185,6 +186,7 @@ class Goals:
     def _keep(
         self, source: Source, name: str, scene: str | None, camera: Camera, poses: Poses | None, png: bytes
     ) -> GoalRecord:
+        self._runner.storage.check_room()
         record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses)
         self._store.keep(record, png)
         self._runner.hub.publish(GoalsChanged())

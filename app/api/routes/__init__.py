@@ -33,5 +33,5 @@ _TEXTS = {
     422: "The input is not valid; the detail says what is allowed.",
     429: "Too many jobs wait already.",
     503: "The simulation, the neural renderer or the predictor is being restarted.",
-    507: "The disk is full.",
+    507: "The disk is full, or the service holds as much as it may.",
 }

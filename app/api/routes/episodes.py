@@ -73,7 +73,7 @@ def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
 def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EpisodeOut | Response:
     """End an episode, within a second. The steps that it has done are kept."""
     if forget:
-        services.runner.jobs.forget(job.id)
+        services.runner.forget_job(job.id)
         return Response(status_code=status.HTTP_204_NO_CONTENT)
     return _out(services, services.runner.jobs.cancel(job.id))
 

@@ -107,7 +107,7 @@ def get(services: ServicesDep, job: FoundDep) -> EstimateOut:
 def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EstimateOut | Response:
     """End an estimate, within a second; what it was given is removed. It stays listed as cancelled."""
     if forget:
-        services.runner.jobs.forget(job.id)
+        services.runner.forget_job(job.id)
         return Response(status_code=status.HTTP_204_NO_CONTENT)
     return _out(services.estimates, services.runner.jobs.cancel(job.id))
 

@@ -90,6 +90,7 @@ def delete(services: ServicesDep, name: FieldName) -> None:
     """Delete a field that was trained here; a shipped one of the same name then counts again."""
     _known_field(services, name)
     services.fields.remove(name)
+    services.runner.storage.outdate()
 
 
 def _out(services: Services, info: FieldInfo) -> FieldOut:

@@ -24,7 +24,7 @@ _FILE = {
 }
 
 
-@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429))
+@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429, 507))
 def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Response) -> JobOut:
     """Queue a job; one runs at a time. Outputs go to the data directory's collections/ID."""
     job = services.runner.submit_job(body.kind, body.params.model_dump())
@@ -50,7 +50,7 @@ def cancel(services: ServicesDep, job: JobId, forget: Forget = False) -> JobOut 
     """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
     _known_job(services, job)
     if forget:
-        services.runner.jobs.forget(job)
+        services.runner.forget_job(job)
         return Response(status_code=status.HTTP_204_NO_CONTENT)
     return JobOut.of(services.runner.jobs.cancel(job))
 
