@@ -8,13 +8,13 @@ from typing import Annotated, Protocol, TypeVar
 from fastapi import Query
 from pydantic import BaseModel, Field
 
-from app.api.schemas.limits import MAX_PAGE
+from app.api.schemas.limits import CURSOR, CURSOR_TEXT, PAGE, sized, within
 
 DEFAULT_PAGE = 100
-Limit = Annotated[int, Query(ge=1, le=MAX_PAGE, description="Entries at most.")]
+Limit = Annotated[int, Query(**within(PAGE), description="Entries at most.")]
 _AFTER = "The `next` of the page before; the list begins with its first entry if left out."
-AfterJob = Annotated[int | None, Query(ge=0, le=2**53, description=_AFTER)]
-AfterEntry = Annotated[str | None, Query(max_length=200, description=_AFTER)]
+AfterJob = Annotated[int | None, Query(**within(CURSOR), description=_AFTER)]
+AfterEntry = Annotated[str | None, Query(**sized(CURSOR_TEXT), description=_AFTER)]
 
 
 class Entry(Protocol):

@@ -19,18 +19,18 @@ const FIELDS = {
     number("steps", "Steps each", 50, 1, 1000),
     number("objects", "Objects", 3, 1, 8),
     { name: "policy", label: "Policy", options: [["paper", "random, as in the paper"], ["directed", "seeks contact"]] },
-    number("seed", "Seed", 0, 0, 4294967295),
+    number("seed", "Seed", 0, 0, 2147483647),
   ],
   collect_object: () => [
     { name: "name", label: "Object", options: objects().filter((o) => o.available).map((o) => [o.name, o.label]) },
     number("images", "Images", 300, 60, 5000),
     number("size", "Size in px", 128, 16, 1024),
-    number("seed", "Seed", 0, 0, 4294967295),
+    number("seed", "Seed", 0, 0, 2147483647),
   ],
   collect_table: () => [
     number("images", "Images", 300, 60, 5000),
     number("size", "Size in px", 128, 16, 1024),
-    number("seed", "Seed", 0, 0, 4294967295),
+    number("seed", "Seed", 0, 0, 2147483647),
   ],
 };
 const LATEST = { train_field: "training", estimate: "estimate", episode: "episode" }; // what the page knows of a kind

@@ -6,7 +6,7 @@ import { tellFailure, toast } from "./toasts.js";
 
 const MOST_OBJECTS = 8;
 const form = () => byId("new-scene");
-const randomSeed = () => Math.floor(Math.random() * 1_000_000);
+const randomSeed = () => Math.floor(Math.random() * 1_000_000); // short to read
 
 function chosenObjects() {
   return [...byId("chips").querySelectorAll("input:checked")].map((box) => box.value);

@@ -15,6 +15,7 @@ from app.api.problems import named_in_path
 from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.routes.events import followed
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
+from app.api.schemas.limits import STEP, within
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
 from app.jobs.job import Job
@@ -113,7 +114,7 @@ async def follow(services: ServicesDep, job: FoundDep) -> AsyncIterator[ServerSe
 async def frame(
     services: ServicesDep,
     job: FoundDep,
-    step: Annotated[int, Path(ge=0, le=100_000, description="Number of the step, from 0.")],
+    step: Annotated[int, Path(**within(STEP), description="Number of the step, from 0.")],
     part: Annotated[
         Part,
         Query(description="The goal image, the table then, the estimate as the goal camera would see it, how much "

@@ -18,6 +18,7 @@ from app.api.routes.comparisons import COMPARED, compared, compared_png
 from app.api.routes.events import followed
 from app.api.schemas.common import Seed
 from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
+from app.api.schemas.limits import FILE_NAME, GUESS, NAME, VIEW, sized, within
 from app.jobs.job import Job
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked, Estimates
@@ -36,7 +37,7 @@ _BODY = {
     }
 }
 router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
-View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")]
+View = Annotated[int, Path(**within(VIEW), description="Number of the camera, from 0.")]
 
 
 def _known_job(services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]) -> Job:
@@ -61,10 +62,9 @@ async def create(
     mode: Annotated[Mode, Query(description="Of an upload; JSON says it in the body.")] = "first",
     seed: Annotated[Seed, Query(description="Of an upload.")] = 0,
     prior: Annotated[
-        str | None,
-        Query(min_length=1, max_length=64, description="Of an upload: the earlier estimate, else its prior.json."),
+        str | None, Query(**sized(NAME), description="Of an upload: the earlier estimate, else its prior.json.")
     ] = None,
-    file_name: Annotated[str, Query(max_length=200, description="Of an upload, for people.")] = "observation.zip",
+    file_name: Annotated[str, Query(**sized(FILE_NAME), description="Of an upload, for people.")] = "observation.zip",
 ) -> EstimateOut:
     """Queue an estimate of the current scene (JSON, or no body at all) or of a zipped observation folder.
 
@@ -129,7 +129,7 @@ async def image(
         Query(description="The difference is absolute, times 4; a comparison is all three side by side."),
     ] = "comparison",
     step: Annotated[
-        int | None, Query(ge=1, le=100_000, description="Whose guess is rendered; the latest if left out.")
+        int | None, Query(**within(GUESS), description="Whose guess is rendered; the latest if left out.")
     ] = None,
 ) -> Response:
     """Show what a camera saw, and what it would see if a step's guess were true."""

@@ -11,6 +11,7 @@ from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
+from app.api.schemas.limits import FILE_NAME, sized
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
 
@@ -38,7 +39,7 @@ async def upload_set(
     services: ServicesDep,
     request: Request,
     response: Response,
-    file_name: Annotated[str, Query(max_length=200, description="What the zip is called, for people.")] = "set.zip",
+    file_name: Annotated[str, Query(**sized(FILE_NAME), description="What the zip is called, for people.")] = "set.zip",
 ) -> SetOut:
     """Upload a zipped image set in the OSF format: train/anno.json, test/anno.json and RGBA PNGs beside them."""
     try:
