@@ -14,7 +14,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, Literal
 
 from app.processes.child_process import end, launch
-from app.processes.process_server import Answer, Overtaken, Ready, child_main
+from app.processes.process_server import Answer, Logged, Overtaken, Ready, child_main
 from app.processes.request_queue import Request
 from osfcore.errors import OsfError
 
@@ -265,6 +265,8 @@ class ProcessClient:
             case Answer(number, value, error):
                 self._heard_at, self._deaths, self._is_warm = time.monotonic(), 0, True
                 self._settle(number, value, error)
+            case Logged(level, name, text):
+                logging.getLogger(name).log(level, "%s", text)
             case Overtaken(number):
                 self._settle(number)
             case _:
