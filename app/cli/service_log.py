@@ -35,9 +35,8 @@ class ServiceLogFile(RotatingFileHandler):
         self.stream = None  # pyright: ignore[reportAttributeAccessIssue]  the next record opens it again
         if isinstance(error, OSError) and not self._has_failed:
             self._has_failed = True
-            print(
-                f"{self._path} cannot be written ({error.strerror}); logging here alone.", file=sys.stderr, flush=True
-            )
+            with suppress(OSError):  # standard error may be on the same disk
+                print(f"{self._path} cannot be written ({error.strerror}); logging here alone.", file=sys.stderr)
 
 
 def start_log(data_dir: Path) -> None:
