@@ -1,6 +1,7 @@
 """The real service in a process of its own."""
 
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -10,8 +11,10 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 START_S = 60
+SMALL = {"steps": 30, "samples": 8, "horizon": 4}  # settings of an episode that is done soon
 
 
 def free_port() -> int:
@@ -62,3 +65,40 @@ def live_service(data_dir: Path) -> Iterator[str]:
         yield f"http://127.0.0.1:{port}"
     finally:
         stop_service(process)
+
+
+def call(port: int, method: str, path: str, body: object = None) -> Any:
+    """Content of one answer, read if it is JSON."""
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/api/{path}", method=method)
+    if body is not None:
+        request.data = json.dumps(body).encode()
+        request.add_header("Content-Type", "application/json")
+    with urllib.request.urlopen(request, timeout=60) as answer:
+        content = answer.read()
+    return json.loads(content) if answer.headers["Content-Type"].startswith("application/json") else content
+
+
+def children(process: int) -> list[int]:
+    """Processes that a process has started, the newest last."""
+    threads = Path(f"/proc/{process}/task").glob("*/children")
+    return sorted((int(pid) for path in threads for pid in path.read_text().split()), key=_started)
+
+
+def _started(process: int) -> int:
+    return int(Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[19])
+
+
+def begun(port: int, scene: str, settings: dict[str, Any]) -> str:
+    """An episode whose goal no short looks ahead will reach."""
+    objects = call(port, "GET", f"scenes/{scene}")["objects"]
+    poses = [{key: entry[key] for key in ("name", "position", "quaternion")} for entry in objects]
+    poses[0]["position"][0] += 0.15 if poses[0]["position"][0] < 0 else -0.15
+    return call(port, "POST", "episodes", {"scene": scene, "poses": poses, "settings": settings})["id"]
+
+
+def resident_mb(process: int) -> float:
+    """Memory of a process and of all that it has started."""
+    text = Path(f"/proc/{process}/smaps_rollup").read_text()
+    found = re.search(r"^Pss: +(\d+) kB", text, re.MULTILINE)  # in which shared pages count once in all
+    assert found is not None
+    return int(found[1]) / 1024 + sum(resident_mb(child) for child in children(process))

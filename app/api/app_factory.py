@@ -18,6 +18,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
 from app.api import problems, relay
+from app.api.bodies import SMALL_BODY_BYTES
 from app.api.connection_timeouts import BodyTimeoutMiddleware
 from app.api.dependencies import ObjectCatalogue, Services
 from app.api.http_metrics import Metrics, MetricsMiddleware
@@ -55,6 +56,7 @@ from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.storage.database import Store
 from app.storage.paths import static_folder
+from app.storage.photos import PhotoReader
 from app.viewer import Viewer
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -127,7 +129,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         predictor = ProcessClient(predictor_main, (settings.data_dir,), "predictor of pushes")
         stack.push_async_callback(run_in_threadpool, predictor.stop)
         prediction_service = Predictions(runner, fields.names, predictor)
-        goal_service = Goals(runner, settings.data_dir, settings.max_goals)
+        photos = PhotoReader()
+        stack.push_async_callback(run_in_threadpool, photos.stop)
+        goal_service = Goals(runner, settings.data_dir, settings.max_goals, photos)
         await run_in_threadpool(goal_service.start)
         episode_service = Episodes(runner, fields, goal_service)
         viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)
@@ -150,16 +154,20 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         )
         app.state.services = services
         app.state.metrics.watch(runner)
+        stack.callback(services.lanes.close)
         stack.callback(services.closing.set)
         yield
 
 
 def _body_limit(settings: Settings, path: str) -> int:
-    """How large a request to a path may be [bytes]: only uploads are large."""
+    """How large a request to a path may be [bytes]: only uploads and many sequences of actions are large."""
     path = path.rstrip("/")
     if path == goals.UPLOAD_PATH:
         return max(settings.max_photo_bytes, settings.max_body_bytes)
-    return settings.max_upload_bytes if path in _UPLOAD_PATHS else settings.max_body_bytes
+    if path in _UPLOAD_PATHS:
+        return settings.max_upload_bytes
+    is_large = path == predictions.router.prefix
+    return settings.max_body_bytes if is_large else min(SMALL_BODY_BYTES, settings.max_body_bytes)
 
 
 def _operation_id(route: APIRoute) -> str:

@@ -13,12 +13,21 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEAD_S = 10.0  # from the first byte, or the connection, to the end of the header
 BODY_S = 20.0  # between two pieces of a body
+STALL_S = 60.0  # that a client may leave its answer unread
 
 
 class PromptProtocol(H11Protocol):
-    """HTTP/1.1, with a deadline for each header."""
+    """HTTP/1.1, with a deadline for each header, and for a client that does not read.
 
+    Attributes:
+        head_s: how long a header may take [s].
+        stall_s: how long a client may leave its answer unread [s].
+    """
+
+    head_s = HEAD_S
+    stall_s = STALL_S
     _deadline: asyncio.TimerHandle | None = None
+    _stalled: asyncio.TimerHandle | None = None
     _is_handed_over = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -34,7 +43,21 @@ class PromptProtocol(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Expect no more."""
         self._forget()
+        self.resume_writing()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Wait a while until the client has read what was sent, and no longer."""
+        super().pause_writing()
+        if self._stalled is None:
+            self._stalled = self.loop.call_later(self.stall_s, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Go on: the client has read."""
+        if self._stalled is not None:
+            self._stalled.cancel()
+            self._stalled = None
+        super().resume_writing()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         """Hand the connection over: it may now be silent for as long as it likes."""
@@ -46,7 +69,7 @@ class PromptProtocol(H11Protocol):
         if self._is_handed_over or not is_idle:
             self._forget()
         elif self._deadline is None and not self.transport.is_closing():
-            self._deadline = self.loop.call_later(HEAD_S, self._close)
+            self._deadline = self.loop.call_later(self.head_s, self._close)
 
     def _forget(self) -> None:
         if self._deadline is not None:

@@ -10,6 +10,8 @@ from typing import Annotated
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from app.api.event_texts import EventTexts
+from app.api.lanes import Lanes
 from app.api.schemas.common import SceneOut
 from app.processes.messages.scene_messages import SceneRecord
 from app.processes.process_client import ProcessClient
@@ -79,6 +81,8 @@ class Services:
     goals: Goals
     episodes: Episodes
     driver: Driver
+    event_texts: EventTexts = field(default_factory=EventTexts)
+    lanes: Lanes = field(default_factory=Lanes)
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
     def scene_out(self, record: SceneRecord) -> SceneOut:
@@ -86,7 +90,7 @@ class Services:
         return SceneOut.of(record, self.objects.labels(), is_current=record.id == self.runner.current)
 
 
-def get_services(connection: HTTPConnection) -> Services:
+async def get_services(connection: HTTPConnection) -> Services:
     """The services of the app that handles a request or websocket."""
     return connection.app.state.services
 

@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from app.api.schemas.common import Problem, ProblemPointer
+from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
 
 _log = logging.getLogger(__name__)
@@ -40,6 +41,8 @@ STATUS_OF_KIND = {
     "ProcessUnavailable": 503,
     "ProcessHangs": 503,
     "ProcessBusy": 503,
+    "ProcessFrozen": 503,
+    "TooManyStreams": 503,
     "CannotStore": 507,
     "StorageFull": 507,
     "UploadNotStored": 507,
@@ -48,6 +51,7 @@ STATUS_OF_KIND = {
     "InternalError": 500,
     "NotFound": 404,
 }
+_MOST_POINTERS = 20  # mistakes that are told of one request
 _TITLES = {
     400: "Bad request",
     401: "Token needed",
@@ -108,17 +112,18 @@ def status_of(error: OsfError) -> int:
 
 
 def install(app: FastAPI) -> None:
-    """Make the app answer every error as a problem."""
+    """Make the app answer every error as a problem; `app.state.settings` tells which places no sentence may name."""
     app.add_exception_handler(OsfError, _on_osf_error)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(Exception, _on_defect)
 
 
-async def _on_osf_error(_: Request, error: Exception) -> ProblemResponse:
+async def _on_osf_error(request: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, OsfError)
     status = status_of(error)
-    return problem(status, str(error), headers={"Retry-After": "2"} if status in (429, 503) else None)
+    detail = without_places(str(error), request.app.state.settings.data_dir)
+    return problem(status, detail, headers={"Retry-After": "2"} if status in (429, 503) else None)
 
 
 async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
@@ -133,9 +138,10 @@ async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, RequestValidationError)
-    pointers = [_pointer(entry, error.body) for entry in error.errors()]
+    entries = error.errors()
+    pointers = [_pointer(entry, error.body) for entry in entries[:_MOST_POINTERS]]
     first = pointers[0] if pointers else ProblemPointer(pointer="#", detail="unreadable")
-    more = f" (and {len(pointers) - 1} more)" if len(pointers) > 1 else ""
+    more = f" (and {len(entries) - 1} more)" if len(entries) > 1 else ""
     return problem(422, f"{first.pointer or first.parameter}: {first.detail}{more}", pointers)
 
 

@@ -33,7 +33,7 @@ def is_allowed(frame: bytes) -> bool:
         return False
     try:
         message = msgspec.msgpack.decode(frame, type=dict[str, Any])
-    except (msgspec.DecodeError, RecursionError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return False
     kind = message.get("type")
     if not isinstance(kind, str) or kind not in _FIELDS or not message.keys() <= _FIELDS[kind]:

@@ -13,7 +13,7 @@ from app.jobs.job import Job
 from app.jobs.outcomes import JobDied, Outcome
 from app.jobs.worker import job_main
 from app.processes.messages.job_messages import CancelJob, JobCancelled, RunJob
-from app.processes.process_client import ProcessClient, ProcessUnavailable
+from app.processes.process_client import ProcessClient, ProcessFrozen, ProcessUnavailable
 from osfcore.errors import OsfError
 
 _WHO = "job"
@@ -68,7 +68,9 @@ class JobProcess:
         except FutureTimeoutError:
             return JobCancelled() if time.monotonic() > self._cancel_at else None
         except ProcessUnavailable as error:
-            return JobDied() if error.who == _WHO else error
+            if error.who != _WHO:
+                return error
+            return JobDied("was frozen and had to be ended") if isinstance(error, ProcessFrozen) else JobDied()
         except OsfError as error:
             return error
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
 from app.storage.database import Store
+from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
 
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
@@ -18,15 +20,17 @@ _log = logging.getLogger(__name__)
 
 
 class JobTable:
-    """Jobs by identifier, oldest first. Callers hold one lock around every call.
+    """Jobs by identifier, oldest first. Callers hold one lock around every call that changes something.
 
     Args:
         store: where they are kept.
+        data_dir: whose place what is told of jobs does not name.
         publish: told of every change; progress is thinned out.
     """
 
-    def __init__(self, store: Store, publish: Callable[[JobEvent], None]) -> None:
+    def __init__(self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None]) -> None:
         self._store = store
+        self._data_dir = data_dir
         self._publish = publish
         self._jobs: dict[str, Job] = {}
         self._numbers: dict[str, int] = {}
@@ -45,7 +49,8 @@ class JobTable:
 
     def all(self) -> list[Job]:
         """All jobs with their places in the queue, oldest first."""
-        return self._with_positions(self._jobs.values())
+        waiting = self._waiting()
+        return [self._told(job, waiting) for job in list(self._jobs.values())]
 
     def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
         """Some of the jobs, newest first.
@@ -55,11 +60,14 @@ class JobTable:
             before: only jobs with smaller numbers; jobs that come or go meanwhile shift nothing.
             kind: only jobs of it.
         """
-        found = [job for job in reversed(self._jobs.values()) if kind in (None, job.kind)]
-        start = 0 if before is None else bisect_right(found, -before, key=lambda job: -self._numbers[job.id])
-        shown = found[start : start + limit]
+        numbers = dict(self._numbers)  # read without a lock
+        found = [job for job in list(self._jobs.values()) if kind in (None, job.kind) and job.id in numbers]
+        found.reverse()
+        start = 0 if before is None else bisect_right(found, -before, key=lambda job: -numbers[job.id])
+        shown, waiting = found[start : start + limit], self._waiting()
         is_last = start + limit >= len(found)
-        return JobPage(tuple(self._with_positions(shown)), len(found), None if is_last else self._numbers[shown[-1].id])
+        told = tuple(self._told(job, waiting) for job in shown)
+        return JobPage(told, len(found), None if is_last else numbers[shown[-1].id])
 
     def get(self, job: str, kind: str | None = None) -> Job:
         """One job with its place in the queue.
@@ -69,13 +77,17 @@ class JobTable:
         """
         found = self._jobs.get(job)
         if found is None or kind not in (None, found.kind):
-            known = (other.id for other in reversed(self._jobs.values()) if kind in (None, other.kind))
+            known = (other.id for other in reversed(list(self._jobs.values())) if kind in (None, other.kind))
             raise UnknownName(kind or "job", job[:80], islice(known, 5))
-        return self._with_position(found)
+        return self._told(found, self._waiting() if found.state == "queued" else [])
 
     def queue(self) -> list[Job]:
         """Jobs that wait, the next one first."""
-        return [job for job in self._jobs.values() if job.state == "queued"]
+        return [job for job in list(self._jobs.values()) if job.state == "queued"]
+
+    def live(self, kind: str | None = None) -> list[Job]:
+        """Jobs of a kind, or of any, that wait, run or pause, oldest first."""
+        return [job for job in list(self._jobs.values()) if kind in (None, job.kind) and not job.is_finished]
 
     def add(self, job: Job) -> None:
         """Keep a new job, the last of all."""
@@ -119,17 +131,19 @@ class JobTable:
         for job in self.queue():
             self._keep(job)
 
-    def _with_position(self, job: Job) -> Job:
-        if job.state != "queued":
-            return job
-        return replace(job, position=1 + [other.id for other in self.queue()].index(job.id))
+    def _waiting(self) -> list[str]:
+        return [job.id for job in self.queue()]
 
-    def _with_positions(self, jobs: Iterable[Job]) -> list[Job]:
-        places = {job.id: place for place, job in enumerate(self.queue(), 1)}
-        return [replace(job, position=places[job.id]) if job.id in places else job for job in jobs]
+    def _told(self, job: Job, waiting: list[str]) -> Job:
+        """A job with its place among those that wait and without the places of this machine."""
+        error = None if job.error is None else without_places(job.error, self._data_dir)
+        told = replace(job, note=without_places(job.note, self._data_dir), error=error)
+        if job.state != "queued":  # if it is, it may have begun just now: this is read without a lock
+            return told
+        return replace(told, position=1 + waiting.index(job.id)) if job.id in waiting else told
 
     def _keep(self, job: Job) -> None:
-        shown = self._with_position(job)
+        shown = self._told(job, self._waiting())
         number = 0
         try:
             self._store.save_job(job.id, self._numbers[job.id], job_fields(job))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -25,10 +26,10 @@ class JobStopped(OsfError):
 
 
 class JobDied(OsfError):
-    """The job's process ended without a word."""
+    """The job's process ended without a word, or was frozen and ended."""
 
-    def __init__(self) -> None:
-        super().__init__("The job's process ended unexpectedly; it may have run out of memory.")
+    def __init__(self, what: str = "ended unexpectedly; it may have run out of memory") -> None:
+        super().__init__(f"The job's process {what}.")
 
 
 def after(job: Job, outcome: Outcome, folder: Path) -> Job:
@@ -53,6 +54,10 @@ def after(job: Job, outcome: Outcome, folder: Path) -> Job:
         shutil.rmtree(folder, ignore_errors=True)
         return then
     for left in folder.glob(".*"):  # half-made when it ended
-        shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):  # on a read-only disk it stays
+                left.unlink()
     files = tuple(sorted(path.name for path in folder.glob("[!.]*") if path.is_file()))
     return replace(then, files=files)

@@ -5,6 +5,8 @@ A service that stops fails the job it was running; waiting ones go on after the 
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import shutil
 import threading
 import uuid
@@ -13,26 +15,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobEvent, JobView, State, WrongJobState, ended
-from app.jobs.job_archive import TEMPORARY_PREFIX, JobArchive
+from app.jobs.job import Job, JobEvent, JobPage, State, WrongJobState, ended
+from app.jobs.job_folders import JobFolders
+from app.jobs.job_loop import JobLoop, StartProcess, forget_workshop
 from app.jobs.job_process import JobProcess
-from app.jobs.outcomes import JobStopped, Outcome, after
-from app.processes.messages.job_messages import (
-    ChangeJob,
-    JobCancelled,
-    JobRests,
-    JobStep,
-    PauseJob,
-    ResumeJob,
-    SceneCommand,
-    StepJob,
-)
+from app.jobs.job_table import JobTable
+from app.jobs.outcomes import JobStopped, after
+from app.processes.messages.job_messages import ChangeJob, PauseJob, ResumeJob, StepJob
 from app.processes.messages.scene_messages import Command
-from app.processes.process_server import Answer
-from app.storage.database import CannotStore, Store, now_utc
-from app.storage.field_files import clear_workshop
-from osfcore.errors import OsfError, UnknownName
+from app.storage.database import Store
+from osfcore.errors import OsfError
 
+_RETRY_S = 1.0  # after the job loop has failed
+_log = logging.getLogger(__name__)
 _ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
 
 
@@ -43,7 +38,7 @@ class QueueFull(OsfError):
         super().__init__(f"{limit} jobs are waiting already, which is the most; wait for one or cancel one.")
 
 
-class Jobs(JobArchive):
+class Jobs:
     """All jobs of one data directory.
 
     Args:
@@ -64,45 +59,75 @@ class Jobs(JobArchive):
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
-        start_process: Callable[[Job, Path, Path, Callable[[object], None]], JobProcess] = JobProcess,
+        start_process: StartProcess = JobProcess,
     ) -> None:
-        super().__init__(store, data_dir / "collections", publish)
         self._data_dir = data_dir
+        self._folders = JobFolders(data_dir)
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
-        self._serve = serve
-        self._start_process = start_process
-        self._run: JobProcess | None = None
-        self._is_stopping = False
-        self._thread: threading.Thread | None = None
+        self._changed = threading.Condition(threading.RLock())
+        self._table = JobTable(store, data_dir, publish)
+        self._loop = JobLoop(self._changed, self._table, data_dir, publish, serve, start_process)
 
     def start(self) -> None:
         """Take over what the store holds, remove what was left half done, and begin to work."""
-        for folder in self._root.glob(f"{TEMPORARY_PREFIX}*"):
-            shutil.rmtree(folder, ignore_errors=True)
+        self._folders.sweep()
         self._table.load()
         for job in self._table.all():
             if job.state in ("running", "paused"):
                 self._table.set(after(job, JobStopped(), self.folder(job.id)))
-        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
-        self._thread.start()
+        self._loop.start()
 
     def stop(self) -> None:
         """End the running job, which counts as failed. Calling it again does nothing."""
-        with self._changed:
-            self._is_stopping = True
-            self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        self._loop.stop()
+
+    @property
+    def problem(self) -> str | None:
+        """Why no job goes on, for people; None if all is well."""
+        return self._loop.problem
 
     # What pages and programs ask for
 
+    # (reading takes no lock: whoever writes to the disk holds it, and the event loop must not wait for that)
+
+    def all(self) -> tuple[Job, ...]:
+        """All jobs, newest first."""
+        return tuple(reversed(self._table.all()))
+
+    def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
+        """Some of the jobs, newest first, see `JobTable.page`."""
+        return self._table.page(limit, before, kind)
+
+    def get(self, job: str, kind: str | None = None) -> Job:
+        """One job.
+
+        Raises:
+            UnknownName: if there is none of this name and kind.
+        """
+        return self._table.get(job, kind)
+
+    def live(self, kind: str | None = None) -> tuple[Job, ...]:
+        """Jobs of a kind, or of any, that wait, run or pause."""
+        return tuple(self._table.live(kind))
+
+    def folder(self, job: str) -> Path:
+        """Where a job's outputs are."""
+        return self._folders.folder(job)
+
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
-        with self._changed:
-            job = self._table[self._run.id] if self._run else None
-            return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
+        run = self._loop.run
+        job = self._table[run.id] if run else None
+        return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
+
+    def inputs(self, job: str) -> Path:
+        """Where a job's inputs are, if it was given any."""
+        return self._folders.inputs(job)
+
+    def new_inputs(self) -> contextlib.AbstractContextManager[Path]:
+        """Where a folder of inputs may be made for `submit`; what no job has taken is removed."""
+        return self._folders.new_inputs()
 
     def submit(self, kind: str, params: dict[str, Any], inputs: Path | None = None) -> Job:
         """Put a job into the queue.
@@ -121,7 +146,7 @@ class Jobs(JobArchive):
                 raise QueueFull(self._max_queued)
             job = Job(uuid.uuid4().hex[:12], kind, params)
             if inputs is not None:
-                self._take(job, inputs)
+                self._folders.take(job.id, inputs)
             self._table.add(job)
             self._changed.notify_all()
             return self.get(job.id)
@@ -139,14 +164,34 @@ class Jobs(JobArchive):
                 raise WrongJobState(known, "cancelled")
             if known.state == "queued":
                 shutil.rmtree(self.folder(job), ignore_errors=True)
-                self._forget_workshop(known)
+                forget_workshop(self._data_dir, self._table, known)
                 self._table.set(ended(self._table[job], "cancelled", note="Cancelled"))
                 self._table.publish_queue()
                 return self.get(job)
-            if self._run is not None:
-                self._run.cancel(0.0 if known.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
+            if self._loop.run is not None:
+                self._loop.run.cancel(0.0 if known.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
             self._changed.wait_for(lambda: self._table[job].is_finished, wait_s)
             return self.get(job)
+
+    def forget(self, job: str) -> None:
+        """Remove a finished job for good, with all its files.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it has not finished.
+            CannotStore: if the disk refuses; then it stays.
+        """
+        with self._changed:
+            known = self.get(job)
+            if not known.is_finished:
+                raise WrongJobState(known, "removed; cancel it first")
+            aside = self._folders.put_aside(job)
+            try:
+                self._table.forget(known)
+            except OsfError:
+                self._folders.put_back(job, aside)
+                raise
+        shutil.rmtree(aside, ignore_errors=True)
 
     def pause(self, job: str) -> Job:
         """Let a running job rest after its current step.
@@ -184,127 +229,18 @@ class Jobs(JobArchive):
         """
         with self._changed:
             known = self.get(job)
-            if known.state not in ("running", "paused") or self._run is None or self._run.is_cancelled:
+            if known.state not in ("running", "paused") or self._loop.run is None or self._loop.run.is_cancelled:
                 raise WrongJobState(known, "changed")
-            self._run.order(ChangeJob(params))
+            self._loop.run.order(ChangeJob(params))
             self._table.set(replace(self._table[job], params={**known.params, **params}))
             return self.get(job)
 
     def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
         with self._changed:
             known = self.get(job)
-            if known.state != before or self._run is None or self._run.is_cancelled:
+            if known.state != before or self._loop.run is None or self._loop.run.is_cancelled:
                 raise WrongJobState(known, "paused" if after == "paused" else "resumed")
-            self._run.order(order)
-            self._run.clock.switch(is_running=after == "running")
+            self._loop.run.order(order)
+            self._loop.run.clock.switch(is_running=after == "running")
             self._table.set(replace(self._table[job], state=after, eta_s=None))
             return self.get(job)
-
-    # The working thread
-
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._is_stopping or bool(self._table.queue()))
-                if self._is_stopping:
-                    return
-                job = self._table.queue()[0]
-                try:
-                    self._begin(job)
-                except OSError as error:
-                    self._table.set(ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
-                    continue
-            self._attend()
-
-    def _begin(self, job: Job) -> None:
-        folder = self.folder(job.id)
-        if job.kind != "fetch_assets":
-            folder.mkdir(parents=True, exist_ok=True)
-        self._run = self._start_process(job, self._data_dir, folder, self._on_event)
-        self._table.set(replace(job, state="running", started_at=now_utc(), note="Starting"))
-        self._table.publish_queue()
-
-    def _attend(self) -> None:
-        """Follow the running job until its process has ended."""
-        run = self._run
-        assert run is not None
-        outcome: Outcome | None = None
-        while outcome is None:
-            outcome = run.wait()
-            with self._changed:
-                if outcome is None:
-                    self._table.flush_progress()
-                if outcome is None and self._is_stopping:
-                    outcome = JobStopped()
-        run.end()
-        self._finish(run, outcome)
-
-    def _finish(self, run: JobProcess, outcome: Outcome) -> None:
-        job = self._table[run.id]
-        if run.is_cancelled and not isinstance(outcome, dict):
-            outcome = JobCancelled()  # whatever ended it first, it was asked to
-        then = after(job, outcome, self.folder(job.id))
-        if then.state == "cancelled":
-            self._forget_workshop(job)
-        with self._changed:
-            self._run = None
-            self._table.set(then)
-            self._changed.notify_all()
-
-    def _on_event(self, event: object) -> None:
-        """Take what the running job tells, in the thread that listens to it."""
-        with self._changed:  # until it has been noted which job that is
-            run = self._run
-        assert run is not None
-        match event:
-            case JobStep():
-                self._progress(run, event)
-            case SceneCommand():
-                self._answer(run, event)
-            case JobRests():
-                self._rest(run)
-
-    def _progress(self, run: JobProcess, step: JobStep) -> None:
-        with self._changed:
-            eta_s = run.clock.left_s(step.done, step.total)
-            job = self._table[run.id]
-            result = step.result or None
-            job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
-            self._table.set_progress(job)
-        if step.view is not None:
-            self._publish(JobView(job, step.view))
-
-    def _answer(self, run: JobProcess, asked: SceneCommand) -> None:
-        """Carry out what a job asks for, with the scene that it drives and no other."""
-        scene = self._table[run.id].params.get("scene")
-        try:
-            if self._serve is None or asked.command.id != scene:
-                raise UnknownName("scene of this job", asked.command.id, [str(scene)])
-            answer = Answer(0, self._serve(asked.command))
-        except OsfError as error:
-            answer = Answer(0, error=error)
-        run.order(answer)
-
-    def _rest(self, run: JobProcess) -> None:
-        """The job has come to the end of a round, and waits."""
-        with self._changed:
-            run.clock.switch(is_running=False)
-            self._table.set(replace(self._table[run.id], state="paused", eta_s=None))
-
-    # Folders
-
-    def _take(self, job: Job, inputs: Path) -> None:
-        place = self.inputs(job.id)
-        try:
-            place.parent.mkdir(parents=True)
-            inputs.rename(place)
-        except OSError as error:
-            raise CannotStore(place, error.strerror or str(error)) from error
-
-    def _forget_workshop(self, job: Job) -> None:
-        """Remove what a cancelled training would find at its next try, unless another works there."""
-        if job.kind != "train_field":
-            return
-        name = job.params["name"]
-        if not any(other.id != job.id and other.params["name"] == name for other in self.live("train_field")):
-            clear_workshop(self._data_dir, name)

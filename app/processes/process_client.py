@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import itertools
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -14,15 +16,17 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, Literal
 
 from app.processes.child_process import end, launch
-from app.processes.process_server import Answer, Logged, Overtaken, Ready, child_main
+from app.processes.outbox import Outbox
+from app.processes.process_server import Alive, Answer, Logged, Overtaken, Ready, child_main
 from app.processes.request_queue import Request
+from app.processes.watchdog import Watchdog
 from osfcore.errors import OsfError
 
 Status = Literal["starting", "ready", "restarting"]
 MAX_PENDING = 64
 ANSWER_S = 180.0  # compiling on a busy machine takes longest
-_CHECK_S = 1.0  # how often it is checked that the process still answers
-_RESTART_PAUSES_S = (0.0, 1.0, 5.0, 30.0)  # longer and longer while it keeps dying without answering anything
+WARM_ANSWER_S = 60.0  # once everything is compiled
+_RESTART_PAUSES_S = (0.0, 1.0, 2.0, 5.0)  # longer and longer while it keeps dying without answering anything
 _log = logging.getLogger(__name__)
 
 
@@ -41,6 +45,13 @@ class ProcessHangs(ProcessUnavailable):
         super().__init__(who, f"did not answer within {answer_s:g} s and is being restarted")
 
 
+class ProcessFrozen(ProcessUnavailable):
+    """A process that shows no sign of life, and is killed."""
+
+    def __init__(self, who: str) -> None:
+        super().__init__(who, "was frozen and is being restarted")
+
+
 class ProcessBusy(OsfError):
     """More requests wait than make sense."""
 
@@ -53,16 +64,17 @@ def _ignore(_: object = None) -> None:
 
 
 class ProcessClient:
-    """A child process and the thread that listens to it.
+    """A child process, and threads that listen to it, write to it and watch it. Nobody who sends waits for it.
 
-    A process that does not answer anybody for `answer_s` while requests wait is killed. One that has died is started
-    again, after a pause that grows while it keeps dying: at once if `keeps_running`, else with the next request.
+    A process that does not answer anybody for `answer_s` while requests wait is killed, as is one that shows no sign of
+    life (see `Watchdog`). One that has died is started again, after a pause that grows while it keeps dying: at once if
+    `keeps_running`, else with the next request.
 
     Args:
         target: what the process runs: `target(server, *arguments)`, a function of a module.
         arguments: of the target, besides its `ProcessServer`.
         who: what people call the process.
-        answer_s: how long it may answer nobody while requests wait [s].
+        answer_s: how long it may answer nobody while requests wait [s]; at most a minute once it has answered.
         keeps_running: whether it is to run from `start` to `stop`; otherwise from the first request on.
         greeting: commands that come before all others whenever it has been started.
         on_event: called from the listening thread with everything that is no answer; must be quick.
@@ -86,18 +98,18 @@ class ProcessClient:
         self._answer_s = answer_s
         self._keeps_running = keeps_running
         self._greeting, self._on_event, self._on_lost = greeting, on_event, on_lost
-        self._launch_lock = threading.RLock()  # taken before the others
-        self._send_lock = threading.Lock()
-        self._lock = threading.Lock()  # never held while sending: the listener needs it to take answers
+        self._launch_lock = threading.RLock()  # taken before the other
+        self._lock = threading.Lock()
         self._numbers = itertools.count(1)
         self._pending: dict[int, Future[Any]] = {}
         self._process: SpawnProcess | None = None
-        self._connection: Connection | None = None
+        self._outbox: Outbox | None = None  # of the process that runs now
+        self._watchdog: Watchdog | None = None
+        self._verdict: ProcessUnavailable | None = None  # why it was killed
         self._listener: threading.Thread | None = None
         self._stopping = threading.Event()
         self._deaths, self._died_at = 0, 0.0
-        self._heard_at = 0.0  # when it last answered, or was asked after all had been answered
-        self._is_warm = False
+        self._is_loading, self._is_warm = True, False
         self.status: Status = "starting"
 
     @property
@@ -117,7 +129,7 @@ class ProcessClient:
             OSError: if there can be no more processes.
         """
         with self._launch_lock:
-            if self._connection is None and not self._stopping.is_set():
+            if self._outbox is None and not self._stopping.is_set():
                 self._launch()
 
     def stop(self, grace_s: float = 0.0) -> None:
@@ -135,18 +147,18 @@ class ProcessClient:
         """Send a command; the future raises what the process raised, ProcessUnavailable or ProcessBusy."""
         future: Future[Any] = Future()
         try:
-            connection, number = self._register(future)
+            outbox, number = self._register(future)
         except OsfError as refusal:
             future.set_exception(refusal)
             return future
-        if not self._send(connection, Request(number, command)):
+        if not outbox.put(Request(number, command)):
             self._settle(number, error=self._unavailable("stopped unexpectedly"))
         return future
 
     def notify(self, message: object) -> bool:
         """Send a message that has no answer; returns whether the process was there."""
-        connection = self._connection
-        return connection is not None and self._send(connection, message)
+        outbox = self._outbox
+        return outbox is not None and outbox.put(message)
 
     def call(self, command: object) -> Any:  # noqa: ANN401  each command says what answers it
         """Send a command and wait for its answer.
@@ -159,37 +171,33 @@ class ProcessClient:
 
     async def call_async(self, command: object) -> Any:  # noqa: ANN401
         """The same without blocking the event loop."""
-        return await asyncio.wrap_future(await asyncio.to_thread(self.submit, command))
+        is_there = self._keeps_running or self._outbox is not None  # else starting it takes a while
+        return await asyncio.wrap_future(
+            self.submit(command) if is_there else await asyncio.to_thread(self.submit, command)
+        )
 
     # Requests
 
-    def _register(self, future: Future[Any]) -> tuple[Connection, int]:
+    def _register(self, future: Future[Any]) -> tuple[Outbox, int]:
         """Where to send a command, and the number of its answer."""
         if self._stopping.is_set():
             raise ProcessUnavailable(self._who, "was stopped")
         if len(self._pending) >= MAX_PENDING:
             raise ProcessBusy(self._who)
-        if not self._keeps_running and self._connection is None:
+        if not self._keeps_running and self._outbox is None:
             with self._launch_lock:
                 if time.monotonic() - self._died_at < self._pause_s():
                     raise ProcessUnavailable(self._who, "keeps stopping")
-                self.start()
+                try:
+                    self.start()
+                except OSError as error:
+                    raise ProcessUnavailable(self._who, f"cannot be started ({error.strerror})") from error
         with self._lock:
-            if self._connection is None:
+            if self._outbox is None:
                 raise self._unavailable("is not running")
             number = next(self._numbers)
-            if not self._pending:
-                self._heard_at = time.monotonic()
             self._pending[number] = future
-            return self._connection, number
-
-    def _send(self, connection: Connection, message: object) -> bool:
-        try:
-            with self._send_lock:
-                connection.send(message)
-        except OSError:  # the listening thread sees the end as well
-            return False
-        return True
+            return self._outbox, number
 
     def _settle(self, number: int, value: object = None, error: OsfError | None = None) -> None:
         with self._lock:
@@ -216,58 +224,92 @@ class ProcessClient:
     def _launch(self) -> None:
         greeting = [Request(0, command) for command in self._greeting()]
         process, connection = launch(child_main, f"osf-{self._who.replace(' ', '-')}", *self._child)
-        with self._send_lock:  # whatever is sent from now on comes after the greeting
-            with self._lock:
-                self._process, self._connection, self._is_warm = process, connection, False
-            try:
-                for request in greeting:
-                    connection.send(request)
-            except OSError:
-                pass  # the listening thread sees the end as well
-        self._listener = threading.Thread(target=self._listen, args=(process, connection), daemon=True)
-        self._listener.start()
-
-    def _listen(self, process: SpawnProcess, connection: Connection) -> None:
-        hangs = False
+        self._process, self._is_loading, self._is_warm, self._verdict = process, True, False, None
         try:
-            while not hangs:
-                if connection.poll(min(_CHECK_S, self._answer_s)):
-                    self._take(connection.recv())
-                else:  # waiting behind others is no sign of hanging, so any answer counts
-                    hangs = bool(self._pending) and time.monotonic() - self._heard_at > self._answer_s
-        except (EOFError, OSError):
-            pass
+            outbox = Outbox(connection)
+            for request in greeting:  # whatever is sent from now on comes after it
+                outbox.put(request)
+            self._outbox = outbox
+            self._watchdog = Watchdog(process.pid or 0, self._patience_s, lambda: bool(self._pending), self._kill)
+            self._listener = threading.Thread(target=self._listen, args=(process, connection), daemon=True)
+            self._listener.start()
+        except RuntimeError as error:  # no more threads
+            self._fail(self._forget(process, connection), self._unavailable("could not be started"))
+            raise OSError(errno.EAGAIN, str(error)) from error
+
+    def _patience_s(self) -> float:
+        """How long it may answer nobody now: loading comes first, and compiling with the first answer."""
+        if self._is_loading:
+            return max(self._answer_s, ANSWER_S)
+        return min(self._answer_s, WARM_ANSWER_S) if self._is_warm and math.isfinite(self._answer_s) else self._answer_s
+
+    def _kill(self, is_frozen: bool) -> None:
+        """End a process that shows no sign of life; the listening thread does the rest."""
+        process = self._process
+        if process is not None:
+            self._verdict = ProcessFrozen(self._who) if is_frozen else ProcessHangs(self._who, self._patience_s())
+            _log.error("%s", self._verdict)
+            end(process)
+
+    def _forget(self, process: SpawnProcess, connection: Connection) -> list[int]:
+        """Take note that the process has ended; returns the requests that it has not answered."""
         with self._lock:
-            self._connection, lost = None, list(self._pending)
+            outbox, watchdog, lost = self._outbox, self._watchdog, list(self._pending)
+            self._outbox = self._watchdog = None
             self._deaths += 1
             self._died_at = time.monotonic()
+        if watchdog is not None:
+            watchdog.stop()
         end(process)
+        if outbox is not None:
+            outbox.stop()
         connection.close()
+        return lost
+
+    def _listen(self, process: SpawnProcess, connection: Connection) -> None:
+        try:
+            while True:
+                self._take(connection.recv())
+        except (EOFError, OSError):
+            pass
+        except Exception:  # this thread must not end before it has brought the process to its end
+            _log.exception("a message of the %s could not be read", self._who)
+        lost = self._forget(process, connection)
         if self._stopping.is_set():
             return
         self.status = "restarting"
         _log.error("the %s ended unexpectedly (exit code %s)", self._who, process.exitcode)
-        self._fail(
-            lost, ProcessHangs(self._who, self._answer_s) if hangs else self._unavailable("stopped unexpectedly")
-        )
+        self._fail(lost, self._verdict or self._unavailable("stopped unexpectedly"))
         self._on_lost()
         while self._keeps_running and not self._stopping.wait(self._pause_s()):
             try:
                 return self.start()
-            except OSError as error:
+            except Exception as error:  # descriptors, threads or memory that are short now may be there again soon
                 _log.error("the %s could not be started: %s", self._who, error)
                 self._deaths += 1
 
     def _take(self, message: object) -> None:
+        watchdog = self._watchdog
+        if watchdog is not None:
+            watchdog.spoken()
         match message:
+            case Alive():
+                pass
             case Ready():
-                self.status = "ready"
+                self.status, self._is_loading = "ready", False
+                if watchdog is not None:
+                    watchdog.answered()
             case Answer(number, value, error):
-                self._heard_at, self._deaths, self._is_warm = time.monotonic(), 0, True
+                self._deaths, self._is_warm = 0, True
+                if watchdog is not None:
+                    watchdog.answered()
                 self._settle(number, value, error)
             case Logged(level, name, text):
                 logging.getLogger(name).log(level, "%s", text)
             case Overtaken(number):
                 self._settle(number)
             case _:
-                self._on_event(message)
+                try:
+                    self._on_event(message)
+                except Exception:
+                    _log.exception("what the %s told could not be used", self._who)

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import signal
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -20,6 +21,7 @@ from app.processes.request_queue import Request, RequestQueue
 from osfcore.errors import OsfError
 
 IsOvertaken = Callable[[], bool]
+ALIVE_S = 0.5
 _log = logging.getLogger(__name__)
 
 
@@ -40,6 +42,11 @@ class OutOfMemory(OsfError):
 @dataclass(frozen=True, slots=True)
 class Ready:
     """The process has loaded its libraries and takes requests."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alive:
+    """The process is neither stopped nor stuck; sent every `ALIVE_S`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,6 +93,10 @@ class ProcessServer:
         with self._lock, contextlib.suppress(OSError):
             self._connection.send(message)
 
+    def show_life(self) -> None:
+        """Tell from now on, in a thread of its own, that this process lives."""
+        threading.Thread(target=self._show_life, name="alive", daemon=True).start()
+
     def serve(
         self,
         carry_out: Callable[[Any, IsOvertaken], object],
@@ -110,6 +121,11 @@ class ProcessServer:
             request = self._queue.take(idle(not self._queue.is_empty()))
             if request is not None:
                 self.send(self._answer(carry_out, request))
+
+    def _show_life(self) -> None:
+        while not self._queue.is_closed():
+            self.send(Alive())
+            time.sleep(ALIVE_S)
 
     def _receive(self, on_message: Callable[[object], None], on_lost: Callable[[], None]) -> None:
         with contextlib.suppress(EOFError, OSError):
@@ -167,4 +183,5 @@ def child_main(connection: Connection, target: Callable[..., None], who: str, *a
     server = ProcessServer(connection, who)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[PipeHandler(server)])
     logging.captureWarnings(True)
+    server.show_life()  # before the target loads what it needs
     target(server, *arguments)

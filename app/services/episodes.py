@@ -176,12 +176,13 @@ class Episodes:
             CorruptFile: if it is damaged.
         """
         path = self._folder(job) / FRAMES_FOLDER / f"{step:03d}.png"
-        if not path.is_file():
+        try:
+            whole = path.read_bytes()
+        except FileNotFoundError:
             count = len(list(path.parent.glob("[0-9]*.png")))
-            raise UnknownName("frame", str(step), [f"0 to {count - 1}"] if count else ["none yet"])
-        if part == "all":
-            return path.read_bytes()
-        return encode_png(part_of(read_frame(path), part))
+            known = [f"0 to {count - 1}"] if count else ["none yet"]
+            raise UnknownName("frame", str(step), known) from None
+        return whole if part == "all" else encode_png(part_of(read_frame(path), part))
 
     def files(self, job: Job) -> tuple[str, ...]:
         """Names that can be downloaded now; those of an episode that was broken off are made when they are."""

@@ -177,7 +177,7 @@ class Estimates:
         return self._runner.submit_with_inputs(KIND, params, folder)
 
     def _prior(self, asked: Asked, names: tuple[str, ...], scene: str | None) -> EstimatedState:
-        """The estimate to begin with, its objects in the order of `names`."""
+        """The estimate to begin with, of the same objects, in whatever order."""
         if asked.prior is not None:
             job = self.get(asked.prior)
             if job.state != "done":
@@ -190,7 +190,7 @@ class Estimates:
             if job is None:
                 raise NoPrior(asked.mode, "of this scene")
         prior = self._state(job)
-        if prior.state.names != names:
+        if set(prior.state.names) != set(names):
             raise InvalidInput(f"objects of estimate {job.id}", ", ".join(prior.state.names), ", ".join(names))
         return prior
 
@@ -255,7 +255,10 @@ class Estimates:
         if step is not None and not 1 <= step <= len(steps):
             raise UnknownName("step", str(step), [f"1 to {len(steps)}"])
         state = state_of_step(steps[-1 if step is None else step - 1])
-        return CompareView(uuid.uuid4().hex, state, camera, image.read_bytes())
+        try:
+            return CompareView(uuid.uuid4().hex, state, camera, image.read_bytes())
+        except FileNotFoundError:
+            raise NoImages(job.id, "they have been removed from the data directory") from None
 
     def _observed(self, job: Job, view: int) -> tuple[Camera, Path]:
         names = job.params["cameras"]

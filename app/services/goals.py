@@ -14,7 +14,7 @@ from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal
 from app.services.runner import Runner
 from app.storage.database import now_utc
 from app.storage.goal_store import GoalRecord, GoalStore, Poses, Source
-from app.storage.photos import read_photo
+from app.storage.photos import PhotoReader
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -77,12 +77,13 @@ class Goals:
         runner: holds the scenes, and tells everybody what has changed.
         data_dir: of the service.
         max_goals: kept at once.
+        photos: decodes what is uploaded.
     """
 
-    def __init__(self, runner: Runner, data_dir: Path, max_goals: int) -> None:
+    def __init__(self, runner: Runner, data_dir: Path, max_goals: int, photos: PhotoReader) -> None:
         self._runner = runner
         self._store = GoalStore(data_dir / "goals", max_goals)
-        self._decoding = threading.Lock()  # one at a time: photos take much memory
+        self._photos = photos
         self._drafting = threading.RLock()
         self._draft: Draft | None = None
         self._draft_png = b""
@@ -130,12 +131,12 @@ class Goals:
 
         Raises:
             PhotoRefused: if it cannot be used.
+            ProcessUnavailable: if what decodes it died.
             InvalidInput: if its sides are not in the proportion of the camera's.
             TooManyGoals: if there are too many.
             StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
-        with self._decoding:
-            pixels = read_photo(data)
+        pixels = self._photos.read(data)
         height, width = pixels.shape[:2]
         camera = camera or goal_camera()
         if abs(width * camera.height / (height * camera.width) - 1) > 0.01:  # scaling down rounds
@@ -246,9 +247,8 @@ class Goals:
         Raises:
             NoDraft: if there is none.
         """
-        with self._drafting:
-            self._require_draft()
-            return self._draft_png
+        self._require_draft()
+        return self._draft_png
 
     def keep_draft(self, name: str) -> GoalRecord:
         """Keep the draft as a goal, and end it.

@@ -114,8 +114,7 @@ class Scenes:
 
     def scenes(self) -> tuple[SceneRecord, ...]:
         """All scenes, oldest first."""
-        with self._lock:
-            return tuple(self._records.values())
+        return tuple(self._records.values())  # without the lock: whoever writes to the disk holds it
 
     @property
     def current(self) -> str | None:
@@ -124,10 +123,10 @@ class Scenes:
 
     def scene(self, scene: str) -> SceneRecord:
         """One scene; raises UnknownName if there is none."""
-        with self._lock:
-            if scene not in self._records:
-                raise UnknownName("scene", scene, self._records)
-            return self._records[scene]
+        record = self._records.get(scene)
+        if record is None:
+            raise UnknownName("scene", scene, tuple(self._records))
+        return record
 
     # Changing
 

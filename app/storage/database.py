@@ -5,34 +5,31 @@ One process at a time: a lock file keeps a second service out, which would take 
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import fcntl
 import json
+import logging
 import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
+
+from pydantic import FiniteFloat, StrictInt
 
 from app.processes.messages.scene_messages import SceneRecord
-from osfcore.errors import CorruptFile, OsfError
+from app.storage.schema import SCHEMA_VERSION, open_database
+from osfcore.errors import OsfError
 from osfcore.geometry.states import SceneState
-from osfcore.io.json_codec import decode, encode
+from osfcore.io.json_codec import Text, decode, encode
 from osfcore.io.scene_file import StateJson
 
 FILE = "service.sqlite3"
-SCHEMA_VERSION = 1
-_APPLICATION_ID = 0x4F534631  # "OSF1"
-_SCHEMA = """
-CREATE TABLE scenes (
-    id TEXT PRIMARY KEY, seed INTEGER NOT NULL, created_at TEXT NOT NULL, image_size INTEGER NOT NULL,
-    initial TEXT NOT NULL, state TEXT NOT NULL, time_s REAL NOT NULL, revision INTEGER NOT NULL,
-    is_current INTEGER NOT NULL DEFAULT 0
-);
-CREATE TABLE jobs (id TEXT PRIMARY KEY, number INTEGER NOT NULL, job TEXT NOT NULL);
-CREATE TABLE events (id INTEGER PRIMARY KEY AUTOINCREMENT, job TEXT NOT NULL);
-"""
+_log = logging.getLogger(__name__)
 
 
 class DataDirectoryInUse(OsfError):
@@ -63,8 +60,12 @@ class Store:
 
     Raises:
         DataDirectoryInUse: if another service has it.
-        CorruptFile: if the file is damaged, not ours, or a newer version's; it is left as it is.
+        CorruptFile: if the file is another program's; it is left as it is.
         CannotStore: if the directory cannot be written.
+
+    Attributes:
+        problem: why the latest write failed, for people; None if it did not.
+        oddities: what had to be put aside since the start, a sentence each.
     """
 
     def __init__(self, data_dir: Path, max_events: int = 1000) -> None:
@@ -73,10 +74,12 @@ class Store:
         self._lock = threading.Lock()
         self._lock_file = self._claim(data_dir)
         try:
-            self._database = self._open()
+            self._database, put_aside = self._open()
         except BaseException:
             self._lock_file.close()
             raise
+        self.problem: str | None = None
+        self.oddities: list[str] = [] if put_aside is None else [put_aside]
 
     def close(self) -> None:
         """Close the file and let others use the directory. Calling it again does nothing."""
@@ -98,50 +101,42 @@ class Store:
             raise DataDirectoryInUse(data_dir) from error
         return file
 
-    def _open(self) -> sqlite3.Connection:
-        database = sqlite3.connect(self._path, check_same_thread=False, isolation_level=None)
+    def _open(self) -> tuple[sqlite3.Connection, str | None]:
         try:
-            version = database.execute("PRAGMA user_version").fetchone()[0]
-            owner = database.execute("PRAGMA application_id").fetchone()[0]
-            tables = database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-            if tables and owner != _APPLICATION_ID:
-                raise CorruptFile(self._path, "it is another program's database; move it away")
-            if version > SCHEMA_VERSION:
-                formats = f"format {version}, this one knows {SCHEMA_VERSION}"
-                raise CorruptFile(self._path, f"a newer version wrote it ({formats}); update, or move it away")
-            if tables and database.execute("PRAGMA quick_check").fetchone()[0] != "ok":
-                raise CorruptFile(self._path, "it is damaged; move it away to start with an empty one")
-            database.execute("PRAGMA journal_mode = WAL")
-            database.execute("PRAGMA synchronous = NORMAL")
-            if not tables:
-                database.executescript(
-                    f"BEGIN; PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
-                    f"{_SCHEMA} COMMIT;"
-                )
-        except sqlite3.OperationalError as error:
-            database.close()
+            return open_database(self._path)
+        except (sqlite3.Error, OSError) as error:
             raise CannotStore(self._path, str(error)) from error
-        except sqlite3.DatabaseError as error:
-            database.close()
-            raise CorruptFile(self._path, "it is damaged; move it away to start with an empty one") from error
-        except BaseException:
-            database.close()
-            raise
-        return database
 
     @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
+    def _transaction(self, begin: str) -> Iterator[sqlite3.Connection]:
         with self._lock:
             try:
-                self._database.execute("BEGIN IMMEDIATE")
+                self._database.execute(begin)
                 try:
                     yield self._database
+                    self._database.execute("COMMIT")
                 except BaseException:
-                    self._database.execute("ROLLBACK")
+                    if self._database.in_transaction:
+                        self._database.execute("ROLLBACK")
                     raise
-                self._database.execute("COMMIT")
             except sqlite3.DatabaseError as error:
                 raise CannotStore(self._path, str(error)) from error
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with self._transaction("BEGIN IMMEDIATE") as database:
+                yield database
+        except CannotStore as error:
+            self.problem = str(error)
+            raise
+        self.problem = None
+
+    def probe(self) -> None:
+        """Write something that changes nothing, to see whether the database can be written again."""
+        with contextlib.suppress(CannotStore), self._writing() as database:
+            database.execute("DELETE FROM events WHERE id < 0")
+            database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     # Scenes
 
@@ -157,7 +152,7 @@ class Store:
             record.time_s,
             record.revision,
         )
-        with self._transaction() as database:
+        with self._writing() as database:
             database.execute(
                 "INSERT INTO scenes (id, seed, created_at, image_size, initial, state, time_s, revision)"
                 " VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET state = excluded.state,"
@@ -167,55 +162,64 @@ class Store:
 
     def delete_scene(self, scene: str) -> None:
         """Forget a scene."""
-        with self._transaction() as database:
+        with self._writing() as database:
             database.execute("DELETE FROM scenes WHERE id = ?", (scene,))
 
     def set_current(self, scene: str | None) -> None:
         """Remember which scene is shown."""
-        with self._transaction() as database:
+        with self._writing() as database:
             database.execute("UPDATE scenes SET is_current = (id IS ?)", (scene,))
 
     def scenes(self) -> tuple[tuple[SceneRecord, ...], str | None]:
-        """All scenes, oldest first, and the one that is shown.
-
-        Raises:
-            CorruptFile: if a row makes no sense.
-        """
-        with self._transaction() as database:
+        """All scenes, oldest first, and the one that is shown; rows that make no sense are set aside."""
+        with self._transaction("BEGIN") as database:
             rows = database.execute(
                 "SELECT id, seed, created_at, image_size, initial, state, time_s, revision, is_current"
                 " FROM scenes ORDER BY created_at, rowid"
             ).fetchall()
-        try:
-            records = tuple(_record_from_row(row) for row in rows)
-        except (KeyError, TypeError, ValueError) as error:
-            raise CorruptFile(self._path, f"a stored scene makes no sense ({error})") from error
-        return records, next((row[0] for row in rows if row[8]), None)
+        records = []
+        for row in rows:
+            try:
+                records.append(_record_from_row(row))
+            except (TypeError, ValueError, RecursionError) as error:
+                self.set_aside("scene", str(row[0]), str(error))
+        return tuple(records), next((row[0] for row in rows if row[8]), None)
 
     # Jobs and events
 
-    def save_job(self, job: str, number: int, fields: dict[str, Any]) -> None:
-        """Insert or update a job.
+    def save_job(self, job: str, number: int, fields: dict[str, Any], event: dict[str, Any] | None = None) -> int:
+        """Insert or update a job, and remember how it was, both or neither.
 
         Args:
             job: identifier.
             number: orders the jobs; an update leaves it.
             fields: as JSON.
+            event: as in `add_event`; None for no event.
+
+        Returns:
+            The event's number; 0 without an event.
 
         Raises:
             CannotStore: if the disk is full.
         """
-        with self._transaction() as database:
+        with self._writing() as database:
             database.execute(
                 "INSERT INTO jobs VALUES (?, ?, ?) ON CONFLICT (id) DO UPDATE SET job = excluded.job",
                 (job, number, json.dumps(fields)),
             )
+            return 0 if event is None else self._add_event(database, event)
 
     def jobs(self) -> tuple[tuple[int, dict[str, Any]], ...]:
-        """Numbers and fields of all jobs, oldest first."""
-        with self._transaction() as database:
-            rows = database.execute("SELECT number, job FROM jobs ORDER BY number").fetchall()
-        return tuple((number, json.loads(text)) for number, text in rows)
+        """Numbers and fields of all jobs, oldest first; rows that are no JSON objects are set aside."""
+        with self._transaction("BEGIN") as database:
+            rows = database.execute("SELECT id, number, job FROM jobs ORDER BY number").fetchall()
+        jobs = []
+        for job, number, text in rows:
+            try:
+                jobs.append((int(number), _fields(text)))
+            except (TypeError, ValueError, RecursionError) as error:
+                self.set_aside("job", str(job), str(error))
+        return tuple(jobs)
 
     def forget_job(self, job: str) -> int:
         """Delete a job with its events; returns the number of the event that says so.
@@ -223,31 +227,76 @@ class Store:
         Raises:
             CannotStore: if the disk refuses; then nothing is deleted.
         """
-        with self._transaction() as database:
+        its_id = "CASE WHEN json_valid(job) THEN json_extract(job, '$.id') END"
+        with self._writing() as database:
             database.execute("DELETE FROM jobs WHERE id = ?", (job,))
-            database.execute("DELETE FROM events WHERE json_extract(job, '$.id') = ?", (job,))
-            fields = json.dumps({"forgotten": job})
-            return database.execute("INSERT INTO events (job) VALUES (?)", (fields,)).lastrowid or 0
+            database.execute(f"DELETE FROM events WHERE {its_id} = ?", (job,))
+            return self._add_event(database, {"forgotten": job})
 
     def add_event(self, fields: dict[str, Any]) -> int:
         """Remember how a job was; returns the event's number. Old events are dropped."""
-        with self._transaction() as database:
-            number = database.execute("INSERT INTO events (job) VALUES (?)", (json.dumps(fields),)).lastrowid or 0
-            database.execute("DELETE FROM events WHERE id <= ?", (number - self._max_events,))
+        with self._writing() as database:
+            return self._add_event(database, fields)
+
+    def _add_event(self, database: sqlite3.Connection, fields: dict[str, Any]) -> int:
+        number = database.execute("INSERT INTO events (job) VALUES (?)", (json.dumps(fields),)).lastrowid or 0
+        database.execute("DELETE FROM events WHERE id <= ?", (number - self._max_events,))
         return number
 
     def events_after(self, number: int) -> tuple[tuple[int, dict[str, Any]], ...]:
-        """Events later than `number`, as far as they are kept, in order."""
-        with self._transaction() as database:
+        """Events later than `number`, as far as they are kept and make sense, in order."""
+        with self._transaction("BEGIN") as database:
             rows = database.execute("SELECT id, job FROM events WHERE id > ? ORDER BY id", (number,)).fetchall()
-        return tuple((event, json.loads(text)) for event, text in rows)
+        events = []
+        for event, text in rows:
+            with contextlib.suppress(TypeError, ValueError, RecursionError):
+                events.append((event, _fields(text)))
+        return tuple(events)
+
+    def set_aside(self, kind: Literal["scene", "job"], name: str, reason: str) -> None:
+        """Move a row that makes no sense to where nobody reads it, and tell of it.
+
+        Args:
+            kind: which table it is in.
+            name: identifier of the row.
+            reason: why it makes no sense.
+        """
+        sentence = f"A stored {kind} ({name[:40]}) makes no sense to this version and was set aside: {reason[:200]}"
+        self.oddities.append(sentence)
+        _log.warning("%s", sentence)
+        table = {"scene": "scenes", "job": "jobs"}[kind]
+        with contextlib.suppress(CannotStore), self._writing() as database:  # else the next start tries again
+            cursor = database.execute(f"SELECT * FROM {table} WHERE id = ?", (name,))
+            names = [column[0] for column in cursor.description]
+            for row in cursor.fetchall():
+                text = json.dumps(dict(zip(names, row, strict=True)), default=repr)
+                database.execute("INSERT INTO set_aside VALUES (?, ?, ?, ?, ?)", (kind, name, text, reason, now_utc()))
+            database.execute(f"DELETE FROM {table} WHERE id = ?", (name,))
+
+
+def _fields(text: str) -> dict[str, Any]:
+    fields = json.loads(text)
+    if not isinstance(fields, dict):
+        raise TypeError("it is no JSON object")
+    return fields
+
+
+@dataclass(frozen=True, slots=True)
+class _SceneRow:
+    id: Text
+    seed: StrictInt
+    created_at: Text
+    image_size: StrictInt
+    time_s: FiniteFloat
+    revision: StrictInt
 
 
 def _record_from_row(row: tuple[Any, ...]) -> SceneRecord:
     scene, seed, created_at, image_size, initial, state, time_s, revision, _ = row
-    return SceneRecord(
-        scene, seed, created_at, image_size, _state_from_json(initial), _state_from_json(state), time_s, revision
-    )
+    facts = (scene, seed, created_at, image_size, time_s, revision)
+    names = (field.name for field in dataclasses.fields(_SceneRow))
+    checked = decode(_SceneRow, dict(zip(names, facts, strict=True)), "scene")
+    return SceneRecord(**dataclasses.asdict(checked), initial=_state_from_json(initial), state=_state_from_json(state))
 
 
 def _state_from_json(text: str) -> SceneState:

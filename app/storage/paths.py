@@ -1,6 +1,7 @@
-"""Where data lies on this machine."""
+"""Where data lies on this machine, and how sentences name it to those who need not know."""
 
 import os
+import re
 from pathlib import Path
 
 import platformdirs
@@ -17,3 +18,20 @@ def static_folder() -> Path:
     here = Path(__file__).parents[1]
     packaged = here / "static"
     return packaged if packaged.is_dir() else here.parent / "static"
+
+
+def without_places(text: str, data_dir: Path) -> str:
+    """A sentence in which paths begin at the data directory or at the program's packages, instead of at the root."""
+    if "/" not in text:
+        return text
+    for place in dict.fromkeys((data_dir.absolute(), data_dir.resolve())):
+        text = _from(place, "the data directory", text)
+    return _from(Path(__file__).parents[2], "the program", text)
+
+
+def _from(place: Path, name: str, text: str) -> str:
+    """The text with paths from a place on, and with a name for the place itself."""
+    path = rf"(?<![\w./-]){re.escape(str(place))}"
+    text = re.sub(f"{path}/", "", text)
+    text = re.sub(rf"{path}(?![\w-]|\.\w)", name, text)
+    return text[:1].upper() + text[1:] if text.startswith(name) else text

@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 from starlette.concurrency import run_in_threadpool
 
-from app.processes.child_process import own_group
+from app.processes.child_process import limit_memory, own_group
 from app.processes.process_client import ProcessClient, ProcessHangs, ProcessUnavailable
 from app.processes.process_server import ProcessServer
 from app.storage.database import CannotStore
@@ -22,6 +22,7 @@ from osfcore.errors import CannotWrite, OsfError
 
 _WRITE_BYTES = 1 << 20
 _PATIENCE_S = 600.0
+_MEMORY_BYTES = 4 << 30  # the largest set that is read takes 3.4 GB
 Found = TypeVar("Found")
 
 
@@ -121,4 +122,5 @@ class Examiner(Generic[Found]):
 def examiner_main(server: ProcessServer, look: Callable[[Path], object]) -> None:
     """Look at the folder that is asked for."""
     own_group()
+    limit_memory(_MEMORY_BYTES)
     server.serve(lambda folder, _: look(folder))

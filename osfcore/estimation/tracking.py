@@ -119,14 +119,14 @@ def estimate_next(
         expected: the last estimate, or what was predicted from it, with the light as last estimated.
         rng: of the search.
         config: how much work to do.
-        usual: residuals that are normal for these objects here, see `expected_residuals`; none are expected by default.
+        usual: residuals that are normal for the observation's objects, see `expected_residuals`; 0 by default.
 
     Raises:
         InvalidInput: if the expected state is of other objects.
         UnknownName: if an object has no field.
     """
     models.check(observation.names)
-    if expected.names != observation.names:
+    if set(expected.names) != set(observation.names):
         raise InvalidInput("objects of the expected state", ", ".join(expected.names), ", ".join(observation.names))
     allowed = np.zeros(len(expected.names)) if usual is None else _ALLOWANCE * np.minimum(usual, _MOST_USUAL)
     yield from _Tracker(models, observation, expected, rng, config or TrackingConfig(), allowed).steps()
@@ -146,7 +146,7 @@ class _Tracker:
     ) -> None:
         self._allowed = allowed
         self._models, self._rng, self._config = models, rng, config
-        self._initial = SceneParameters.of(expected, observation.pusher)
+        self._initial = SceneParameters.of(expected.reordered(observation.names), observation.pusher)
         self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._fine = views_of(observation, FINE_SIDE, samples=2)
         self._sharp = views_of(observation, FINE_SIDE)

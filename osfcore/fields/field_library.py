@@ -97,7 +97,10 @@ class FieldLibrary:
         """
         if not self.has(name):
             raise UnknownName("field", name, self.names())
-        return self._info(name)
+        try:
+            return self._info(name)
+        except FileNotFoundError:  # it has just been deleted
+            raise UnknownName("field", name, self.names()) from None
 
     def _info(self, name: str) -> FieldInfo:
         trained = None if self._trained is None else self._trained / name / FIELD_FILE

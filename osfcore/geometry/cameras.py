@@ -76,7 +76,8 @@ class Camera:
             target: what appears in the middle of the image [m].
             size: sides of the image [px].
             fov_y_deg: angle of view, vertical and horizontal [deg].
-            up: world direction that points upwards in the image; world y takes its place for a view along it.
+            up: world direction that points upwards in the image; world y takes its place for a view along it, and
+                world z for a view along both.
 
         Raises:
             InvalidInput: if both points coincide or are not finite, or `size` is outside 16 to 1024.
@@ -88,7 +89,7 @@ class Camera:
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, up)
         if np.linalg.norm(right) < 1e-9:  # looking along `up`: any direction serves as the image's top
-            right = np.cross(forward, (0.0, 1.0, 0.0))
+            right = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
         focal = size / 2 / np.tan(np.deg2rad(fov_y_deg) / 2)

@@ -5,12 +5,12 @@ Letters: V views, N objects, h w pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from osfcore.errors import InvalidInput, finite_vector
+from osfcore.errors import InvalidInput, UnknownName, finite_vector
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -49,8 +49,25 @@ class SceneState:
             object.__setattr__(self, "pusher", finite_vector(self.pusher, 3, "pusher position [m]"))
 
     def pose(self, name: str) -> Pose:
-        """`T_world_object` of one object."""
-        return self.poses[self.names.index(name)]
+        """`T_world_object` of one object.
+
+        Raises:
+            UnknownName: if it is not in the scene.
+        """
+        return self.poses[self._number(name)]
+
+    def reordered(self, names: tuple[str, ...]) -> SceneState:
+        """The same state with its objects in another order.
+
+        Raises:
+            UnknownName: if one of them is not in the scene.
+        """
+        return replace(self, names=names, poses=self.poses[[self._number(name) for name in names]])
+
+    def _number(self, name: str) -> int:
+        if name not in self.names:
+            raise UnknownName("object in the scene", name, self.names)
+        return self.names.index(name)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

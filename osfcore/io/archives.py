@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.io.files import folder_at_once
+from osfcore.io.zip_directory import check_directory
 
 MAX_BYTES = 2 << 30
 MAX_FILES = 20_000
@@ -97,10 +98,12 @@ def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: in
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
     try:
-        with zipfile.ZipFile(archive) as file:
-            members = _members(archive, file, max_bytes, max_files)
-            wanted = _wanted(archive, members, kind)
-            _write(archive, file, wanted, out)
+        with archive.open("rb") as raw:
+            check_directory(raw, max_files)
+            with zipfile.ZipFile(raw) as file:
+                members = _members(archive, file, max_bytes)
+                wanted = _wanted(archive, members, kind)
+                _write(archive, file, wanted, out)
     except _DAMAGE as error:
         if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
             raise
@@ -110,13 +113,9 @@ def _unpack(archive: Path, out: Path, kind: _Kind, max_bytes: int, max_files: in
     return out
 
 
-def _members(
-    archive: Path, file: zipfile.ZipFile, max_bytes: int, max_files: int
-) -> dict[PurePosixPath, zipfile.ZipInfo]:
+def _members(archive: Path, file: zipfile.ZipFile, max_bytes: int) -> dict[PurePosixPath, zipfile.ZipInfo]:
     """The plain files of an archive by their path, all of which lead inside."""
     infos = file.infolist()
-    if len(infos) > max_files:
-        raise CorruptFile(archive, f"it holds {len(infos)} files; at most {max_files} are unpacked")
     size = sum(info.file_size for info in infos)
     if size > max_bytes:
         raise CorruptFile(archive, f"it unpacks to {size / 1e6:.0f} MB; at most {max_bytes / 1e6:.0f} MB are unpacked")

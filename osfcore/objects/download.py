@@ -148,7 +148,7 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
                 if not (member.isfile() or member.isdir()):
                     raise CorruptFile(archive, f"it holds {member.name!r}, which is neither a file nor a folder")
                 tar.extract(member, folder, filter="data")
-            _read_on(tar)
+            _read_on(tar, max_bytes)
     except CorruptFile:
         raise
     except (tarfile.TarError, EOFError) as error:
@@ -161,9 +161,9 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
         raise CorruptFile(archive, "it is a damaged archive") from error
 
 
-def _read_on(tar: tarfile.TarFile) -> None:
+def _read_on(tar: tarfile.TarFile, max_bytes: int) -> None:
     """Read what follows the last member: only at its end does gzip compare checksums."""
-    for _ in range(MAX_BYTES // _CHUNK_BYTES):
+    for _ in range(0, max_bytes, _CHUNK_BYTES):
         if tar.fileobj is None or not tar.fileobj.read(_CHUNK_BYTES):
             return
 

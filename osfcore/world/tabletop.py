@@ -217,9 +217,11 @@ class Tabletop:
         """Like `act_contacts`, with the objects' poses (instants, N) on the way, equally spaced, the last at the end.
 
         Raises:
-            InvalidInput: if the action is outside its limits; the world is unchanged.
+            InvalidInput: if the action is outside its limits or `instants` no divisor of 48; the world is unchanged.
         """
         velocity = check_action(action)
+        if instants < 1 or SUBSTEPS % instants:
+            raise InvalidInput("instants within an action", instants, f"a divisor of {SUBSTEPS}")
         stride = SUBSTEPS // instants
         touched, poses = frozenset[str](), []
         for step in range(1, SUBSTEPS + 1):

@@ -37,28 +37,31 @@ function status(text, state) {
   byId("status").dataset.state = state;
 }
 
+const STARTING_INTERVAL_MS = 300;
+const HEALTH_INTERVAL_MS = 15_000;
 let follower = 0;
 let isViewerOld = false;
 
-/** Asks until the simulation is ready, then shows the 3D view. A later call takes over from an earlier one. */
+/** Shows the 3D view once the simulation is ready, and what is wrong. A later call takes over from an earlier one. */
 async function followHealth(again) {
   follower += 1;
   isViewerOld ||= again;
   for (const me = follower; me === follower; ) {
+    let pause = STARTING_INTERVAL_MS;
     try {
       const health = await get("health");
-      if (health.stage === "ready") {
-        status("Live", "live");
-        if (isViewerOld || !isViewerShown()) showViewer();
-        isViewerOld = false;
-        return;
-      }
-      status(STARTING[health.stage] ?? "Starting", "wait");
+      const isReady = health.stage === "ready";
+      if (!isReady) status(STARTING[health.stage] ?? "Starting", "wait");
+      else if (health.status === "ok") status("Live", "live");
+      else status(health.problems[0], "wait");
+      if (isReady && (isViewerOld || !isViewerShown())) showViewer();
+      isViewerOld &&= !isReady;
+      pause = isReady ? HEALTH_INTERVAL_MS : STARTING_INTERVAL_MS;
     } catch {
       status("Reconnecting", "lost");
       return; // the event stream tells when the service is back
     }
-    await new Promise((resolve) => setTimeout(resolve, 300));
+    await new Promise((resolve) => setTimeout(resolve, pause));
   }
 }
 

@@ -1,6 +1,5 @@
 """What the fields say the cameras see, beside what they saw."""
 
-import asyncio
 import uuid
 from typing import Annotated, Literal
 
@@ -72,7 +71,7 @@ async def compared(services: Services, order: CompareView) -> Comparison:
     Raises:
         OsfError: if the renderer refuses it or is not there now.
     """
-    answer = await asyncio.wrap_future(await asyncio.to_thread(services.neural.submit, order))
+    answer = await services.neural.call_async(order)
     assert isinstance(answer, Comparison)
     return answer
 

@@ -5,12 +5,13 @@ from typing import Annotated
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.common import Input
 from app.api.schemas.limits import NAME, sized
 
-router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems())
+router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems(), route_class=BoundedRoute)
 Visitor = Annotated[str, Field(**sized(NAME), pattern="^[A-Za-z0-9_-]+$", description="What a page calls itself.")]
 
 

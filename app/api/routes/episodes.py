@@ -9,19 +9,22 @@ from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import ValidationError
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
-from app.api.paging import DEFAULT_PAGE, AfterJob, Limit
+from app.api.lanes import slow, urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import FORGOTTEN, PNG, Forget, problems
-from app.api.routes.events import followed
+from app.api.routes.events import StreamDep, followed
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
 from app.api.schemas.limits import STEP, within
+from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
 from app.jobs.job import Job
 from osfcore.errors import CorruptFile
 
-router = APIRouter(prefix="/api/episodes", tags=["episodes"], responses=problems())
+router = APIRouter(prefix="/api/episodes", tags=["episodes"], responses=problems(), route_class=BoundedRoute)
 _MEDIA_TYPES = {
     ".json": "application/json",
     ".csv": "text/csv",
@@ -40,7 +43,9 @@ _FILE = {
 }
 
 
-def _known_job(services: ServicesDep, episode: Annotated[str, Path(description="Identifier of an episode.")]) -> Job:
+async def _known_job(
+    services: ServicesDep, episode: Annotated[str, Path(description="Identifier of an episode.")]
+) -> Job:
     with named_in_path():
         return services.episodes.get(episode)
 
@@ -49,6 +54,7 @@ FoundDep = Annotated[Job, Depends(_known_job)]
 
 
 @router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429, 507))
+@slow
 def create(services: ServicesDep, body: EpisodeIn, response: Response) -> EpisodeOut:
     """Queue an episode: look, predict, plan, push and look again until the scene is as the goal shows it."""
     job = services.episodes.start(body.asked())
@@ -71,6 +77,7 @@ def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
 
 
 @router.delete("/{episode}", response_model=EpisodeOut, responses={**problems(404, 409, 507), **FORGOTTEN})
+@urgent
 def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EpisodeOut | Response:
     """End an episode, within a second. The steps that it has done are kept."""
     if forget:
@@ -80,32 +87,37 @@ def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> Epis
 
 
 @router.post("/{episode}/pause", responses=problems(404, 409))
+@urgent
 def pause(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     """Let a running episode rest. Lamp and objects may be moved by hand meanwhile."""
     return _out(services, services.runner.jobs.pause(job.id))
 
 
 @router.post("/{episode}/resume", responses=problems(404, 409))
+@urgent
 def resume(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     """Let a paused episode go on."""
     return _out(services, services.runner.jobs.resume(job.id))
 
 
 @router.post("/{episode}/step", responses=problems(404, 409))
+@urgent
 def step(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     """Let a paused episode go on to the end of the round, and rest again."""
     return _out(services, services.runner.jobs.step(job.id))
 
 
 @router.patch("/{episode}/settings", responses=problems(404, 409))
+@urgent
 def change(services: ServicesDep, job: FoundDep, body: SettingsIn) -> EpisodeOut:
     """Let an episode that runs or pauses go on with other settings; what is left out stays."""
     return _out(services, services.episodes.change(job, body.given()))
 
 
-@router.get("/{episode}/events", response_class=EventSourceResponse, responses=problems(404))
-async def follow(services: ServicesDep, job: FoundDep) -> AsyncIterator[ServerSentEvent]:
+@router.get("/{episode}/events", response_class=EventSourceResponse, responses=problems(404, 503))
+async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> AsyncIterator[ServerSentEvent]:
     """Follow one episode: "job" events as at /api/events, from how it is now to its end."""
+    del counted
     async for event in followed(services, job):
         yield event
 
@@ -130,11 +142,12 @@ async def frame(
 @router.get("/{episode}/files/{name}", response_class=FileResponse, responses={**problems(404, 409, 507), **_FILE})
 def file(
     services: ServicesDep, job: FoundDep, name: Annotated[str, Path(description="One of the episode's files.")]
-) -> FileResponse:
+) -> OpenFile:
     """Download what an episode has left: report, table of steps, goal image, video, and a recording for the viewer."""
     with named_in_path():
         path = services.episodes.file(job, name)
-    return FileResponse(path, media_type=_MEDIA_TYPES[path.suffix], content_disposition_type="inline", filename=name)
+    gone = f"{name} of episode {job.id} has been removed from the data directory."
+    return OpenFile(path, gone, media_type=_MEDIA_TYPES[path.suffix], filename=name, disposition="inline")
 
 
 def _out(services: Services, job: Job) -> EpisodeOut:

@@ -5,20 +5,21 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response, status
-from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.requests import ClientDisconnect
 
-from app.api.bodies import JSON, kind_of, parsed, whole_body
+from app.api.bodies import JSON, SMALL_BODY_BYTES, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep
-from app.api.paging import DEFAULT_PAGE, AfterJob, Limit
+from app.api.lanes import urgent
+from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import FORGOTTEN, Forget, problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
-from app.api.routes.events import followed
+from app.api.routes.events import StreamDep, followed
 from app.api.schemas.common import Seed
 from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
 from app.api.schemas.limits import FILE_NAME, GUESS, NAME, VIEW, sized, within
+from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.jobs.job import Job
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked, Estimates
@@ -40,7 +41,9 @@ router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
 View = Annotated[int, Path(**within(VIEW), description="Number of the camera, from 0.")]
 
 
-def _known_job(services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]) -> Job:
+async def _known_job(
+    services: ServicesDep, estimate: Annotated[str, Path(description="Identifier of an estimate.")]
+) -> Job:
     with named_in_path():
         return services.estimates.get(estimate)
 
@@ -78,8 +81,8 @@ async def create(
         except ClientDisconnect:
             raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
     else:
-        request_body = await _body(request, kind, services.settings.max_body_bytes)
-        job = await asyncio.to_thread(services.estimates.of_scene, request_body.asked(), request_body.scene)
+        request_body = await _body(request, kind)
+        job = await services.lanes.slow.run(services.estimates.of_scene, request_body.asked(), request_body.scene)
     response.headers["Location"] = f"{UPLOAD_PATH}/{job.id}"
     return await asyncio.to_thread(_out, services.estimates, job)
 
@@ -104,6 +107,7 @@ def get(services: ServicesDep, job: FoundDep) -> EstimateOut:
     responses={**problems(404, 409, 507), **FORGOTTEN},
     response_model_exclude_unset=True,
 )
+@urgent
 def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EstimateOut | Response:
     """End an estimate, within a second; what it was given is removed. It stays listed as cancelled."""
     if forget:
@@ -112,9 +116,10 @@ def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> Esti
     return _out(services.estimates, services.runner.jobs.cancel(job.id))
 
 
-@router.get("/{estimate}/events", response_class=EventSourceResponse, responses=problems(404))
-async def follow(services: ServicesDep, job: FoundDep) -> AsyncIterator[ServerSentEvent]:
+@router.get("/{estimate}/events", response_class=EventSourceResponse, responses=problems(404, 503))
+async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> AsyncIterator[ServerSentEvent]:
     """Follow one estimate: "job" events as at /api/events, from how it is now to its end."""
+    del counted
     async for event in followed(services, job):
         yield event
 
@@ -135,18 +140,23 @@ async def image(
     """Show what a camera saw, and what it would see if a step's guess were true."""
     with named_in_path():
         if kind == "observed":
-            return FileResponse(await asyncio.to_thread(services.estimates.observed, job, view), media_type="image/png")
+            return await asyncio.to_thread(_observed, services.estimates, job, view)
         order = await asyncio.to_thread(services.estimates.comparison, job, view, step)
     return compared_png(await compared(services, order), kind)
+
+
+def _observed(estimates: Estimates, job: Job, view: int) -> OpenFile:
+    gone = f"The images of estimate {job.id} have been removed from the data directory."
+    return OpenFile(estimates.observed(job, view), gone, media_type="image/png")
 
 
 def _out(estimates: Estimates, job: Job) -> EstimateOut:
     return EstimateOut.of_job(job, estimates.steps(job), estimates.result(job), estimates.simulation_errors(job))
 
 
-async def _body(request: Request, kind: str, max_bytes: int) -> EstimateIn:
+async def _body(request: Request, kind: str) -> EstimateIn:
     """The JSON of a request; nothing at all asks for the defaults."""
-    body = await whole_body(request, max_bytes)
+    body = await whole_body(request, SMALL_BODY_BYTES)
     if not body and not kind:
         return EstimateIn.model_validate({})
     if kind != JSON:

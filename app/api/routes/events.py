@@ -8,9 +8,10 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query
+from fastapi import APIRouter, Depends, Header, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
@@ -26,6 +27,7 @@ from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
+from app.storage.paths import without_places
 from osfcore.errors import UnknownName
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
@@ -35,6 +37,14 @@ _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest ar
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
 Letter = JobChanged | JobForgotten | Notice | GoalsChanged | DriverChanged
+
+
+async def _counted(services: ServicesDep) -> AsyncIterator[None]:
+    with services.event_texts.stream():
+        yield
+
+
+StreamDep = Annotated[None, Depends(_counted)]
 
 
 class Mailbox:
@@ -81,9 +91,10 @@ class Mailbox:
         self.arrived.set()
 
 
-@router.get("/events", response_class=EventSourceResponse)
+@router.get("/events", response_class=EventSourceResponse, responses=problems(503))
 async def stream(
     services: ServicesDep,
+    counted: StreamDep,
     frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
     visitor: Annotated[
         str | None, Query(**sized(NAME), pattern="^[A-Za-z0-9_-]+$", description="What the page calls itself.")
@@ -91,6 +102,7 @@ async def stream(
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow what happens: "job", "forgotten", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
+    del counted
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
     is_watching = has_arrived = False
@@ -109,7 +121,7 @@ async def stream(
             last = min(int(last_event_id[:19]), _MAX_EVENT)
             for number, fields in await run_in_threadpool(services.store.events_after, last):
                 last = number
-                yield _replayed(number, fields)
+                yield _replayed(services, number, fields)
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
     finally:
@@ -129,15 +141,15 @@ async def _follow(
             letter = mailbox.letters.popleft()
             match letter:
                 case Notice():
-                    yield ServerSentEvent(event="notice", data=NoticeEvent.model_validate(letter, from_attributes=True))
+                    yield _notice_event(services, letter)
                 case GoalsChanged():
                     yield ServerSentEvent(event="goals", raw_data="null")
                 case DriverChanged():
                     yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
-                    yield job_event(letter.event, letter.job)
+                    yield job_event(services, letter.event, letter.job)
                 case JobForgotten() if letter.event > last:
-                    yield _replayed(letter.event, {"forgotten": letter.job.id})
+                    yield _replayed(services, letter.event, {"forgotten": letter.job.id})
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
             yield _draft_event(services, changed)
@@ -148,7 +160,8 @@ async def _follow(
         if mailbox.frames is not None and now >= frame_at:
             taken, mailbox.frames, frame_at = mailbox.frames, None, now + FRAME_INTERVAL_S
             if wants_frames:
-                yield ServerSentEvent(event="frame", data=_frame(taken))
+                text = services.event_texts.of(taken, partial(_frame, taken))
+                yield ServerSentEvent(event="frame", raw_data=text)
         mailbox.arrived.clear()
         due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)
         timeout = min([_LOOK_INTERVAL_S, *(max(at - time.monotonic(), 0.001) for at in due)])
@@ -169,26 +182,44 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
         with contextlib.suppress(UnknownName):  # one that was just removed for good ends as it was
             job = services.runner.jobs.get(job.id)  # again, now that nothing is missed
         now = job
-        yield job_event(0, now)
+        yield job_event(services, 0, now)
         while not now.is_finished and not services.closing.is_set():
             letter = await mailbox.next_job(job.id)
             if letter is not None:
                 now = letter.job
-                yield job_event(letter.event, now)
+                yield job_event(services, letter.event, now)
     finally:
         leave()
 
 
-def job_event(number: int, job: Job) -> ServerSentEvent:
-    """A job as an event; the number is 0 where nothing came after it that could be asked for."""
-    return ServerSentEvent(event="job", id=str(number) if number else None, data=JobOut.of(job))
+def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:
+    """A job as an event.
+
+    Args:
+        services: of the app.
+        number: of the event; 0 where nothing came after it that could be asked for.
+        job: as it was then.
+    """
+    text = services.event_texts.of(job, partial(JobOut.of, job))
+    return ServerSentEvent(event="job", id=str(number) if number else None, raw_data=text)
 
 
-def _replayed(number: int, fields: dict[str, Any]) -> ServerSentEvent:
-    """What the store keeps of an event, as it was told."""
+def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
+    text = without_places(notice.text, services.settings.data_dir)
+    return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
+
+
+def _replayed(services: Services, number: int, fields: dict[str, Any]) -> ServerSentEvent:
+    """An event as it was told.
+
+    Args:
+        services: of the app.
+        number: of the event.
+        fields: what the store keeps of it.
+    """
     if "forgotten" in fields:
         return ServerSentEvent(event="forgotten", id=str(number), data=ForgottenEvent(job=fields["forgotten"]))
-    return job_event(number, job_from_fields(fields))
+    return job_event(services, number, job_from_fields(fields))
 
 
 def _scene_event(services: Services) -> ServerSentEvent:
@@ -196,7 +227,8 @@ def _scene_event(services: Services) -> ServerSentEvent:
     record = next((r for r in services.runner.scenes() if r.id == current), None)
     if record is None:
         return ServerSentEvent(event="scene", raw_data="null")
-    return ServerSentEvent(event="scene", data=services.scene_out(record))
+    text = services.event_texts.of(record, partial(services.scene_out, record))
+    return ServerSentEvent(event="scene", raw_data=text)
 
 
 def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:

@@ -7,11 +7,12 @@ from fastapi.responses import FileResponse
 from starlette.requests import ClientDisconnect
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
-from app.api.problems import NotFound, named_in_path
+from app.api.open_file import OpenFile
+from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
 from app.api.schemas.limits import FILE_NAME, sized
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
 
@@ -71,13 +72,12 @@ def delete_set(services: ServicesDep, set_id: SetId) -> None:
 
 
 @router.get("/sets/{set_id}/overlay.png", response_class=FileResponse, responses={**problems(404), **PNG})
-def overlay(services: ServicesDep, set_id: SetId) -> FileResponse:
+def overlay(services: ServicesDep, set_id: SetId) -> OpenFile:
     """Show how a set was understood: axes, light and the silhouettes' box, drawn into some of its images."""
     _found_set(services, set_id)
     path = services.runner.sets.overlay(set_id)
-    if not path.is_file():
-        raise NotFound(f"The overlay of image set {set_id} has been removed from the data directory.")
-    return FileResponse(path, media_type="image/png")
+    gone = f"The overlay of image set {set_id} has been removed from the data directory."
+    return OpenFile(path, gone, media_type="image/png")
 
 
 @router.get("/{name}", responses=problems(404))

@@ -8,13 +8,15 @@ from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from app.api.bodies import JSON, kind_of, parsed, whole_body
+from app.api.bodies import JSON, SMALL_BODY_BYTES, BoundedRoute, kind_of, parsed, whole_body
 from app.api.dependencies import Services, ServicesDep
-from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
+from app.api.lanes import slow
+from app.api.open_file import OpenFile
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
 from app.api.schemas.limits import CAMERA_JSON, GOAL_NAME, sized
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.services.goals import Draft, NoDraft
 from app.storage.goal_store import GoalRecord
 from osfcore.errors import InvalidInput, OsfError
@@ -34,7 +36,7 @@ _BODY = {
         },
     }
 }
-router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems())
+router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems(), route_class=BoundedRoute)
 
 
 def _known_goal(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
@@ -69,8 +71,8 @@ async def create(
             seen_by = None if camera is None else _camera(camera)
             record = await run_in_threadpool(services.goals.receive, data, name, seen_by)
         elif kind == JSON:
-            body = parsed(GoalIn, await whole_body(request, services.settings.max_body_bytes))
-            record = await run_in_threadpool(_made, services, body)
+            body = parsed(GoalIn, await whole_body(request, SMALL_BODY_BYTES))
+            record = await services.lanes.slow.run(_made, services, body)
         else:
             allowed = f"{' or '.join(PHOTOS)} for a photo, or {JSON}"
             raise HTTPException(
@@ -90,6 +92,7 @@ def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEnt
 
 
 @router.post("/draft", status_code=status.HTTP_201_CREATED, responses=problems(409, 503))
+@slow
 def begin(services: ServicesDep, body: DraftIn) -> DraftOut:
     """Begin to compose a goal, from where the objects are now. All visitors see the same draft."""
     return _draft_out(services, services.goals.begin_draft(body.scene))
@@ -105,12 +108,14 @@ def draft(services: ServicesDep) -> DraftOut:
 
 
 @router.patch("/draft", responses=problems(404, 409, 503))
+@slow
 def lay_out(services: ServicesDep, body: DraftPatch) -> DraftOut:
     """Put objects of the draft elsewhere; where they cannot be, `problem` says so."""
     return _draft_out(services, services.goals.move_draft(body.named_poses()))
 
 
 @router.delete("/draft", status_code=status.HTTP_204_NO_CONTENT)
+@slow
 def drop(services: ServicesDep) -> None:
     """End composing without keeping anything."""
     services.goals.drop_draft()
@@ -123,6 +128,7 @@ def draft_image(services: ServicesDep) -> Response:
 
 
 @router.post("/draft/save", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 507))
+@slow
 def save(services: ServicesDep, body: DraftKeep, response: Response) -> GoalOut:
     """Keep the draft as a goal, and end composing."""
     record = services.goals.keep_draft(body.name)
@@ -137,12 +143,11 @@ def get(record: FoundDep) -> GoalOut:
 
 
 @router.get("/{goal}/image.png", response_class=FileResponse, responses={**problems(404), **PNG})
-def image(services: ServicesDep, record: FoundDep) -> FileResponse:
+def image(services: ServicesDep, record: FoundDep) -> OpenFile:
     """Show a goal."""
     path = services.goals.image(record.id)
-    if not path.is_file():
-        raise NotFound(f"The image of goal {record.id} has been removed from the data directory.")
-    return FileResponse(path, media_type="image/png")
+    gone = f"The image of goal {record.id} has been removed from the data directory."
+    return OpenFile(path, gone, media_type="image/png")
 
 
 @router.delete("/{goal}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))

@@ -5,15 +5,18 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Path, Response, status
 from fastapi.responses import FileResponse
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
-from app.api.paging import DEFAULT_PAGE, AfterJob, Limit
-from app.api.problems import NotFound, named_in_path
+from app.api.lanes import urgent
+from app.api.open_file import OpenFile
+from app.api.problems import named_in_path
 from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
+from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.jobs.job import Job, check_file_name
 from app.jobs.kinds.fields import PREVIEW
 
-router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems())
+router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems(), route_class=BoundedRoute)
 FileName = Annotated[str, Path(description="One of the job's files.")]
 JobId = Annotated[str, Path(description="Identifier of a job.")]
 _FILE = {
@@ -46,6 +49,7 @@ async def get(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.delete("/{job}", response_model=JobOut, responses={**problems(404, 409, 507), **FORGOTTEN})
+@urgent
 def cancel(services: ServicesDep, job: JobId, forget: Forget = False) -> JobOut | Response:
     """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
     _known_job(services, job)
@@ -56,6 +60,7 @@ def cancel(services: ServicesDep, job: JobId, forget: Forget = False) -> JobOut 
 
 
 @router.post("/{job}/pause", responses=problems(404, 409))
+@urgent
 def pause(services: ServicesDep, job: JobId) -> JobOut:
     """Let a running job rest after its current step. It keeps its turn."""
     _known_job(services, job)
@@ -63,6 +68,7 @@ def pause(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.post("/{job}/resume", responses=problems(404, 409))
+@urgent
 def resume(services: ServicesDep, job: JobId) -> JobOut:
     """Let a paused job go on."""
     _known_job(services, job)
@@ -70,24 +76,22 @@ def resume(services: ServicesDep, job: JobId) -> JobOut:
 
 
 @router.get("/{job}/files/{name}", response_class=FileResponse, responses={**problems(404), **_FILE})
-def file(services: ServicesDep, job: JobId, name: FileName) -> FileResponse:
+def file(services: ServicesDep, job: JobId, name: FileName) -> OpenFile:
     """Download what a job has made."""
     known_job = _known_job(services, job)
     with named_in_path():
         path = services.runner.jobs.folder(job) / check_file_name(known_job, name)
-    if not path.is_file():
-        raise NotFound(f"{name} of job {job} has been removed from the data directory.")
-    return FileResponse(path, filename=name, media_type="application/octet-stream")
+    gone = f"{name} of job {job} has been removed from the data directory."
+    return OpenFile(path, gone, media_type="application/octet-stream", filename=name)
 
 
 @router.get("/{job}/preview.png", response_class=FileResponse, responses={**problems(404), **PNG})
-def preview(services: ServicesDep, job: JobId) -> FileResponse:
+def preview(services: ServicesDep, job: JobId) -> OpenFile:
     """Show one unseen image of a field in training: the truth, the field's, and their difference times four."""
     _known_job(services, job)
     path = services.runner.jobs.folder(job) / PREVIEW
-    if not path.is_file():
-        raise NotFound(f"Job {job} has no preview; training a field makes one, some seconds after it has begun.")
-    return FileResponse(path, media_type="image/png", headers={"Cache-Control": "no-store"})
+    gone = f"Job {job} has no preview; training a field makes one, some seconds after it has begun."
+    return OpenFile(path, gone, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
 def _known_job(services: Services, job: str) -> Job:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from fastapi import APIRouter, Response
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.predictions import PredictionIn, PredictionOut
@@ -20,7 +21,7 @@ from osfcore.io.rollout_file import rollouts_to_json
 
 MAX_POSES = 100_000  # some 8 MB of JSON
 _ANSWER: dict[int | str, dict[str, Any]] = {200: {"model": PredictionOut, "description": "The predicted futures."}}
-router = APIRouter(prefix="/api/predictions", tags=["predictions"])
+router = APIRouter(prefix="/api/predictions", tags=["predictions"], route_class=BoundedRoute)
 
 
 @router.post("", response_class=Response, responses={**problems(409, 503), **_ANSWER})

@@ -3,7 +3,9 @@
 from fastapi import APIRouter, Path, status
 from pydantic import BaseModel, Field
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
+from app.api.lanes import slow
 from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.schemas.common import SceneOut
@@ -11,7 +13,7 @@ from app.api.schemas.goals import GoalOut
 from app.services.presets import PRESETS, preset, set_up
 from app.storage.paths import static_folder
 
-router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems())
+router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems(), route_class=BoundedRoute)
 
 
 class PresetOut(BaseModel):
@@ -58,6 +60,7 @@ def list_all(services: ServicesDep) -> PresetList:
 
 
 @router.post("/{preset_id}", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 503, 507))
+@slow
 def make(services: ServicesDep, preset_id: str = Path(description="Identifier of a preset.")) -> PresetMade:
     """Make a preset's scene, which is then shown, and its goal image."""
     with named_in_path():

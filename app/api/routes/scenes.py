@@ -4,16 +4,18 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response, status
 
+from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
-from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, page
+from app.api.lanes import slow
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS
 
-router = APIRouter(prefix="/api/scenes", tags=["scenes"], responses=problems(503, 507))
+router = APIRouter(prefix="/api/scenes", tags=["scenes"], responses=problems(503, 507), route_class=BoundedRoute)
 _CAMERAS = (*(str(number) for number in range(len(CAMERA_POSITIONS))), "goal")
 SceneId = Annotated[str, Path(description="Identifier of a scene.")]
 CameraName = Annotated[str, Path(description='"0" to "3" or "goal".', examples=["0"])]
@@ -21,6 +23,7 @@ SizeQuery = Annotated[ImageSize | None, Query(description="Side of the image [px
 
 
 @router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409))
+@slow
 def create(services: ServicesDep, body: SceneIn, response: Response) -> SceneOut:
     """Make a scene and show it; it has come to rest."""
     record = services.runner.create_scene(
@@ -52,6 +55,7 @@ async def get(services: ServicesDep, scene: SceneId) -> SceneOut:
 
 
 @router.delete("/{scene}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409))
+@slow
 def delete(services: ServicesDep, scene: SceneId) -> None:
     """Forget a scene."""
     record_of(services, scene)
@@ -59,6 +63,7 @@ def delete(services: ServicesDep, scene: SceneId) -> None:
 
 
 @router.post("/{scene}/activate", responses=problems(404))
+@slow
 def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Show a scene in viewer and page."""
     record_of(services, scene)
@@ -66,6 +71,7 @@ def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
 
 
 @router.post("/{scene}/reset", responses=problems(404, 409))
+@slow
 def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Put a scene back to how it was created."""
     record_of(services, scene)
@@ -73,6 +79,7 @@ def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
 
 
 @router.patch("/{scene}", responses=problems(404, 409))
+@slow
 def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
     """Move light and objects by hand, all or nothing."""
     record_of(services, scene)
@@ -85,6 +92,7 @@ def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
 
 
 @router.post("/{scene}/actions", responses=problems(404, 409))
+@slow
 def act(services: ServicesDep, scene: SceneId, body: ActionsIn) -> SceneOut:
     """Push: hold each velocity for 0.2 s of simulated time."""
     record_of(services, scene)

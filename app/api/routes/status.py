@@ -5,8 +5,10 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
+from app.api.condition import problems as problems_of
 from app.api.dependencies import ServicesDep
 from app.api.http_metrics import CONTENT_TYPE
+from app.api.lanes import urgent
 from app.api.routes import problems
 from app.api.schemas.common import Health
 from app.api.schemas.episodes import ServiceSettings
@@ -19,10 +21,13 @@ _TEXT: dict[int | str, dict[str, Any]] = {
 
 
 @router.get("/health", tags=["health"])
-async def health(services: ServicesDep) -> Health:
-    """Tell that the service runs, and in which state."""
+@urgent
+def health(services: ServicesDep) -> Health:
+    """Tell that the service runs, and what is wrong with it."""
+    found = list(problems_of(services.runner, services.settings.data_dir))
     return Health(
-        status="ok",
+        status="degraded" if found else "ok",
+        problems=found,
         version=VERSION,
         uptime_s=round(services.runner.uptime_s, 3),
         objects_available=len(services.objects.names()),

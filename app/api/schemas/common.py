@@ -11,7 +11,6 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.api.paging import PageOut
 from app.api.schemas.limits import (
     ACTIONS,
     COORDINATE_M,
@@ -23,6 +22,7 @@ from app.api.schemas.limits import (
     sized,
     within,
 )
+from app.api.schemas.paging import PageOut
 from app.processes.messages.scene_messages import SceneRecord
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.light import Light
@@ -70,7 +70,8 @@ class Problem(BaseModel):
 class Health(BaseModel):
     """Whether and how the service runs."""
 
-    status: Literal["ok"]
+    status: Literal["ok", "degraded"]
+    problems: list[str] = Field(description="What is wrong now, a sentence each; it goes when its cause is gone.")
     version: str
     uptime_s: float = Field(description="Since the start [s].")
     objects_available: int

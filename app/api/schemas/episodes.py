@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field
 
-from app.api.paging import JobPageOut
 from app.api.schemas.common import Input, Seed
 from app.api.schemas.goals import Poses, SceneRef
 from app.api.schemas.limits import HORIZON, NAME, SAMPLES, STEPS, TEMPERATURE, sized, within
+from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.services.episodes import AskedEpisode, flat
 from osfcore.control.episode_settings import CostKind, EpisodeSettings

@@ -6,9 +6,9 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from app.api.paging import JobPageOut
 from app.api.schemas.common import Input, Seed
 from app.api.schemas.limits import NAME, sized
+from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked

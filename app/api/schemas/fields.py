@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from app.api.paging import PageOut
+from app.api.schemas.paging import PageOut
 from app.services.image_sets import SetRecord
 
 

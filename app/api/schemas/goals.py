@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, model_validator
 
-from app.api.paging import PageOut
 from app.api.schemas.common import Input, LightIn, ObjectPose, SceneObject, Seed
 from app.api.schemas.limits import GOAL_NAME, NAME, OBJECTS, sized, within
+from app.api.schemas.paging import PageOut
 from app.services.goals import Draft
 from app.storage.goal_store import GoalRecord, Source
 from osfcore.geometry.poses import Pose

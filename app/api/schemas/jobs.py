@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from app.api.paging import JobPageOut
 from app.api.schemas.common import ImageSize, Input, ObjectName, Seed
 from app.api.schemas.limits import (
     FETCHED,
@@ -19,6 +18,7 @@ from app.api.schemas.limits import (
     sized,
     within,
 )
+from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 from app.api.schemas.common import Input, LightIn, ObjectName, Position, Quaternion, Vector3, Velocity
 from app.api.schemas.limits import HORIZON, OBJECTS, SEQUENCES, sized
@@ -14,7 +14,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 
 _OVERHEAD = (0.0, 0.0, 1.0)
-Sequence = Annotated[list[Velocity], Field(**sized(HORIZON))]
+Sequence = Annotated[list[Velocity], Field(**sized(HORIZON)), FailFast()]
 _STATE_EXAMPLE = {
     "objects": [{"name": "006_mustard_bottle", "position": [0.0, 0.0, 0.095], "quaternion": [1.0, 0.0, 0.0, 0.0]}],
     "light": {"position": [0.3, -0.4, 0.8]},

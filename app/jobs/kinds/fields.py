@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from app.storage.field_files import clear_workshop, install, open_workshop
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from osfcore.io.files import write_atomically
 from osfcore.io.image_file import write_png
 
 if TYPE_CHECKING:
@@ -124,6 +124,6 @@ def _offer(shop: Path, folder: Path, name: str) -> None:
     """Copy what was made to where the job's files can be downloaded from."""
     try:
         for file in (FIELD_FILE, METRICS_FILE):
-            shutil.copyfile(shop / file, folder / f"{name}{Path(file).suffix}")
+            write_atomically(folder / f"{name}{Path(file).suffix}", (shop / file).read_bytes())
     except OSError as error:
         raise CannotWrite(folder, error.strerror or str(error)) from error

@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -145,9 +145,9 @@ class _Run:
         names = tuple(sorted(shapes))
         self._table = ShapeTable(tuple(shapes[name] for name in names), device)
         learned, kept = _episodes(config, frozenset(names))
-        self._long = record(learned, shapes, LONG_WINDOW)
-        self._samples = samples(record(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
-        self._validation = record(kept, shapes, MEASURED_WINDOW)
+        self._long = _recorded(learned, shapes, LONG_WINDOW)
+        self._samples = samples(_recorded(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
+        self._validation = _recorded(kept, shapes, MEASURED_WINDOW)
         self._used = len(learned)
         torch.manual_seed(config.seed)
         self._rng = np.random.default_rng(config.seed)
@@ -295,9 +295,15 @@ def _episodes(config: TrainDynamics, known: frozenset[str]) -> tuple[list[PushEp
     return parts
 
 
+def _recorded(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], length: int) -> Recording:
+    recording = record(episodes, shapes, length)
+    if not len(recording.starts):
+        what = f"windows of {length} actions in which all objects stay on the table"
+        raise InvalidInput(what, 0, "at least 1: collect more pushes")
+    return recording
+
+
 def _draw(recording: Recording, rng: np.random.Generator, count: int) -> np.ndarray:
     """Windows, most of them with something happening."""
-    busy = np.flatnonzero(recording.is_busy)
     quiet = rng.integers(len(recording.starts), size=count - round(count * _BUSY_SHARE))
-    chosen = busy if len(busy) else np.arange(len(recording.starts))
-    return np.concatenate([rng.choice(chosen, count - len(quiet)), quiet])
+    return np.concatenate([rng.choice(recording.telling, count - len(quiet)), quiet])

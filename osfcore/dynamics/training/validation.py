@@ -67,16 +67,15 @@ def _sine(a: Tensor, b: Tensor) -> Tensor:
 def validate(
     network: PropagationNetwork, table: ShapeTable, recording: Recording, device: torch.device | str = "cpu"
 ) -> Validation:
-    """Errors on windows in which something happens.
+    """Errors on windows in which something happens, or on all where nothing ever does.
 
     Args:
         network: to measure.
         table: shapes of the recorded objects, on `device`.
-        recording: held out, with windows of four actions; of its busy ones 2000 at most are measured.
+        recording: held out, with one or more windows of four actions; of the busy ones 2000 at most are measured.
         device: that computes.
     """
-    busy = np.flatnonzero(recording.is_busy)
-    chosen = np.random.default_rng(0).permutation(busy)[:_MEASURED]
+    chosen = np.random.default_rng(0).permutation(recording.telling)[:_MEASURED]
     pieces = batch(recording, table, chosen, device)
     loss, motion = 0.0, pieces.motion
     for step, motion in enumerate(unroll(network, table, pieces.number, pieces.motion, pieces.velocity)):

@@ -58,6 +58,12 @@ class Recording:
     is_busy: Bool[np.ndarray, "W"]
     length: int
 
+    @property
+    def telling(self) -> Int[np.ndarray, "chosen"]:
+        """Numbers of the windows in which something happens; of all where nothing ever does."""
+        busy = np.flatnonzero(self.is_busy)
+        return busy if len(busy) else np.arange(len(self.starts))
+
 
 def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], length: int) -> Recording:
     """Episodes as tensors, with the windows that can be learned from.

@@ -144,8 +144,10 @@ def crop_to_object(
     w, h = min(max(side, MIN_IMAGE_SIDE), width), min(max(side, MIN_IMAGE_SIDE), height)
     corners = [(int(np.clip(x - w / 2, 0, width - w)), int(np.clip(y - h / 2, 0, height - h))) for _, x, y, _ in boxes]
     cameras = tuple(crop_camera(views.cameras[v], x, y, w, h) for (v, *_), (x, y) in zip(boxes, corners, strict=True))
-    images = [views.images[v, y : y + h, x : x + w] for (v, *_), (x, y) in zip(boxes, corners, strict=True)]
-    return ObservedViews(cameras, np.stack(images), None, views.pusher, views.quality)
+    windows = [(v, slice(y, y + h), slice(x, x + w)) for (v, *_), (x, y) in zip(boxes, corners, strict=True)]
+    images = np.stack([views.images[window] for window in windows])
+    only = None if views.only is None else np.stack([views.only[window] for window in windows])
+    return ObservedViews(cameras, images, None, views.pusher, views.quality, only)
 
 
 def crop_to_silhouette(

@@ -72,3 +72,25 @@ def test_json_is_checked_as_everywhere_else():
         with pytest.raises(RequestValidationError) as refusal:
             parsed(GoalIn, body)
         assert refusal.value.errors()[0]["loc"][: len(place)] == place
+
+
+@pytest.mark.parametrize("path", ["/api/scenes", "/api/goals", "/api/predictions", "/api/jobs", "/api/driver"])
+@pytest.mark.parametrize("nested", [False, True])
+def test_objects_with_very_many_members_are_refused_at_once(service, path, nested):
+    members = {f"k{n}": n for n in range(3000)}
+    answer = service.post(path, json={"light": members} if nested else members)
+    assert answer.status_code == 422
+    assert "3000 members" in answer.json()["detail"]
+
+
+def test_of_many_mistakes_the_first_few_are_told(service):
+    answer = service.post("/api/scenes", json={f"k{n}": n for n in range(90)})
+    assert answer.status_code == 422
+    assert len(answer.json()["errors"]) == 20
+    assert "(and 89 more)" in answer.json()["detail"]
+
+
+def test_a_long_list_of_mistakes_ends_with_the_first(service):
+    answer = service.post("/api/predictions", json={"actions": [["x"] * 10] * 900})
+    assert answer.status_code == 422
+    assert len(answer.text) < 5000

@@ -43,6 +43,11 @@ RECORDING = "http://localhost/api/episodes/e-1/files/recording.viser"
     "query",
     [
         {"websocket": "ws://evil.example"},
+        {"websocket": "ws://evil.example/viewer"},
+        {"websocket": "ws://localhost@evil.example/viewer"},
+        {"websocket": "http://localhost/viewer"},
+        {"websocket": "ws://localhost/viewer?x=1"},
+        {"websocket": "ws://localhost/other"},
         {"playbackPath": "data:text/plain,x"},
         {"playbackPath": "http://evil.example/api/episodes/e-1/files/recording.viser"},
         {"playbackPath": "//evil.example/api/episodes/e-1/files/recording.viser"},
@@ -61,7 +66,16 @@ def test_the_client_page_is_not_opened_for_messages_from_elsewhere(service, quer
     assert "open it from the page" in answer.json()["detail"]
 
 
-@pytest.mark.parametrize("query", ["", "hideViserLogo&darkMode", f"hideViserLogo&playbackPath={RECORDING}"])
+@pytest.mark.parametrize(
+    "query",
+    [
+        "",
+        "websocket=ws://localhost/viewer",
+        "websocket=ws://localhost/viewer/",
+        "hideViserLogo&darkMode",
+        f"hideViserLogo&playbackPath={RECORDING}",
+    ],
+)
 def test_the_client_page_is_opened_with_looks_and_own_recordings(service, query):
     assert service.get(f"/viewer/?{query}").status_code == 200
 

@@ -19,9 +19,9 @@ def told():
 
 
 @pytest.fixture
-def table(store, told):
+def table(store, told, tmp_path):
     """Ten jobs of two kinds in turn, of which the last three wait."""
-    table = JobTable(store, told.append)
+    table = JobTable(store, tmp_path, told.append)
     for number in range(10):
         table.add(Job(f"j{number}", ("even", "odd")[number % 2], {}))
     for number in range(7):
@@ -65,7 +65,7 @@ def test_a_job_of_another_kind_is_not_found_and_names_of_the_kind_are_told(table
         table.get("j8", "odd")
 
 
-def test_a_forgotten_job_is_gone_and_pages_that_come_back_are_told(table, store, told):
+def test_a_forgotten_job_is_gone_and_pages_that_come_back_are_told(table, store, told, tmp_path):
     before = told[-1].event
     table.forget(table["j2"])
     assert isinstance(told[-1], JobForgotten)
@@ -73,7 +73,7 @@ def test_a_forgotten_job_is_gone_and_pages_that_come_back_are_told(table, store,
     assert "j2" not in [fields["id"] for _, fields in store.jobs()]
     assert store.events_after(before) == ((before + 1, {"forgotten": "j2"}),)
     assert "j2" not in [fields.get("id") for _, fields in store.events_after(0)]
-    again = JobTable(store, told.append)
+    again = JobTable(store, tmp_path, told.append)
     again.load()
     assert [job.id for job in again.all()] == [job.id for job in table.all()]
 

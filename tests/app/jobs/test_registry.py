@@ -2,6 +2,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import threading
 import time
 
 import pytest
@@ -430,3 +431,49 @@ def test_an_episode_that_was_cancelled_before_it_began_leaves_nothing(played, op
     waiting = jobs.submit("episode", {"scene": "s1"}, data_dir / "given")
     assert jobs.cancel(waiting.id).state == "cancelled"
     assert not jobs.folder(waiting.id).exists()
+
+
+def test_a_job_whose_simulation_hangs_is_heard_and_cancelled_all_the_same(played, open_jobs):
+    hangs = threading.Event()
+
+    def serve(command):
+        hangs.wait(60)
+
+    jobs, _ = open_jobs(serve=serve, start_process=played.start, cancel_grace_s=0.1)
+    job = jobs.submit("episode", {"scene": "s1"})
+    until_state(jobs, job, "running")
+    played.send(SceneCommand(TakeImage("s1", "goal", 32)))
+    played.send(JobStep(3, 10, "Look", {}))
+    until(lambda: jobs.get(job.id).done == 3)
+    assert jobs.cancel(job.id).state == "cancelled"
+    hangs.set()
+
+
+def test_a_frozen_job_fails_and_the_next_one_runs(open_jobs):
+    jobs, _ = open_jobs()
+    job, following = jobs.submit(*LONG), jobs.submit(*TABLE)
+    until(lambda: jobs.get(job.id).done > 0)
+    os.kill(pid_of_job(), signal.SIGSTOP)
+    assert "was frozen" in until_state(jobs, job, "failed").error
+    assert until_state(jobs, following, "done").state == "done"
+
+
+def test_a_failure_of_the_loop_is_told_and_jobs_go_on_once_its_cause_is_gone(played, open_jobs):
+    is_broken = threading.Event()
+    is_broken.set()
+
+    def start(*arguments):
+        if is_broken.is_set():
+            raise RuntimeError("can't start new thread")
+        return played.start(*arguments)
+
+    jobs, _ = open_jobs(start_process=start)
+    job = jobs.submit("episode", {"scene": "s1"})
+    until(lambda: jobs.problem)
+    assert "tried again" in jobs.problem
+    assert jobs.get(job.id).state == "queued"
+    is_broken.clear()
+    until_state(jobs, job, "running")
+    played.end_with({})
+    until_state(jobs, job, "done")
+    until(lambda: jobs.problem is None)

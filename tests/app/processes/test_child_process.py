@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from app.processes.child_process import end, import_quietly, launch, own_group, silence_stdout
+from app.processes.child_process import end, import_quietly, launch, limit_memory, own_group, silence_stdout
 from tests.app.conftest import until
 
 
@@ -23,6 +23,15 @@ def with_child(connection):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     connection.send(child.pid)
     time.sleep(600)
+
+
+def with_little_memory(connection):
+    limit_memory(256 << 20)
+    connection.send(len(bytearray(64 << 20)))
+    try:
+        bytearray(512 << 20)
+    except MemoryError:
+        connection.send("refused")
 
 
 def is_running(pid):
@@ -62,3 +71,10 @@ def test_a_quiet_import_still_fails_loudly(capfd):
         import_quietly("no_such_module")
     os.write(2, b"heard")
     assert capfd.readouterr().err == "heard"
+
+
+def test_memory_beyond_the_limit_is_refused():
+    process, connection = launch(with_little_memory, "little")
+    assert (connection.recv(), connection.recv()) == (64 << 20, "refused")
+    end(process, 10)
+    connection.close()

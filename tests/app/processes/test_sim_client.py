@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.processes.messages.scene_messages import Act, AdoptScene, CreateScene, ResetScene, SceneChanged, TakeImage
-from app.processes.process_client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessUnavailable
+from app.processes.process_client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessFrozen, ProcessUnavailable
 from app.processes.sim_process import simulation_main
 from osfcore.errors import OverlappingObjects, UnknownName
 from osfcore.geometry.poses import Pose
@@ -93,16 +93,14 @@ def test_waiting_commands_fail_clearly_when_it_dies(link):
             future.result(20)
 
 
-def test_a_simulation_that_hangs_is_replaced(library, desk):
-    link = simulation(library, desk, 1.0)
-    link.start()
-    until(lambda: link.status == "ready")
-    hung = link.process
-    os.kill(hung.pid, signal.SIGSTOP)
-    with pytest.raises(ProcessUnavailable, match="did not answer"):
-        create(link)
-    until(lambda: link.process is not hung and link.status == "ready")
-    link.stop()
+def test_a_frozen_simulation_comes_back_with_its_scenes(link, desk):
+    create(link)
+    frozen = link.process
+    os.kill(frozen.pid, signal.SIGSTOP)
+    with pytest.raises(ProcessFrozen, match="restarted"):
+        link.call(ResetScene("a"))
+    until(lambda: link.process is not frozen and link.status == "ready")
+    assert link.call(ResetScene("a")).state.names == ("003_cracker_box",)
 
 
 def test_too_much_at_once_is_refused(link):

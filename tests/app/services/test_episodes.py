@@ -5,6 +5,7 @@ import io
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -279,6 +280,14 @@ def test_frames_are_shown_whole_and_in_parts(episodes, broken_off):
         np.testing.assert_array_equal(cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1], part_of(drawn(1), part))
     with pytest.raises(UnknownName, match="0 to 1"):
         episodes.frame(broken_off, 2, "all")
+
+
+def test_a_frame_that_is_deleted_while_it_is_asked_for_is_unknown(episodes, runner, broken_off, monkeypatch):
+    frames = runner.jobs.folder(broken_off.id) / FRAMES_FOLDER
+    (frames / "001.png").unlink()
+    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was a moment ago
+    with pytest.raises(UnknownName, match="0 to 0"):
+        episodes.frame(broken_off, 1, "all")
 
 
 def test_frames_that_are_damaged_or_not_there_yet_are_told(episodes, runner, broken_off):

@@ -209,6 +209,7 @@ def test_an_uploaded_folder_is_taken_in_with_its_prior(estimates, runner, tmp_pa
     data = archive(tmp_path, seen(views=1, masks=False), prior_json=(tmp_path / "prior.json").read_text())
     goal = upload(estimates, data, Asked("goal"))
     assert (runner.jobs.inputs(goal.id) / "prior.json").is_file()
+    write_estimated(runner.jobs.folder(job.id) / STATE, believed((MUSTARD, BOX)))  # another order
     later = upload(estimates, archive(tmp_path, seen(masks=False)), Asked("next", prior=job.id))
     assert (runner.jobs.inputs(later.id) / "prior.json").is_file()
     assert left_over(tmp_path) == []
@@ -311,6 +312,9 @@ def test_images_are_of_cameras_and_steps_that_exist(estimates, runner):
     assert latest.observed == estimates.observed(job, 1).read_bytes()
     with pytest.raises(UnknownName, match="no step named '3'"):
         estimates.comparison(job, 1, 3)
+    estimates.observed(job, 1).unlink()
+    with pytest.raises(NoImages, match="have been removed"):
+        estimates.comparison(job, 1)
     with pytest.raises(NoImages, match="it was cancelled"):
         estimates.observed(runner.jobs.finish(job, "cancelled"), 0)
 

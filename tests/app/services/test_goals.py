@@ -17,7 +17,7 @@ from app.services.goals import GOAL_SIDE, Draft, DraftChanged, DraftUnsound, Goa
 from app.services.scenes import SceneHeld
 from app.storage.database import CannotStore
 from app.storage.goal_store import GoalStore, TooManyGoals
-from app.storage.photos import PhotoRefused
+from app.storage.photos import PhotoRefused, read_photo
 from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
@@ -64,9 +64,15 @@ def runner():
     return Runner()
 
 
+class Photos:
+    """Decodes here."""
+
+    read = staticmethod(read_photo)
+
+
 @pytest.fixture
 def goals(runner, tmp_path):
-    goals = Goals(runner, tmp_path, max_goals=3)
+    goals = Goals(runner, tmp_path, max_goals=3, photos=Photos())
     goals.start()
     return goals
 

@@ -1,7 +1,10 @@
 """Whatever a stranger sends is either a picture of moderate size or refused in one sentence."""
 
 import io
+import os
+import signal
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -10,7 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from app.storage.photos import KEPT_SIDE, MAX_RATIO, MAX_SIDE, MIN_SIDE, PhotoRefused, read_photo
+from app.processes.process_client import ProcessUnavailable
+from app.processes.process_server import OutOfMemory
+from app.storage.photos import KEPT_SIDE, MAX_RATIO, MAX_SIDE, MIN_SIDE, PhotoReader, PhotoRefused, read_photo
 
 TURNED = 6  # EXIF: the camera was held upright, so its first row is the right edge
 ORIENTATION = 0x0112
@@ -69,7 +74,7 @@ def test_every_kind_of_png_is_understood(mode):
 def test_sixteen_bits_become_eight():
     values = np.linspace(0, 65535, 64 * 64).astype(np.uint16).reshape(64, 64)
     seen = read_photo(encoded(Image.fromarray(values)))
-    np.testing.assert_allclose(seen[..., 0], values / 257, atol=0.5)
+    np.testing.assert_array_equal(seen[..., 0], np.round(values / 257))
     assert (seen == seen[..., :1]).all()
 
 
@@ -195,3 +200,158 @@ def mutated(rng):
 def test_damage_anywhere_is_refused_or_harmless(count):
     outcomes = [taken_or_refused(mutated(np.random.default_rng([count, number]))) for number in range(count)]
     assert 0 < sum(seen is None for seen in outcomes) < count
+
+
+# Odd metadata
+
+
+def segment(marker, data):
+    return bytes([0xFF, marker]) + struct.pack(">H", len(data) + 2) + data
+
+
+def jpeg_with(*segments, size=(96, 64)):
+    plain = encoded(picture(*size), "JPEG", quality=95)
+    return plain[:2] + b"".join(segments) + plain[2:]
+
+
+def tiff(*entries, order="<", count=None, offset=8):
+    """The metadata that EXIF is: a table of (tag, type, count, value)."""
+    head = (b"II" if order == "<" else b"MM") + struct.pack(f"{order}HL", 42, offset)
+    table = b"".join(struct.pack(f"{order}HHLL", *entry) for entry in entries)
+    return head + struct.pack(f"{order}H", len(entries) if count is None else count) + table + bytes(4)
+
+
+def exif(data):
+    return segment(0xE1, b"Exif\0\0" + data)
+
+
+def xmp(data):
+    return segment(0xE1, b"http://ns.adobe.com/xap/1.0/\0" + data)
+
+
+RIGHT, WIDTH, PACKET = (ORIENTATION, 3, 1, TURNED), 0x011A, 0x02BC
+ODD_TURNED = {  # understood as far as needed, though what else they say makes no sense
+    "maker is a fraction": exif(tiff(RIGHT, (0x010F, 5, 1, 8))),
+    "maker is a number": exif(tiff(RIGHT, (0x010F, 11, 1, 7))),
+    "resolution is text": exif(tiff(RIGHT, (WIDTH, 2, 4, 0x363636))),
+    "resolution is bytes": exif(tiff(RIGHT, (WIDTH, 7, 4, 7))),
+    "XMP packet is a number": exif(tiff(RIGHT, (PACKET, 12, 1, 8))),
+    "XMP packet is text": exif(tiff(RIGHT, (PACKET, 2, 4, 0x363636))),
+    "XMP packet is a list of numbers": exif(tiff(RIGHT, (PACKET, 11, 2, 8))),
+    "strips are nowhere": exif(tiff(RIGHT, (0x0111, 4, 1, 2**32 - 1))),
+    "orientation is a list": exif(tiff((ORIENTATION, 3, 2, 6 + (6 << 16)))),
+    "XMP is no XML": xmp(b'<<\xff\xfe tiff:Orientation="6"'),
+}
+ODD_UPRIGHT = {
+    "orientation is text": exif(tiff((ORIENTATION, 2, 4, 0x363636))),
+    "orientation is bytes": exif(tiff((ORIENTATION, 7, 4, 6))),
+    "orientation is a fraction by zero": exif(tiff((ORIENTATION, 5, 1, 26)) + bytes(8)),
+    "orientation is a fraction from nowhere": exif(tiff((ORIENTATION, 5, 1, 2**32 - 1))),
+    "orientation is unknown": exif(tiff((ORIENTATION, 3, 1, 99))),
+    "type is unknown": exif(tiff((ORIENTATION, 77, 1, 6))),
+    "table is nowhere": exif(tiff(RIGHT, offset=2**31)),
+    "table is the head": exif(tiff(RIGHT, offset=0)),
+    "head is cut off": exif(b"II*"),
+    "head is of no known kind": exif(b"IX*\0\0\0\0\0" * 3),
+    "nothing": exif(b""),
+    "another order of bytes": exif(b"MM" + tiff(RIGHT)[2:]),
+    "XMP says nonsense": xmp(b'<a tiff:Orientation="9"/>'),
+    "XMP in another encoding": xmp('<a tiff:Orientation="6"/>'.encode("utf-16")),
+}
+ODD_ANY = {
+    "colour profile without its number": segment(0xE2, b"ICC_PROFILE\0"),
+    "JFIF without a version": segment(0xE0, b"JFIF"),
+    "Adobe without a version": segment(0xEE, b"Adobe"),
+    "further views from nowhere": segment(0xE2, b"MPF\0" + tiff((0xB001, 4, 1, 9), (0xB002, 7, 2**31, 2**31))),
+    "a table of 65535 entries": exif(tiff(RIGHT, count=65535)),
+    "resources that end early": segment(0xED, b"Photoshop 3.0\x008BIM\4\4\xff"),
+}
+
+
+@pytest.mark.parametrize("odd", ODD_TURNED.values(), ids=ODD_TURNED)
+def test_odd_metadata_does_not_hide_which_way_is_up(odd):
+    seen = read_photo(jpeg_with(odd))
+    assert np.abs(seen.astype(int) - np.rot90(np.asarray(picture()), -1)).mean() < 8
+
+
+@pytest.mark.parametrize("odd", ODD_UPRIGHT.values(), ids=ODD_UPRIGHT)
+def test_metadata_that_cannot_be_understood_turns_nothing(odd):
+    seen = read_photo(jpeg_with(odd))
+    assert np.abs(seen.astype(int) - np.asarray(picture())).mean() < 8
+
+
+@pytest.mark.parametrize("odd", ODD_ANY.values(), ids=ODD_ANY)
+def test_other_odd_metadata_is_refused_or_harmless(odd):
+    taken_or_refused(jpeg_with(odd))
+
+
+@given(noise=st.binary(max_size=80), place=st.integers(0, 80), kind=st.sampled_from([exif, xmp]))
+def test_random_metadata_never_spoils_a_photo(noise, place, kind):
+    sound = tiff(RIGHT, (WIDTH, 5, 1, 8), (PACKET, 7, 4, 7))
+    assert taken_or_refused(jpeg_with(kind(sound[:place] + noise + sound[place + len(noise) :]))) is not None
+
+
+# In a process
+
+
+@pytest.fixture
+def reader(request):
+    reader = PhotoReader(*getattr(request, "param", ()))
+    yield reader
+    reader.stop()
+
+
+def odd_reader(data):
+    """Misbehaves as asked, and otherwise says how long what was sent is."""
+    if data == b"hang":
+        time.sleep(600)
+    if data == b"crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if data == b"devour":
+        return bytearray(4 << 30)
+    return len(data)
+
+
+def test_photos_are_decoded_elsewhere(reader):
+    for mode in ("RGB", "L"):
+        image = picture().convert(mode)
+        np.testing.assert_array_equal(reader.read(encoded(image)), np.asarray(image.convert("RGB")))
+    with pytest.raises(PhotoRefused, match="neither a PNG nor a JPEG"):
+        reader.read(b"GIF89a")
+
+
+def test_the_largest_photos_fit_into_the_memory_of_the_process(reader):
+    pixels = np.random.default_rng(0).integers(0, 256, (512, 512, 4), np.uint8).repeat(8, axis=0).repeat(8, axis=1)
+    photos = {
+        "CMYK": encoded(Image.fromarray(pixels, "CMYK"), "JPEG", progressive=True),
+        "RGBA": encoded(Image.fromarray(pixels), compress_level=1),
+        "I;16": encoded(Image.fromarray(pixels[..., 0].astype(np.uint16) * 257), compress_level=1, exif=turned_exif()),
+    }
+    for mode, data in photos.items():
+        assert reader.read(data).shape == (512, 512, 3), mode
+
+
+def test_a_bomb_in_the_process_is_refused_and_hurts_nobody(reader):
+    text = b"Comment\0\0" + zlib.compress(b"0" * 200_000_000, 9)
+    with pytest.raises(PhotoRefused):
+        reader.read(png_of(64, 64, (b"zTXt", text), (b"IDAT", zlib.compress(b"\0" * 64 * 193))))
+    assert reader.read(encoded(picture())).shape == (64, 96, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", [(odd_reader, 8.0)], indirect=True)
+def test_a_decoder_that_hangs_is_ended_and_heals(reader):
+    with pytest.raises(PhotoRefused, match="could not be decoded within 8 s"):
+        reader.read(b"hang")
+    assert reader.read(b"sound") == 5
+
+
+@pytest.mark.parametrize("reader", [(odd_reader,)], indirect=True)
+def test_a_decoder_that_crashes_or_devours_memory_is_told_and_heals(reader):
+    assert reader.read(b"sound") == 5
+    with pytest.raises(ProcessUnavailable, match="decoder of photos stopped unexpectedly"):
+        reader.read(b"crash")
+    assert reader.read(b"sound") == 5
+    with pytest.raises(OutOfMemory, match="ran out of memory"):
+        reader.read(b"devour")
+    assert reader.read(b"sound") == 5

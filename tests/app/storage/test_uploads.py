@@ -39,6 +39,10 @@ def devour(folder):
     raise MemoryError
 
 
+def devour_truly(folder):
+    return len(bytearray(8 << 30))
+
+
 def die(folder):
     os._exit(3)
 
@@ -74,6 +78,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
         (fill_the_disk, "No space left", UploadNotStored),
         (fail, r"failed \(RuntimeError\)", UploadRefused),
         (devour, "ran out of memory", UploadRefused),
+        (devour_truly, "looked at the drawing ran out of memory; take fewer or smaller images", UploadRefused),
         (die, "ended unexpectedly", UploadRefused),
     ],
 )

@@ -111,9 +111,19 @@ def test_the_same_generator_gives_the_same_estimate(models, truth):
     np.testing.assert_array_equal(first.poses.quaternion, second.poses.quaternion)
 
 
+def test_the_order_of_the_expected_objects_does_not_matter(models, truth):
+    seen = observe(models, pushed(truth, (0.02, 0.01), 0.2), CAMERAS, masks=False)
+    first, second = (
+        next(estimate_next(models, seen, expected, np.random.default_rng(0))).state
+        for expected in (truth, truth.reordered(truth.names[::-1]))
+    )
+    assert first.names == second.names == seen.names
+    np.testing.assert_array_equal(first.poses.position, second.poses.position)
+
+
 def test_other_objects_than_expected_are_refused(models, truth):
     seen = observe(models, truth, CAMERAS, masks=False)
-    other = replace(truth, names=truth.names[::-1])
+    other = replace(truth, names=(truth.names[0], "another"))
     with pytest.raises(InvalidInput, match="expected state"):
         next(estimate_next(models, seen, other, np.random.default_rng(0)))
     unheard = replace(seen, names=("unheard", truth.names[1]))

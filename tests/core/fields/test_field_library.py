@@ -100,6 +100,12 @@ def test_unknown_names_are_told_with_the_known_ones(shipped, data_dir):
                 ask(name)
 
 
+def test_a_field_that_is_deleted_while_it_is_asked_for_is_unknown(shipped, data_dir, monkeypatch):
+    monkeypatch.setattr(FieldLibrary, "has", lambda *_: True)  # as it was a moment ago
+    with pytest.raises(UnknownName, match="no field named .mug."):
+        FieldLibrary(data_dir, shipped=shipped).info("mug")
+
+
 def test_without_a_data_directory_nothing_can_be_placed(shipped):
     with pytest.raises(UnknownName, match="folder"):
         FieldLibrary(None, shipped=shipped).folder("mug")

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, UnknownName, check_seed
 from osfcore.geometry.cameras import CAMERA_POSITIONS, SCENE_CENTRE, Camera, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -48,6 +48,15 @@ def test_a_resized_camera_sees_the_same():
 
 def test_a_camera_straight_above_has_an_upright_image():
     camera = Camera.look_at("above", (0, 0, 1), (0, 0, 0), size=64)
+    matrix = camera.T_world_camera.matrix()[:3, :3]
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(camera.project(np.zeros(3)), [32, 32])
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 1, 1)])
+@pytest.mark.parametrize("position", [(0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 0), (0, 1, 1), (0, 1, 1e-12)])
+def test_cameras_look_along_any_direction(position, up):
+    camera = Camera.look_at("any", position, (0, 0, 0), size=64, up=up)
     matrix = camera.T_world_camera.matrix()[:3, :3]
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(camera.project(np.zeros(3)), [32, 32])
@@ -113,6 +122,18 @@ def test_states_that_cannot_be_are_refused(bad, words):
 def test_pose_of_an_object_by_name():
     both = state(("a", "b"), [[0.0, 0, 0], [0.1, 0.2, 0.3]])
     np.testing.assert_array_equal(both.pose("b").position, [0.1, 0.2, 0.3])
+    with pytest.raises(UnknownName, match="no object in the scene named 'c'; known: a, b"):
+        both.pose("c")
+
+
+def test_objects_are_put_in_another_order():
+    both = state(("a", "b"), [[0.0, 0, 0], [0.1, 0.2, 0.3]])
+    other = both.reordered(("b", "a"))
+    assert other.names == ("b", "a")
+    for name in both.names:
+        np.testing.assert_array_equal(other.pose(name).position, both.pose(name).position)
+    with pytest.raises(UnknownName, match="'c'"):
+        both.reordered(("b", "c"))
 
 
 def test_seeds_are_what_every_generator_takes():

@@ -1,9 +1,13 @@
+import contextlib
 import shutil
 import stat
+import struct
 import zipfile
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import osfcore.io.archives as module
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
@@ -192,3 +196,89 @@ def test_an_archive_without_an_observation_is_told(archive, tmp_path):
     with pytest.raises(CorruptFile, match="leads out"):
         unpack_observation(archive, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def many(path, count, comment=b"", before=b""):
+    """An archive whose list names `count` files, of which it holds none."""
+    entries = b"".join(
+        struct.pack("<4s24xHHH12x", b"PK\1\2", len(name), 0, 0) + name
+        for name in (f"train/{number}.png".encode() for number in range(count))
+    )
+    end = struct.pack("<4s4xHHLLH", b"PK\5\6", count % 65536, count % 65536, len(entries), len(before), len(comment))
+    path.write_bytes(before + entries + end + comment)
+    return path
+
+
+def large_form(archive, size=None, told=None, comment=b""):
+    """The same archive with the records for large archives, and an end record that says nothing."""
+    data = archive.read_bytes()
+    body, end = data[:-22], data[-22:]
+    size = struct.unpack_from("<12xL", end)[0] if size is None else size
+    record = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 1, 1, size, max(len(body) - size, 0))
+    locator = struct.pack("<4sLQL", b"PK\6\7", 0, len(body) if told is None else told, 1)
+    nothing = struct.pack("<4s4xHHLLH", b"PK\5\6", 1, 1, 0, 0, len(comment))
+    archive.write_bytes(body + record + locator + nothing + comment)
+    return archive
+
+
+@pytest.fixture
+def unparsed(monkeypatch):
+    """Fails a test in which a list of files is parsed."""
+    monkeypatch.setattr(zipfile, "ZipFile", lambda *_: pytest.fail("the list was parsed"))
+
+
+@pytest.mark.usefixtures("unparsed")
+def test_files_are_counted_before_their_list_is_parsed(tmp_path):
+    path = tmp_path / "many.zip"
+    forms = (
+        lambda: many(path, 31),
+        lambda: many(path, 31, comment=b"made by a tool" * 1000),
+        lambda: many(path, 31, before=b"#!/bin/sh\n" * 1000),
+        lambda: many(path, 31 + 65536),  # the end record says 31
+        lambda: large_form(many(path, 31)),
+        lambda: large_form(many(path, 31, before=b"x" * 50), comment=b"by a tool"),
+    )
+    for form in forms:
+        form()
+        with pytest.raises(CorruptFile, match=r"many.zip cannot be used: it(s list)? (holds|of files has) \d+"):
+            unpack_set(path, tmp_path / "out", max_files=30)
+
+
+@pytest.mark.usefixtures("unparsed")
+def test_a_list_that_is_large_for_what_it_may_hold_is_refused(tmp_path):
+    names = b"".join(struct.pack("<4s24xHHH12x", b"PK\1\2", 1, 40_000, 0) + b"x" + bytes(40_000) for _ in range(20))
+    (tmp_path / "fat.zip").write_bytes(names + struct.pack("<4s4xHHLLH", b"PK\5\6", 20, 20, len(names), 0, 0))
+    with pytest.raises(CorruptFile, match="its list of files has 800940 bytes; at most 65536 are read"):
+        unpack_set(tmp_path / "fat.zip", tmp_path / "out", max_files=30)
+
+
+def test_records_of_large_archives_are_understood_or_refused(archive, tmp_path):
+    sound = archive.read_bytes()
+    shutil.rmtree(unpack_set(large_form(archive), tmp_path / "out"))
+    archive.write_bytes(sound)
+    unpack_set(large_form(archive, comment=b"by a tool"), tmp_path / "out")
+    archive.write_bytes(sound)
+    with pytest.raises(CorruptFile, match="damaged"):
+        unpack_set(large_form(archive, size=2**63), tmp_path / "set")
+    archive.write_bytes(b"PK\6\6" + sound)
+    with pytest.raises(CorruptFile, match="two lists of its files"):
+        unpack_set(large_form(archive, told=0), tmp_path / "set")
+
+
+@given(data=st.data())
+def test_no_damage_to_an_archive_brings_another_error(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("damaged")
+    path = folder / "few.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("train/anno.json", "{}")
+        file.writestr("test/0.png", b"\0" * 300)
+    if data.draw(st.booleans(), "large form"):
+        large_form(path)
+    sound = path.read_bytes()
+    tail = len(sound) - sound.index(b"PK\1\2")
+    damaged = bytearray(sound)
+    for place in data.draw(st.lists(st.integers(-tail, -1), min_size=1, max_size=8), "places"):
+        damaged[place] = data.draw(st.sampled_from([0, 1, 2, 0x4B, 0x50, 0x7F, 0x80, 0xFF]) | st.integers(0, 255))
+    path.write_bytes(bytes(damaged) + data.draw(st.sampled_from([b"", b"x", b"PK\5\6", sound[-22:]]), "more"))
+    with contextlib.suppress(CorruptFile):
+        unpack_set(path, folder / "out", max_files=2)

@@ -281,6 +281,10 @@ def test_poses_within_an_action_lead_to_its_end(library, world):
         assert same(world.truth(), twin.truth())
     with pytest.raises(InvalidInput):
         world.act_recorded(np.array([0.31, 0, 0]), 4)
+    for instants in (0, -1, 5, 96):
+        with pytest.raises(InvalidInput, match="divisor of 48"):
+            world.act_recorded(ACTIONS[0], instants)
+    assert same(world.truth(), twin.truth())
     twin.close()
 
 

@@ -15,6 +15,7 @@ from osfcore.io.scene_file import camera_to_json
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import LONG, until
 from tests.app.services.test_goals import photo
+from tests.app.storage.test_photos import ODD_ANY, ODD_TURNED, ODD_UPRIGHT, jpeg_with
 
 BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"
 PNG = {"Content-Type": "image/png"}
@@ -84,6 +85,15 @@ def test_a_photo_may_bring_its_own_camera(service):
     goal = upload(service, photo(96, 64), camera=json.dumps(camera)).json()
     assert (goal["width"], goal["height"], goal["camera"]["name"]) == (96, 64, "mine")
     assert "96 x 64" in is_problem(upload(service, photo(96, 64)), 422)["detail"]
+
+
+def test_odd_metadata_is_no_defect_of_the_service(service):
+    for name, odd in (ODD_TURNED | ODD_UPRIGHT | ODD_ANY).items():
+        made = upload(service, jpeg_with(odd, size=(64, 64)), {"Content-Type": "image/jpeg"})
+        if name in ODD_ANY and made.status_code == 422:
+            continue
+        assert made.status_code == 201, name
+        service.delete(made.headers["location"])
 
 
 @pytest.mark.parametrize(
@@ -255,4 +265,4 @@ def test_photos_may_be_larger_than_other_bodies():
         own.kwargs["limit_of"] for own in create_app(Settings()).user_middleware if "limit_of" in own.kwargs
     )
     assert limit_of("/api/goals") == limit_of("/api/goals/") == Settings().max_photo_bytes
-    assert limit_of("/api/goals/draft") == limit_of("/api/episodes") == Settings().max_body_bytes
+    assert limit_of("/api/goals/draft") == limit_of("/api/episodes") < limit_of("/api/predictions")

@@ -220,6 +220,24 @@ def test_what_made_the_recording_has_no_error(recording, table):
     assert found.constant_mm_4 > 10
 
 
+def test_where_nothing_ever_happens_all_windows_are_measured(recording, table):
+    quiet = replace(recording, is_busy=np.zeros_like(recording.is_busy))
+    busy = replace(recording, is_busy=np.ones_like(recording.is_busy))
+    net = network()
+    assert validate(net, table, quiet) == validate(net, table, busy)
+
+
+def test_recordings_in_which_everything_falls_off_the_table_are_told(tmp_path, shapes):
+    fallen = []
+    for seed in range(13):
+        episode = pushes(shapes, *PAIRS[0], seed)
+        positions = episode.positions.copy()
+        positions[..., 2] = -0.7
+        fallen.append(replace(episode, positions=positions))
+    with pytest.raises(InvalidInput, match="stay on the table is 0"):
+        list(train_dynamics(config(write(tmp_path / "fallen.h5", fallen), tmp_path), shapes))
+
+
 def test_a_network_that_learned_nothing_is_worse(recording, table):
     exact, random = validate(network(silent=True), table, recording), validate(network(), table, recording)
     assert random.loss > exact.loss + 1

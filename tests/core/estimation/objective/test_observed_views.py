@@ -171,6 +171,12 @@ def test_around_are_windows_that_hold_the_object(plain, params, views):
         np.testing.assert_allclose(shown.sum(axis=(1, 2)), views.masks[:, number].sum(axis=(1, 2)), rtol=1e-3)
 
 
+def test_around_keeps_which_pixels_count(plain, params, views):
+    bright = views.images.sum(axis=-1) > 0.2
+    own = crop_to_object(replace(views, only=bright), plain, params, 0)
+    np.testing.assert_array_equal(own.only, own.images.sum(axis=-1) > 0.2)
+
+
 def test_around_leaves_out_cameras_that_look_elsewhere(plain, params):
     away = view((0.5, 0, 0.4), (1.0, 0, 0.5), 64)
     both = own_views(plain, params, [CAMERAS[0], away])

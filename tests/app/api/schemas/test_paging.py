@@ -2,7 +2,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from app.api.paging import page
+from app.api.schemas.paging import page
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import keep_busy
 

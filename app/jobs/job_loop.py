@@ -1,0 +1,188 @@
+"""The job loop: a thread that takes the next job from the queue and follows its process to the end."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from app.jobs.job import Job, JobChanged, JobView, ended
+from app.jobs.job_folders import JobFolders
+from app.jobs.job_process import JobProcess
+from app.jobs.job_table import JobTable
+from app.jobs.outcomes import JobStopped, Outcome, after
+from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep, SceneCommand
+from app.processes.messages.scene_messages import Command
+from app.processes.process_server import Answer
+from app.storage.database import now_utc
+from app.storage.field_files import clear_workshop
+from osfcore.errors import OsfError, UnknownName
+
+StartProcess = Callable[[Job, Path, Path, Callable[[object], None]], JobProcess]
+_RETRY_S = 1.0  # after a failure of the loop itself
+_log = logging.getLogger(__name__)
+
+
+class JobLoop:
+    """Does one job at a time, each in a process of its own.
+
+    Args:
+        changed: guards the table; notified when a job is added or has ended.
+        table: of all jobs.
+        data_dir: of the service.
+        publish: told what the running job lets the live view draw.
+        serve: carries out what a job asks for with the scene that it drives.
+        start_process: of a job, its data directory, its folder and what takes its events.
+    """
+
+    def __init__(
+        self,
+        changed: threading.Condition,
+        table: JobTable,
+        data_dir: Path,
+        publish: Callable[[JobChanged | JobView], None],
+        serve: Callable[[Command], Any] | None,
+        start_process: StartProcess,
+    ) -> None:
+        self._changed, self._table = changed, table
+        self._data_dir, self._folders = data_dir, JobFolders(data_dir)
+        self._publish, self._serve, self._start_process = publish, serve, start_process
+        self._is_stopping = False
+        self._thread: threading.Thread | None = None
+        self._serving = ThreadPoolExecutor(1, thread_name_prefix="jobs-scene")
+        self.run: JobProcess | None = None  # the job at work
+        self.problem: str | None = None  # why no job goes on, for people; None if all is well
+
+    def start(self) -> None:
+        """Begin to work."""
+        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the running job, which counts as failed. Calling it again does nothing."""
+        with self._changed:
+            self._is_stopping = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._serving.shutdown(wait=False)
+
+    def _work(self) -> None:
+        while not self._is_stopping:
+            try:
+                self._work_once()
+            except Exception as error:  # whatever it is, jobs must go on once its cause is gone
+                _log.exception("the job loop failed")
+                self.problem = f"Jobs cannot go on ({type(error).__name__}); it is tried again."
+                time.sleep(_RETRY_S)
+        if self.run is not None:
+            self.run.end()
+
+    def _work_once(self) -> None:
+        """Wait for a job and do it; one that an earlier failure has left is brought to its end."""
+        if self.run is None:
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_stopping or bool(self._table.queue()))
+                if self._is_stopping:
+                    return
+                job = self._table.queue()[0]
+                try:
+                    self._begin(job)
+                except OSError as error:
+                    self._table.set(ended(job, "failed", error=f"The job could not be started ({error.strerror})."))
+                    return
+        self.problem = None
+        self._attend()
+
+    def _begin(self, job: Job) -> None:
+        folder = self._folders.folder(job.id)
+        if job.kind != "fetch_assets":
+            folder.mkdir(parents=True, exist_ok=True)
+        self.run = self._start_process(job, self._data_dir, folder, self._on_event)
+        self._table.set(replace(job, state="running", started_at=now_utc(), note="Starting"))
+        self._table.publish_queue()
+
+    def _attend(self) -> None:
+        """Follow the running job until its process has ended."""
+        run = self.run
+        assert run is not None
+        outcome: Outcome | None = None
+        while outcome is None:
+            outcome = run.wait()
+            with self._changed:
+                if outcome is None:
+                    self._table.flush_progress()
+                if outcome is None and self._is_stopping:
+                    outcome = JobStopped()
+        run.end()
+        self._finish(run, outcome)
+
+    def _finish(self, run: JobProcess, outcome: Outcome) -> None:
+        job = self._table[run.id]
+        if run.is_cancelled and not isinstance(outcome, dict):
+            outcome = JobCancelled()  # whatever ended it first, it was asked to
+        then = after(job, outcome, self._folders.folder(job.id))
+        if then.state == "cancelled":
+            forget_workshop(self._data_dir, self._table, job)
+        with self._changed:
+            self.run = None
+            self._table.set(then)
+            self._changed.notify_all()
+
+    def _on_event(self, event: object) -> None:
+        """Take what the running job tells, in the thread that listens to it."""
+        with self._changed:  # until it has been noted which job that is
+            run = self.run
+        assert run is not None
+        match event:
+            case JobStep():
+                self._progress(run, event)
+            case SceneCommand():
+                self._serving.submit(self._answer, run, event)
+            case JobRests():
+                self._rest(run)
+
+    def _progress(self, run: JobProcess, step: JobStep) -> None:
+        with self._changed:
+            eta_s = run.clock.left_s(step.done, step.total)
+            job = self._table[run.id]
+            result = step.result or None
+            job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
+            self._table.set_progress(job)
+        if step.view is not None:
+            self._publish(JobView(job, step.view))
+
+    def _answer(self, run: JobProcess, asked: SceneCommand) -> None:
+        """Carry out what a job asks for, with the scene that it drives and no other.
+
+        In a thread of its own: the simulation may hang, and the job must be heard, and cancelled, meanwhile.
+        """
+        scene = self._table[run.id].params.get("scene")
+        try:
+            if self._serve is None or asked.command.id != scene:
+                raise UnknownName("scene of this job", asked.command.id, [str(scene)])
+            answer = Answer(0, self._serve(asked.command))
+        except OsfError as error:
+            answer = Answer(0, error=error)
+        run.order(answer)
+
+    def _rest(self, run: JobProcess) -> None:
+        """The job has come to the end of a round, and waits."""
+        with self._changed:
+            run.clock.switch(is_running=False)
+            self._table.set(replace(self._table[run.id], state="paused", eta_s=None))
+
+
+def forget_workshop(data_dir: Path, table: JobTable, job: Job) -> None:
+    """Remove what a cancelled training would find at its next try, unless another works there."""
+    if job.kind != "train_field":
+        return
+    name = job.params["name"]
+    if not any(other.id != job.id and other.params["name"] == name for other in table.live(job.kind)):
+        clear_workshop(data_dir, name)
