@@ -19,8 +19,10 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api import problems, relay
 from app.api.bodies import SMALL_BODY_BYTES
-from app.api.connection_timeouts import BodyTimeoutMiddleware
 from app.api.dependencies import ObjectCatalogue, Services
+from app.api.guards.connection_timeouts import BodyTimeoutMiddleware
+from app.api.guards.security import BodyLimitMiddleware, SecurityMiddleware
+from app.api.guards.token_gate import TokenMiddleware
 from app.api.http_metrics import Metrics, MetricsMiddleware
 from app.api.routes import comparisons as neural
 from app.api.routes import (
@@ -41,8 +43,6 @@ from app.api.routes import (
 from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
-from app.api.security import BodyLimitMiddleware, SecurityMiddleware
-from app.api.token_gate import TokenMiddleware
 from app.processes.predict_process import predictor_main
 from app.processes.process_client import ProcessClient
 from app.processes.render_process import renderer_main

@@ -21,10 +21,9 @@ def problems(runner: Runner, data_dir: Path) -> tuple[str, ...]:
         runner: holds the simulation and the jobs.
         data_dir: where everything is stored.
     """
-    found = [runner.jobs.problem, _disk_problem(data_dir)]
-    if runner.simulation_status == "restarting":
-        found.append("The simulation has stopped and is being restarted.")
-    return tuple(sentence for sentence in found if sentence is not None)
+    disk = _disk_problem(data_dir)
+    found = runner.problems()
+    return found if disk is None else (*found, disk)
 
 
 def _disk_problem(data_dir: Path) -> str | None:

@@ -18,9 +18,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.rate_limit import RateLimit
-from app.api.security import is_same_origin
-from app.api.viewer_messages import BURST, RATE, is_allowed
+from app.api.guards.rate_limit import RateLimit
+from app.api.guards.security import is_same_origin
+from app.api.guards.viewer_messages import BURST, RATE, is_allowed
 from app.viewer.private_server import SECRET_HEADER
 from osfcore.errors import shown
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from app.storage.database import now_utc
 from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.io.json_codec import decode
 
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files
@@ -141,8 +142,12 @@ def job_fields(job: Job) -> dict[str, Any]:
 
 
 def job_from_fields(fields: dict[str, Any]) -> Job:
-    """The inverse of `job_fields`."""
-    return Job(**{**fields, "files": tuple(fields["files"])})
+    """The inverse of `job_fields`; fields of other versions of this program are left alone.
+
+    Raises:
+        InvalidInput: if they do not make a job.
+    """
+    return decode(Job, {name: fields[name] for name in Job.__dataclass_fields__ if name in fields}, "job")
 
 
 def ended(job: Job, state: State, **changes: Any) -> Job:  # noqa: ANN401  any field of Job

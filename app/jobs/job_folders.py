@@ -10,6 +10,7 @@ from pathlib import Path
 
 from app.jobs.job import INPUTS
 from app.storage.database import CannotStore
+from app.storage.durable import put_in_place
 
 _TEMPORARY_PREFIX = ".new-"
 
@@ -74,6 +75,6 @@ class JobFolders:
         place = self.inputs(job)
         try:
             place.parent.mkdir(parents=True)
-            inputs.rename(place)
+            put_in_place(inputs, place)
         except OSError as error:
             raise CannotStore(place, error.strerror or str(error)) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -20,6 +21,7 @@ from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep,
 from app.processes.messages.scene_messages import Command
 from app.processes.process_server import Answer
 from app.storage.database import now_utc
+from app.storage.durable import sync_tree
 from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
 
@@ -130,6 +132,9 @@ class JobLoop:
         then = after(job, outcome, self._folders.folder(job.id))
         if then.state == "cancelled":
             forget_workshop(self._data_dir, self._table, job)
+        if then.state == "done":
+            with contextlib.suppress(OSError):
+                sync_tree(self._folders.folder(job.id))  # before anybody is told that it is there
         with self._changed:
             self.run = None
             self._table.set(then)

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 
 from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
-from app.storage.database import Store
+from app.storage.database import CannotStore, Store
 from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
 
@@ -22,14 +22,22 @@ _log = logging.getLogger(__name__)
 class JobTable:
     """Jobs by identifier, oldest first. Callers hold one lock around every call that changes something.
 
+    A new job is stored before anybody hears of it. What becomes of it later is told in any case, since a full disk must
+    not stop work; what could not be stored is stored as soon as the disk takes it.
+
     Args:
         store: where they are kept.
         data_dir: whose place what is told of jobs does not name.
         publish: told of every change; progress is thinned out.
+        check: raises an error for a stored job that this version can do nothing with.
     """
 
-    def __init__(self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None]) -> None:
+    def __init__(
+        self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None], check: Callable[[Job], object] = id
+    ) -> None:
         self._store = store
+        self._check = check
+        self._unwritten: set[str] = set()  # jobs whose latest change is not stored
         self._data_dir = data_dir
         self._publish = publish
         self._jobs: dict[str, Job] = {}
@@ -40,8 +48,13 @@ class JobTable:
     def load(self) -> None:
         """Take over what the store holds."""
         for number, fields in self._store.jobs():
-            job = job_from_fields(fields)
-            self._jobs[job.id], self._numbers[job.id] = job, number
+            try:
+                job = job_from_fields(fields)
+                self._check(job)
+            except (OsfError, TypeError, KeyError, AttributeError) as error:
+                self._store.set_aside("job", str(fields.get("id")), str(error))
+            else:
+                self._jobs[job.id], self._numbers[job.id] = job, number
 
     def __getitem__(self, job: str) -> Job:
         """One job as it is stored."""
@@ -90,9 +103,16 @@ class JobTable:
         return [job for job in list(self._jobs.values()) if kind in (None, job.kind) and not job.is_finished]
 
     def add(self, job: Job) -> None:
-        """Keep a new job, the last of all."""
-        self._numbers[job.id] = 1 + next(reversed(self._numbers.values()), 0)
-        self.set(job)
+        """Keep a new job, the last of all.
+
+        Raises:
+            CannotStore: if it cannot be stored; then there is none.
+        """
+        number = 1 + next(reversed(self._numbers.values()), 0)
+        shown = replace(job, position=1 + len(self.queue()))
+        event = self._store.save_job(job.id, number, job_fields(job), job_fields(shown))
+        self._jobs[job.id], self._numbers[job.id] = job, number
+        self._publish(JobChanged(event, shown))
 
     def forget(self, job: Job) -> None:
         """Keep a job no longer.
@@ -102,6 +122,7 @@ class JobTable:
         """
         event = self._store.forget_job(job.id)
         del self._jobs[job.id], self._numbers[job.id]
+        self._unwritten.discard(job.id)
         self._publish(JobForgotten(event, job))
 
     def set(self, job: Job) -> None:
@@ -144,10 +165,19 @@ class JobTable:
 
     def _keep(self, job: Job) -> None:
         shown = self._told(job, self._waiting())
-        number = 0
+        event = 0
         try:
-            self._store.save_job(job.id, self._numbers[job.id], job_fields(job))
-            number = self._store.add_event(job_fields(shown))
-        except OsfError as error:  # a full disk must not stop the jobs
-            _log.error("job %s: %s", job.id, error)
-        self._publish(JobChanged(number, shown))
+            event = self._store.save_job(job.id, self._numbers[job.id], job_fields(job), job_fields(shown))
+            self._unwritten.discard(job.id)
+        except CannotStore as error:
+            if not self._unwritten:
+                _log.error("job %s: %s", job.id, error)
+            self._unwritten.add(job.id)
+        self._publish(JobChanged(event, shown))
+
+    def write_again(self) -> None:
+        """Store what could not be stored before, as far as the disk takes it now."""
+        for name in tuple(self._unwritten):
+            self._keep(self._jobs[name])
+            if name in self._unwritten:
+                return

@@ -23,7 +23,7 @@ from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, after
 from app.processes.messages.job_messages import ChangeJob, PauseJob, ResumeJob, StepJob
 from app.processes.messages.scene_messages import Command
-from app.storage.database import Store
+from app.storage.database import CannotStore, Store
 from osfcore.errors import OsfError
 
 _RETRY_S = 1.0  # after the job loop has failed
@@ -49,6 +49,7 @@ class Jobs:
         cancel_grace_s: how long a cancelled job may take to stop by itself.
         serve: carries out what a job asks for with the scene that it drives.
         start_process: of a job, its data directory, its folder and what takes its events.
+        check: raises an error for a stored job that this version can do nothing with.
     """
 
     def __init__(
@@ -60,13 +61,14 @@ class Jobs:
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
         start_process: StartProcess = JobProcess,
+        check: Callable[[Job], object] = id,
     ) -> None:
         self._data_dir = data_dir
         self._folders = JobFolders(data_dir)
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
         self._changed = threading.Condition(threading.RLock())
-        self._table = JobTable(store, data_dir, publish)
+        self._table = JobTable(store, data_dir, publish, check)
         self._loop = JobLoop(self._changed, self._table, data_dir, publish, serve, start_process)
 
     def start(self) -> None:
@@ -81,6 +83,11 @@ class Jobs:
     def stop(self) -> None:
         """End the running job, which counts as failed. Calling it again does nothing."""
         self._loop.stop()
+
+    def write_again(self) -> None:
+        """Store what could not be stored before, as far as the disk takes it now."""
+        with self._changed:
+            self._table.write_again()
 
     @property
     def problem(self) -> str | None:
@@ -139,7 +146,7 @@ class Jobs:
 
         Raises:
             QueueFull: if too many wait already.
-            CannotStore: if the inputs cannot be put in place.
+            CannotStore: if the job, or its inputs, cannot be stored; then there is none.
         """
         with self._changed:
             if len(self._table.queue()) >= self._max_queued:
@@ -147,7 +154,11 @@ class Jobs:
             job = Job(uuid.uuid4().hex[:12], kind, params)
             if inputs is not None:
                 self._folders.take(job.id, inputs)
-            self._table.add(job)
+            try:
+                self._table.add(job)
+            except CannotStore:
+                shutil.rmtree(self.folder(job.id), ignore_errors=True)
+                raise
             self._changed.notify_all()
             return self.get(job.id)
 

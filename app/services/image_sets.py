@@ -20,6 +20,7 @@ from pydantic import Field, StrictInt
 from starlette.concurrency import run_in_threadpool
 
 from app.storage.database import CannotStore, now_utc
+from app.storage.durable import put_in_place
 from app.storage.uploads import Examiner, save
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
 from osfcore.io.files import read_json
@@ -172,7 +173,7 @@ class ImageSets:
             (folder / _FACTS).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
             with self._keeping:  # others may have come in since the upload began
                 self._check_room()
-                folder.rename(self._root / record.id)
+                put_in_place(folder, self._root / record.id)
         except OSError as error:
             raise CannotStore(self._root, error.strerror or str(error)) from error
 

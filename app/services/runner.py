@@ -10,6 +10,7 @@ from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobEvent, SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse, check_params
 from app.jobs.registry import Jobs
+from app.jobs.stored import check_stored
 from app.processes.messages.scene_messages import Act, Command
 from app.services.event_hub import Notice
 from app.services.image_sets import ImageSets
@@ -21,6 +22,9 @@ from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
+_TEND_S = 1.0
+_PROBE_S = 5.0
+_DOWN = "The simulation has stopped and is being restarted."
 _RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
 
@@ -34,13 +38,22 @@ class Runner(Scenes):
     def __init__(self, settings: Settings, store: Store, library: AssetLibrary) -> None:
         super().__init__(settings, store, library)
         self.jobs = Jobs(
-            store, settings.data_dir, self._on_job, settings.max_queued_jobs, settings.cancel_grace_s, self._serve
+            store,
+            settings.data_dir,
+            self._on_job,
+            settings.max_queued_jobs,
+            settings.cancel_grace_s,
+            self._serve,
+            check=check_stored,
         )
         self.storage = StorageMeter(settings.data_dir, settings.max_data_bytes, settings.min_free_bytes)
         self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets, self.storage.check_room)
         self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
+        self._probed_at = self._started
+        self._is_over = threading.Event()
+        self._tending: threading.Thread | None = None
 
     def start(self) -> None:
         """Take over what the store holds, start simulation and jobs, make a first scene if there is none."""
@@ -49,10 +62,17 @@ class Runner(Scenes):
             sweep(self._settings.data_dir / folder)
         super().start()
         self.jobs.start()
+        self._tending = threading.Thread(target=self._tend, name="tend", daemon=True)
+        self._tending.start()
+        for sentence in self._store.oddities:
+            self.hub.publish(Notice("warning", sentence))
         self.ensure_demo_scene()
 
     def stop(self) -> None:
         """End all processes. Calling it again does nothing."""
+        self._is_over.set()
+        if self._tending is not None:
+            self._tending.join()
         self.sets.stop()
         self.jobs.stop()
         super().stop()
@@ -160,7 +180,7 @@ class Runner(Scenes):
         """Make the first scene as soon as there are objects, in the background; does nothing if there is a scene."""
         with self._lock:
             count = min(DEMO_OBJECTS, len(self.library.names()))
-            if not self._demo_due or self._records or count == 0:
+            if not self._demo_due or self._table.all() or count == 0:
                 return
             self._demo_due = False
         threading.Thread(target=self._make_demo_scene, args=(count,), name="demo-scene", daemon=True).start()
@@ -171,7 +191,27 @@ class Runner(Scenes):
         except OsfError as error:
             self.hub.publish(Notice("warning", f"No first scene could be made. {error}"))
 
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong now, in sentences for people; nothing once its causes are gone. Tries to write now and then."""
+        if time.monotonic() - self._probed_at > _PROBE_S:
+            self._probed_at = time.monotonic()
+            self._store.probe()
+        is_down = self.simulation_status == "restarting"
+        found = (_DOWN if is_down else None, self.jobs.problem, self._store.problem)
+        return tuple(sentence for sentence in found if sentence is not None)
+
     # Inside
+
+    def _tend(self) -> None:
+        """Store what a disk has refused, again and again until it takes it."""
+        while not self._is_over.wait(_TEND_S):
+            try:
+                if self._store.problem is not None:
+                    self._store.probe()
+                    self.jobs.write_again()
+                    self.write_again()
+            except Exception:  # this thread lives as long as the service
+                _log.exception("what had to be stored again could not be")
 
     def _serve(self, command: Command) -> Any:  # noqa: ANN401  each command says what answers it
         """Carry out what a job asks for with its own scene."""

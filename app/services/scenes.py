@@ -35,7 +35,8 @@ from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.scene_images import SceneImages
 from app.services.service_settings import Settings
 from app.storage.database import Store, now_utc
-from osfcore.errors import InvalidInput, MissingAssets, OsfError, UnknownName
+from app.storage.scene_table import SceneTable
+from osfcore.errors import InvalidInput, MissingAssets, OsfError
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -81,8 +82,7 @@ class Scenes:
             on_lost=lambda: self.hub.publish(Notice("error", _LOST)),
         )
         self._lock = threading.RLock()
-        self._records: dict[str, SceneRecord] = {}
-        self._current: str | None = None
+        self._table = SceneTable(store)
         self._watchers = 0
         self._images = SceneImages(
             settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._simulation.call_async
@@ -91,10 +91,7 @@ class Scenes:
 
     def start(self) -> None:
         """Take over the scenes that the store holds, and start the simulation."""
-        records, self._current = self._store.scenes()
-        self._records = {record.id: record for record in records}
-        if self._current is None and records:
-            self._current = records[-1].id
+        self._table.load()
         self._simulation.start()
 
     def stop(self) -> None:
@@ -114,19 +111,16 @@ class Scenes:
 
     def scenes(self) -> tuple[SceneRecord, ...]:
         """All scenes, oldest first."""
-        return tuple(self._records.values())  # without the lock: whoever writes to the disk holds it
+        return self._table.all()
 
     @property
     def current(self) -> str | None:
         """The scene that is shown."""
-        return self._current
+        return self._table.current
 
     def scene(self, scene: str) -> SceneRecord:
         """One scene; raises UnknownName if there is none."""
-        record = self._records.get(scene)
-        if record is None:
-            raise UnknownName("scene", scene, tuple(self._records))
-        return record
+        return self._table.get(scene)
 
     # Changing
 
@@ -157,7 +151,7 @@ class Scenes:
             names = posed
         self._check_names(names)
         with self._lock:
-            if len(self._records) + self._scenes_in_the_making >= self._settings.max_scenes:
+            if len(self._table) + self._scenes_in_the_making >= self._settings.max_scenes:
                 raise TooManyScenes(self._settings.max_scenes)
             self._scenes_in_the_making += 1
         command = CreateScene(
@@ -171,10 +165,7 @@ class Scenes:
             poses=None if poses is None else _stacked([pose for _, pose in poses]),
         )
         try:
-            record: SceneRecord = self._simulation.call(command)
-            with self._lock:
-                self._store.save_scene(record)
-                self._records[record.id] = record
+            record = self._made(command)
         finally:
             with self._lock:
                 self._scenes_in_the_making -= 1
@@ -190,12 +181,10 @@ class Scenes:
         self._check_free(scene)
         with self._lock:
             self.scene(scene)
-            self._store.delete_scene(scene)
-            del self._records[scene]
+            self._table.remove(scene)
             self._simulation.submit(DropScene(scene))
-            was_current = self._current == scene
-            if was_current:
-                self._show(next(reversed(self._records), None))
+            if self.current == scene:
+                self._show(self._table.latest())
 
     def activate(self, scene: str) -> SceneRecord:
         """Show a scene in viewer and pages; raises UnknownName if there is none."""
@@ -288,20 +277,30 @@ class Scenes:
 
     # Inside
 
+    def _made(self, command: CreateScene) -> SceneRecord:
+        """A new scene that is stored; one that cannot be is none."""
+        record: SceneRecord = self._simulation.call(command)
+        try:
+            self._table.add(record)
+        except OsfError:
+            self._simulation.submit(DropScene(record.id))
+            raise
+        return record
+
     def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
         self.scene(command.id)
         record: SceneRecord = self._simulation.call(command)
-        with self._lock:
-            latest = self._records.get(command.id)
-            if latest is not None:
-                self._store.save_scene(latest)
+        self._table.save(command.id)
         return record
 
+    def write_again(self) -> None:
+        """Store what could not be stored before, as far as the disk takes it now."""
+        self._table.write_again()
+
     def _show(self, scene: str | None) -> None:
-        self._current = scene
-        self._store.set_current(scene)
+        self._table.show(scene)
         self._simulation.submit(ShowScene(scene))
-        self.hub.publish(CurrentScene(None if scene is None else self._records[scene]))
+        self.hub.publish(CurrentScene(None if scene is None else self._table.get(scene)))
 
     def _check_names(self, names: tuple[str, ...] | None) -> None:
         if names is None:
@@ -325,14 +324,12 @@ class Scenes:
 
     def _greeting(self) -> list[Command]:
         with self._lock:
-            adopt: list[Command] = [AdoptScene(record) for record in self._records.values()]
-            return [*adopt, ShowScene(self._current), WatchFrames(self._watchers > 0)]
+            adopt: list[Command] = [AdoptScene(record) for record in self._table.all()]
+            return [*adopt, ShowScene(self.current), WatchFrames(self._watchers > 0)]
 
     def _on_simulation_event(self, event: SceneChanged | FramesTaken) -> None:
         if isinstance(event, SceneChanged):
-            with self._lock:
-                if event.record.id in self._records:
-                    self._records[event.record.id] = event.record
+            self._table.note(event.record)
         self.hub.publish(event)
 
 

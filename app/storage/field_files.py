@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import tempfile
 import uuid
@@ -17,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from app.storage.durable import sync, sync_tree
 from app.storage.usage import folder_bytes
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
@@ -114,7 +114,7 @@ def install(made: Path, place: Path) -> None:
             folder.mkdir(mode=0o755)
             for name in (FIELD_FILE, METRICS_FILE):
                 shutil.copyfile(made / name, folder / name)
-                _sync(folder / name)
+            sync_tree(folder)
             _swap(folder, place)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -155,7 +155,7 @@ def _swap(folder: Path, place: Path) -> None:
     """Rename a folder to its place; the older one is put aside first, and returns if that fails."""
     if not place.exists():
         folder.rename(place)
-        _sync(place.parent)
+        sync(place.parent)
         return
     aside = Path(tempfile.mkdtemp(prefix=_ASIDE_PREFIX, dir=place.parent))
     older = aside / place.name
@@ -166,15 +166,7 @@ def _swap(folder: Path, place: Path) -> None:
         except OSError:
             older.rename(place)
             raise
-        _sync(place.parent)
+        sync(place.parent)
     finally:
         if place.exists():  # else the older one is all there is, and the next start puts it back
             shutil.rmtree(aside, ignore_errors=True)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.storage.database import CannotStore
+from app.storage.durable import put_in_place
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -124,7 +125,7 @@ class GoalStore:
                 folder.mkdir(parents=True)
                 (folder / IMAGE).write_bytes(png)
                 (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
-                folder.rename(self._root / record.id)
+                put_in_place(folder, self._root / record.id)
         except OSError as error:
             raise CannotStore(self._root, error.strerror or str(error)) from error
         finally:

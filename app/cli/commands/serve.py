@@ -124,7 +124,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
     import uvicorn
 
     from app.api.app_factory import create_app
-    from app.api.connection_timeouts import PromptProtocol
+    from app.api.guards.connection_timeouts import PromptProtocol
 
     app = create_app(settings)
 

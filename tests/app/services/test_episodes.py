@@ -59,7 +59,7 @@ class Goals(GoalStore):
 
 @pytest.fixture
 def runner(tmp_path, library):
-    runner = Runner(tmp_path / "collections", library)
+    runner = Runner(tmp_path, library)
     runner.jobs = ChangingJobs(tmp_path / "collections")
     return runner
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import app.jobs.registry as jobs_module
 from app.jobs.job import Job, JobPage
+from app.jobs.job_folders import JobFolders
 from app.jobs.kinds.estimates import STATE
 from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, errors_of, examine
 from app.services.fields import FieldCatalogue, MissingFields
@@ -44,14 +44,12 @@ def believed(names=(BOX, MUSTARD)) -> EstimatedState:
     return EstimatedState(state, np.ones(count), np.ones(count), 0.1, ("",) * count, "")
 
 
-class Jobs:
+class Jobs(JobFolders):
     """A registry that never works."""
 
-    def __init__(self, root):
-        self._root = root
+    def __init__(self, data_dir):
+        super().__init__(data_dir)
         self._all = []
-
-    new_inputs = jobs_module.Jobs.new_inputs
 
     def submit(self, kind, params, inputs):
         job = Job(f"job{len(self._all)}", kind, params)
@@ -72,12 +70,6 @@ class Jobs:
                 return job
         raise UnknownName(kind, name, [])
 
-    def folder(self, name):
-        return self._root / name
-
-    def inputs(self, name):
-        return self._root / name / "inputs"
-
     def finish(self, job, state="done", estimate=None):
         ended = replace(job, state=state, finished_at=now_utc())
         self._all[self._all.index(job)] = ended
@@ -91,12 +83,12 @@ class Jobs:
 class Runner:
     """A service with one scene, whose camera images are grey."""
 
-    def __init__(self, root, library):
-        self.jobs = Jobs(root)
+    def __init__(self, data_dir, library):
+        self.jobs = Jobs(data_dir)
         self.library = library
         self.current = "s"
         self.names = (BOX, MUSTARD)
-        self.storage = StorageMeter(root)
+        self.storage = StorageMeter(data_dir)
 
     def submit_with_inputs(self, kind, params, inputs):
         return self.jobs.submit(kind, params, inputs)
@@ -113,7 +105,7 @@ class Runner:
 
 @pytest.fixture
 def runner(tmp_path, library):
-    return Runner(tmp_path / "collections", library)
+    return Runner(tmp_path, library)
 
 
 @pytest.fixture

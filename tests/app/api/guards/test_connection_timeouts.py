@@ -8,7 +8,7 @@ import pytest
 import uvicorn
 import websockets.sync.client
 
-from app.api.connection_timeouts import BodyTimeoutMiddleware, PromptProtocol
+from app.api.guards.connection_timeouts import BodyTimeoutMiddleware, PromptProtocol
 from tests.app.conftest import until
 
 LARGE = bytes(64 << 20)

@@ -17,8 +17,8 @@ from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from app.api.guards.rate_limit import RateLimit
 from app.api.problems import problem
-from app.api.rate_limit import RateLimit
 
 COOKIE = "osf_session"
 _LIFE_S = 30 * 24 * 3600

@@ -1,7 +1,7 @@
 import pytest
 from starlette.requests import HTTPConnection
 
-from app.api.security import is_known_host, is_same_origin
+from app.api.guards.security import is_known_host, is_same_origin
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from app.api.app_factory import create_app
-from app.api.token_gate import COOKIE, TokenMiddleware
+from app.api.guards.token_gate import COOKIE, TokenMiddleware
 from app.services.service_settings import Settings
 
 TOKEN = "open-sesame"

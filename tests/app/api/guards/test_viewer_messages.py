@@ -3,8 +3,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from app.api.rate_limit import RateLimit
-from app.api.viewer_messages import MAX_FRAME_BYTES, is_allowed
+from app.api.guards.rate_limit import RateLimit
+from app.api.guards.viewer_messages import MAX_FRAME_BYTES, is_allowed
 
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 1, 2], "fov": 0.8, "near": 0.1, "far": 100,

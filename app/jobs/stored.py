@@ -1,0 +1,66 @@
+"""Whether a stored job is one that this version of the program can tell of, and go on with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from app.jobs.job import Job
+from app.jobs.kinds.episodes import settings_of
+from app.jobs.worker import KINDS
+from osfcore.errors import InvalidInput, shown
+from osfcore.io.json_codec import Entry, Text, decode
+
+
+class _Named(Entry):
+    name: Text
+
+
+class _Source(Entry):
+    mesh: Text | None
+    set: Text | None
+
+
+class _Training(_Named):
+    source: _Source
+
+
+class _Of(Entry):
+    scene: Text | None
+
+
+class _Estimate(Entry):
+    mode: Text
+    names: list[Text]
+    cameras: list[Text]
+    of: _Of
+
+
+class _Goal(Entry):
+    id: Text | None
+
+
+class _Episode(Entry):
+    scene: Text
+    names: list[Text]
+    seed: int
+    settings: dict[str, Any]
+    goal: _Goal
+
+
+_PARAMS = {"collect_object": _Named, "train_field": _Training, "estimate": _Estimate, "episode": _Episode}
+
+
+def check_stored(job: Job) -> None:
+    """Refuse a job of a kind, or with parameters, of another version.
+
+    Raises:
+        InvalidInput: if it is one.
+        TypeError: if settings of an episode are unknown to this version.
+    """
+    if job.kind not in KINDS:
+        raise InvalidInput("kind of the job", shown(job.kind), f"one of {', '.join(KINDS)}")
+    params = _PARAMS.get(job.kind)
+    if params is not None:
+        decode(params, job.params, "job")
+    if job.kind == "episode":
+        settings_of(job.params["settings"])
