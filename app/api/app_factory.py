@@ -38,8 +38,9 @@ from app.api.routes import (
     presets,
     scenes,
     status,
+    storage,
 )
-from app.api.schemas.common import FrameEvent, NoticeEvent, Problem
+from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
 from app.processes.predict_process import predictor_main
@@ -68,7 +69,7 @@ _DESCRIPTION = (
 
 _ROUTES = (
     status, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs,
-    driver, events,
+    driver, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
@@ -178,7 +179,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-        for model in (Problem, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
+        for model in (Problem, ForgottenEvent, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
             schemas[model.__name__] = own

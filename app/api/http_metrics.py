@@ -68,6 +68,13 @@ class _State(Collector):
         for (kind, state), count in Tally((job.kind, job.state) for job in runner.jobs.all()).items():
             jobs.add_metric((kind, state), float(count))
         yield jobs
+        yield GaugeMetricFamily("osf_disk_free_bytes", "On the disk of the data directory.", runner.storage.free_bytes)
+        usage = runner.storage.usage(wait_s=0)
+        if usage is not None:
+            held = GaugeMetricFamily("osf_data_bytes", "That the data directory holds, by kind.", labels=("kind",))
+            for kind, count in usage.bytes.items():
+                held.add_metric((kind,), float(count))
+            yield held
 
 
 class MetricsMiddleware:

@@ -39,6 +39,20 @@ class SetInUse(OsfError):
         super().__init__(f"Job {job} needs image set {set_id}; wait for it or cancel it first.")
 
 
+class SceneNeeded(OsfError):
+    """A scene that a job needs to go on, or to begin."""
+
+    def __init__(self, scene: str, job: Job) -> None:
+        super().__init__(f"Job {job.id} is {job.state} and needs scene {scene}; cancel it first.")
+
+
+class WorkshopInUse(OsfError):
+    """Files of a training that goes on, or waits."""
+
+    def __init__(self, name: str, job: Job) -> None:
+        super().__init__(f"Job {job.id} is {job.state} and trains the field {name} from these files; cancel it first.")
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """A job as it is now.
@@ -91,12 +105,38 @@ class JobChanged:
     job: Job
 
 
+@dataclass(frozen=True, slots=True)
+class JobForgotten:
+    """A job is gone, with all its files; `event` as in `JobChanged`."""
+
+    event: int
+    job: Job
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class JobView:
     """What a running job lets the live view draw; it is neither kept nor told to pages."""
 
     job: Job
     view: object
+
+
+JobEvent = JobChanged | JobForgotten | JobView
+
+
+@dataclass(frozen=True, slots=True)
+class JobPage:
+    """Some of the jobs.
+
+    Attributes:
+        jobs: newest first.
+        total: how many there are in all.
+        next: where the next page begins, see `JobTable.page`; None at the end.
+    """
+
+    jobs: tuple[Job, ...]
+    total: int
+    next: int | None
 
 
 def job_fields(job: Job) -> dict[str, Any]:

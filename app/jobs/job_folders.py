@@ -47,6 +47,25 @@ class JobFolders:
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
+    def put_aside(self, job: str) -> Path:
+        """Rename a job's folder, if there is one, to one that the next start removes.
+
+        Raises:
+            CannotStore: if that is not allowed.
+        """
+        aside = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            if self.folder(job).is_dir():
+                self.folder(job).rename(aside)
+        except OSError as error:
+            raise CannotStore(self.folder(job), error.strerror or str(error)) from error
+        return aside
+
+    def put_back(self, job: str, aside: Path) -> None:
+        """Undo `put_aside`."""
+        if aside.is_dir():
+            aside.rename(self.folder(job))
+
     def take(self, job: str, inputs: Path) -> None:
         """Make a folder from `new_inputs` a job's own.
 

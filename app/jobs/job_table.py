@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobChanged, JobView, job_fields, job_from_fields
+from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
 from app.storage.database import Store
 from app.storage.paths import without_places
 from osfcore.errors import UnknownName
@@ -30,11 +32,7 @@ class JobTable:
     """
 
     def __init__(
-        self,
-        store: Store,
-        data_dir: Path,
-        publish: Callable[[JobChanged | JobView], None],
-        check: Callable[[Job], object] = id,
+        self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None], check: Callable[[Job], object] = id
     ) -> None:
         self._store = store
         self._check = check
@@ -61,25 +59,45 @@ class JobTable:
 
     def all(self) -> list[Job]:
         """All jobs with their places in the queue, oldest first."""
-        return [self._told(job) for job in list(self._jobs.values())]
+        waiting = self._waiting()
+        return [self._told(job, waiting) for job in list(self._jobs.values())]
 
-    def get(self, job: str) -> Job:
+    def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
+        """Some of the jobs, newest first.
+
+        Args:
+            limit: how many at most.
+            before: only jobs with smaller numbers; jobs that come or go meanwhile shift nothing.
+            kind: only jobs of it.
+        """
+        numbers = dict(self._numbers)  # read without a lock
+        found = [job for job in list(self._jobs.values()) if kind in (None, job.kind) and job.id in numbers]
+        found.reverse()
+        start = 0 if before is None else bisect_right(found, -before, key=lambda job: -numbers[job.id])
+        shown, waiting = found[start : start + limit], self._waiting()
+        is_last = start + limit >= len(found)
+        told = tuple(self._told(job, waiting) for job in shown)
+        return JobPage(told, len(found), None if is_last else numbers[shown[-1].id])
+
+    def get(self, job: str, kind: str | None = None) -> Job:
         """One job with its place in the queue.
 
         Raises:
-            UnknownName: if there is none of this name.
+            UnknownName: if there is none of this name and kind.
         """
-        if job not in self._jobs:
-            raise UnknownName("job", job, list(self._jobs)[-5:])
-        return self._told(self._jobs[job])
+        found = self._jobs.get(job)
+        if found is None or kind not in (None, found.kind):
+            known = (other.id for other in reversed(list(self._jobs.values())) if kind in (None, other.kind))
+            raise UnknownName(kind or "job", job[:80], islice(known, 5))
+        return self._told(found, self._waiting() if found.state == "queued" else [])
 
     def queue(self) -> list[Job]:
         """Jobs that wait, the next one first."""
         return [job for job in list(self._jobs.values()) if job.state == "queued"]
 
-    def live(self, kind: str) -> list[Job]:
-        """Jobs of a kind that wait, run or pause, oldest first."""
-        return [job for job in list(self._jobs.values()) if job.kind == kind and not job.is_finished]
+    def live(self, kind: str | None = None) -> list[Job]:
+        """Jobs of a kind, or of any, that wait, run or pause, oldest first."""
+        return [job for job in list(self._jobs.values()) if kind in (None, job.kind) and not job.is_finished]
 
     def add(self, job: Job) -> None:
         """Keep a new job, the last of all.
@@ -87,11 +105,21 @@ class JobTable:
         Raises:
             CannotStore: if the disk refuses; then there is no such job.
         """
-        number = 1 + max(self._numbers.values(), default=0)
+        number = 1 + next(reversed(self._numbers.values()), 0)
         shown = replace(job, position=1 + len(self.queue()))
         event = self._store.save_job(job.id, number, job_fields(job), job_fields(shown))
         self._numbers[job.id], self._jobs[job.id] = number, job
         self._publish(JobChanged(event, shown))
+
+    def forget(self, job: Job) -> None:
+        """Keep a job no longer.
+
+        Raises:
+            CannotStore: if the disk refuses; then it is kept.
+        """
+        event = self._store.forget_job(job.id)
+        del self._jobs[job.id], self._numbers[job.id]
+        self._publish(JobForgotten(event, job))
 
     def set(self, job: Job) -> None:
         """Keep and publish a job's new state."""
@@ -121,17 +149,19 @@ class JobTable:
         for job in self.queue():
             self._keep(job)
 
-    def _told(self, job: Job) -> Job:
-        """A job with its place in the queue and without those of this machine."""
+    def _waiting(self) -> list[str]:
+        return [job.id for job in self.queue()]
+
+    def _told(self, job: Job, waiting: list[str]) -> Job:
+        """A job with its place among those that wait and without the places of this machine."""
         error = None if job.error is None else without_places(job.error, self._data_dir)
         told = replace(job, note=without_places(job.note, self._data_dir), error=error)
-        if job.state != "queued":
+        if job.state != "queued":  # if it is, it may have begun just now: this is read without a lock
             return told
-        waiting = [other.id for other in self.queue()]  # read without a lock, so it may have begun just now
         return replace(told, position=1 + waiting.index(job.id)) if job.id in waiting else told
 
     def _keep(self, job: Job) -> None:
-        shown, number = self._told(job), self._numbers[job.id]
+        shown, number = self._told(job, self._waiting()), self._numbers[job.id]
         event = self._store.save_job(  # a full disk must not stop the jobs
             job.id, number, job_fields(job), job_fields(shown), can_wait=True
         )

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobChanged, JobView, State, WrongJobState, ended
+from app.jobs.job import Job, JobEvent, JobPage, State, WrongJobState, ended
 from app.jobs.job_folders import JobFolders
 from app.jobs.job_loop import JobLoop, StartProcess, forget_workshop
 from app.jobs.job_process import JobProcess
@@ -56,7 +56,7 @@ class Jobs:
         self,
         store: Store,
         data_dir: Path,
-        publish: Callable[[JobChanged | JobView], None],
+        publish: Callable[[JobEvent], None],
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
@@ -97,16 +97,20 @@ class Jobs:
         """All jobs, newest first."""
         return tuple(reversed(self._table.all()))
 
-    def get(self, job: str) -> Job:
+    def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
+        """Some of the jobs, newest first, see `JobTable.page`."""
+        return self._table.page(limit, before, kind)
+
+    def get(self, job: str, kind: str | None = None) -> Job:
         """One job.
 
         Raises:
-            UnknownName: if there is none of this name.
+            UnknownName: if there is none of this name and kind.
         """
-        return self._table.get(job)
+        return self._table.get(job, kind)
 
-    def live(self, kind: str) -> tuple[Job, ...]:
-        """Jobs of a kind that wait, run or pause."""
+    def live(self, kind: str | None = None) -> tuple[Job, ...]:
+        """Jobs of a kind, or of any, that wait, run or pause."""
         return tuple(self._table.live(kind))
 
     def folder(self, job: str) -> Path:
@@ -174,6 +178,26 @@ class Jobs:
                 self._loop.run.cancel(0.0 if known.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
             self._changed.wait_for(lambda: self._table[job].is_finished, wait_s)
             return self.get(job)
+
+    def forget(self, job: str) -> None:
+        """Remove a finished job for good, with all its files.
+
+        Raises:
+            UnknownName: if there is no such job.
+            WrongJobState: if it has not finished.
+            CannotStore: if the disk refuses; then it stays.
+        """
+        with self._changed:
+            known = self.get(job)
+            if not known.is_finished:
+                raise WrongJobState(known, "removed; cancel it first")
+            aside = self._folders.put_aside(job)
+            try:
+                self._table.forget(known)
+            except OsfError:
+                self._folders.put_back(job, aside)
+                raise
+        shutil.rmtree(aside, ignore_errors=True)
 
     def pause(self, job: str) -> Job:
         """Let a running job rest after its current step.

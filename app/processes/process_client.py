@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from app.processes.child_process import end, launch
 from app.processes.outbox import Outbox
-from app.processes.process_server import Alive, Answer, Overtaken, Ready, child_main
+from app.processes.process_server import Alive, Answer, Logged, Overtaken, Ready, child_main
 from app.processes.request_queue import Request
 from app.processes.watchdog import Watchdog
 from osfcore.errors import OsfError
@@ -304,6 +304,8 @@ class ProcessClient:
                 if watchdog is not None:
                     watchdog.answered()
                 self._settle(number, value, error)
+            case Logged(level, name, text):
+                logging.getLogger(name).log(level, "%s", text)
             case Overtaken(number):
                 self._settle(number)
             case _:

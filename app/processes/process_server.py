@@ -59,6 +59,15 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class Logged:
+    """What was logged in the child; the service logs it as its own."""
+
+    level: int
+    name: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Overtaken:
     """A request that is left undone because a newer one of its key has come."""
 
@@ -76,7 +85,7 @@ class ProcessServer:
     def __init__(self, connection: Connection, who: str) -> None:
         self._connection = connection
         self._who = who
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # what is sent may log while it is pickled
         self._queue = RequestQueue()
 
     def send(self, message: object) -> None:
@@ -141,6 +150,25 @@ class ProcessServer:
             return Answer(request.number, error=InternalError(self._who, error))
 
 
+class PipeHandler(logging.Handler):
+    """Sends what is logged to the service.
+
+    Args:
+        server: knows the way.
+    """
+
+    def __init__(self, server: ProcessServer) -> None:
+        super().__init__()
+        self._server = server
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record, with its traceback."""
+        try:
+            self._server.send(Logged(record.levelno, record.name, self.format(record).rstrip()))
+        except Exception:
+            self.handleError(record)
+
+
 def child_main(connection: Connection, target: Callable[..., None], who: str, *arguments: object) -> None:
     """Run `target(server, *arguments)`: what every child process starts with.
 
@@ -153,5 +181,7 @@ def child_main(connection: Connection, target: Callable[..., None], who: str, *a
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service decides when to stop
     silence_stdout()
     server = ProcessServer(connection, who)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[PipeHandler(server)])
+    logging.captureWarnings(True)
     server.show_life()  # before the target loads what it needs
     target(server, *arguments)

@@ -11,7 +11,7 @@ from typing import Any
 
 from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, RECORDING_FILE, REPORT_FILE, VIDEO_FILE
 from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
-from app.jobs.job import Job
+from app.jobs.job import Job, JobPage
 from app.jobs.kinds.episodes import settings_of
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals import Goals, NoTable
@@ -84,6 +84,7 @@ class Episodes:
             MissingFields: if an object cannot be recognised.
             InvalidInput: if a setting is out of range, or the poses are not those of the scene's objects.
             QueueFull: if too many jobs wait.
+            StorageFull: if nothing more may be written.
         """
         check_seed(asked.seed)
         scene = asked.scene or self._runner.current
@@ -102,7 +103,7 @@ class Episodes:
                 "settings": settings,
                 "goal": self._goal(asked, scene, names, folder),
             }
-            job = self._runner.jobs.submit(KIND, params, folder)
+            job = self._runner.submit_with_inputs(KIND, params, folder)
         self._goals.drop_draft()  # what is composed cannot be moved while the episode has the scene
         return job
 
@@ -136,9 +137,9 @@ class Episodes:
 
     # Telling of one
 
-    def all(self) -> tuple[Job, ...]:
-        """All episodes, newest first."""
-        return tuple(job for job in self._runner.jobs.all() if job.kind == KIND)
+    def page(self, limit: int, before: int | None = None) -> JobPage:
+        """Some of the episodes, newest first, see `JobTable.page`."""
+        return self._runner.jobs.page(limit, before, KIND)
 
     def get(self, episode: str) -> Job:
         """One episode.
@@ -146,10 +147,7 @@ class Episodes:
         Raises:
             UnknownName: if there is none of this name.
         """
-        known = [job.id for job in self.all()]
-        if episode not in known:
-            raise UnknownName("episode", episode[:80], known[:5])
-        return self._runner.jobs.get(episode)
+        return self._runner.jobs.get(episode, KIND)
 
     @staticmethod
     def settings(job: Job) -> EpisodeSettings:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from starlette.concurrency import run_in_threadpool
 
-from app.jobs.job import Job
+from app.jobs.job import Job, JobPage
 from app.jobs.kinds.estimates import OBSERVATION, PRIOR, STATE, STEPS, TRUTH, Mode, read_steps, state_of_step
 from app.processes.messages.neural_messages import CompareView
 from app.services.fields import FieldCatalogue, MissingFields
@@ -150,9 +150,10 @@ class Estimates:
             InvalidInput: if it does not fit the mode.
             UnknownName: if an object in it cannot be recognised, or the earlier estimate is unknown.
             NoPrior: if an earlier estimate is needed and there is none.
-            QueueFull: if too many jobs wait.
+            QueueFull, StorageFull: if too many jobs wait, or nothing more may be written.
         """
         check_seed(asked.seed)
+        await run_in_threadpool(self._runner.storage.check_room)
         with self._runner.jobs.new_inputs() as folder:
             await save(chunks, folder / _ARCHIVE)
             uploaded = await self._examiner.examine(folder)
@@ -173,7 +174,7 @@ class Estimates:
         self, asked: Asked, of: dict[str, Any], names: tuple[str, ...], cameras: tuple[str, ...], folder: Path
     ) -> Job:
         params = {"mode": asked.mode, "seed": asked.seed, "of": of, "names": list(names), "cameras": list(cameras)}
-        return self._runner.jobs.submit(KIND, params, folder)
+        return self._runner.submit_with_inputs(KIND, params, folder)
 
     def _prior(self, asked: Asked, names: tuple[str, ...], scene: str | None) -> EstimatedState:
         """The estimate to begin with, of the same objects, in whatever order."""
@@ -199,16 +200,17 @@ class Estimates:
         """All estimates, newest first."""
         return tuple(job for job in self._runner.jobs.all() if job.kind == KIND)
 
+    def page(self, limit: int, before: int | None = None) -> JobPage:
+        """Some of the estimates, newest first, see `JobTable.page`."""
+        return self._runner.jobs.page(limit, before, KIND)
+
     def get(self, estimate: str) -> Job:
         """One estimate.
 
         Raises:
             UnknownName: if there is none of this name.
         """
-        known = [job.id for job in self.all()]
-        if estimate not in known:
-            raise UnknownName("estimate", estimate, known[:5])
-        return self._runner.jobs.get(estimate)
+        return self._runner.jobs.get(estimate, KIND)
 
     def steps(self, job: Job) -> tuple[dict[str, Any], ...]:
         """What was told of each step so far, see `read_steps`."""

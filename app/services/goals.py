@@ -118,6 +118,7 @@ class Goals:
             CannotStore: if that is not allowed.
         """
         self._store.remove(goal)
+        self._runner.storage.outdate()
         self._runner.hub.publish(GoalsChanged())
 
     def receive(self, data: bytes, name: str, camera: Camera | None = None) -> GoalRecord:
@@ -133,7 +134,7 @@ class Goals:
             ProcessUnavailable: if what decodes it died.
             InvalidInput: if its sides are not in the proportion of the camera's.
             TooManyGoals: if there are too many.
-            CannotStore: if the disk is full.
+            StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
         pixels = self._photos.read(data)
         height, width = pixels.shape[:2]
@@ -186,6 +187,7 @@ class Goals:
     def _keep(
         self, source: Source, name: str, scene: str | None, camera: Camera, poses: Poses | None, png: bytes
     ) -> GoalRecord:
+        self._runner.storage.check_room()
         record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses)
         self._store.keep(record, png)
         self._runner.hub.publish(GoalsChanged())

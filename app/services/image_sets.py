@@ -11,7 +11,7 @@ import json
 import shutil
 import threading
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -80,11 +80,13 @@ class ImageSets:
     Args:
         root: the folder, DATA_DIR/sets; made at the first upload.
         max_sets: kept at once.
+        check_room: raises an OsfError if nothing more may be written.
     """
 
-    def __init__(self, root: Path, max_sets: int = 20) -> None:
+    def __init__(self, root: Path, max_sets: int = 20, check_room: Callable[[], None] = lambda: None) -> None:
         self._root = root
         self._max_sets = max_sets
+        self._check_storage = check_room
         self._keeping = threading.Lock()
         self._examiner = Examiner(examine, "set", _names)
 
@@ -145,10 +147,12 @@ class ImageSets:
 
         Raises:
             TooManySets: if there are too many.
+            StorageFull: if nothing more may be written.
             UploadRefused: if it is no sound set of an object; nothing is kept.
             CannotStore: if the disk is full.
         """
         await run_in_threadpool(self._check_room)
+        await run_in_threadpool(self._check_storage)
         set_id = uuid.uuid4().hex[:12]
         folder = self._root / f"{_TEMPORARY_PREFIX}{set_id}"
         try:

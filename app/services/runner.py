@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobChanged, JobView, SetInUse, TrainingAlready, check_params
+from app.jobs.job import Job, JobChanged, JobEvent, SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse, check_params
 from app.jobs.registry import Jobs
 from app.jobs.stored import check_stored
 from app.processes.messages.scene_messages import Act, Command
@@ -16,8 +17,9 @@ from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes
 from app.services.service_settings import Settings
 from app.storage.database import Store
-from app.storage.field_files import sweep
-from osfcore.errors import InvalidInput, OsfError
+from app.storage.field_files import Leftover, remove_workshop, sweep, workshops
+from app.storage.usage import StorageMeter
+from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
 _PROBE_S = 5.0  # between two tries whether the disk takes something
@@ -42,7 +44,8 @@ class Runner(Scenes):
             self._serve,
             check=check_stored,
         )
-        self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets)
+        self.storage = StorageMeter(settings.data_dir, settings.max_data_bytes, settings.min_free_bytes)
+        self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets, self.storage.check_room)
         self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
@@ -51,7 +54,8 @@ class Runner(Scenes):
     def start(self) -> None:
         """Take over what the store holds, start simulation and jobs, make a first scene if there is none."""
         self.sets.start()
-        sweep(self._settings.data_dir / "fields")
+        for folder in ("fields", "training"):
+            sweep(self._settings.data_dir / folder)
         super().start()
         self.jobs.start()
         for entry in self._store.set_aside:
@@ -64,6 +68,7 @@ class Runner(Scenes):
         self.sets.stop()
         self.jobs.stop()
         super().stop()
+        self.storage.stop()
 
     def holder(self, scene: str) -> str | None:
         """The job that drives a scene, if one does: then only that job may change it."""
@@ -91,14 +96,75 @@ class Runner(Scenes):
         """Queue a job.
 
         Raises:
+            StorageFull: if nothing more may be written.
             OsfError: if it could not succeed, or too many wait.
         """
+        self.storage.check_room()
         fetches = kind == "fetch_assets"
         with self._ordering:
             if kind == "train_field":
                 self._check_training(params)
             check_params(kind, params, self.library.info if fetches else self._check_object, len(self.library.names()))
             return self.jobs.submit(kind, params)
+
+    def submit_with_inputs(self, kind: str, params: dict[str, Any], inputs: Path) -> Job:
+        """Queue a job that was given files.
+
+        Args:
+            kind: what to do.
+            params: with what; "scene" names one that it drives.
+            inputs: see `Jobs.submit`.
+
+        Raises:
+            StorageFull: if nothing more may be written.
+            UnknownName: if the scene has gone meanwhile.
+            QueueFull: if too many wait.
+        """
+        self.storage.check_room()
+        with self._ordering:
+            if "scene" in params:
+                self.scene(params["scene"])
+            return self.jobs.submit(kind, params, inputs)
+
+    def forget_job(self, job: str) -> None:
+        """Remove a finished job for good, with all its files, see `Jobs.forget`."""
+        self.jobs.forget(job)
+        self.storage.outdate()
+
+    def delete_scene(self, scene: str) -> None:
+        """Forget a scene; if it was shown, the latest other one is shown.
+
+        Raises:
+            UnknownName: if there is none.
+            SceneNeeded: if a job that waits, runs or pauses drives it.
+        """
+        with self._ordering:
+            for job in self.jobs.live():
+                if job.params.get("scene") == scene:
+                    raise SceneNeeded(scene, job)
+            super().delete_scene(scene)
+
+    def leftovers(self) -> tuple[Leftover, ...]:
+        """What trainings have left that did not finish, or have made so far, sorted by name."""
+        return workshops(self._settings.data_dir)
+
+    def remove_leftover(self, name: str) -> None:
+        """Delete what a training has left; the same order then begins anew.
+
+        Raises:
+            UnknownName: if it has left nothing.
+            WorkshopInUse: if a training that goes on or waits needs it.
+            CannotWrite: if that is not allowed.
+        """
+        with self._ordering:
+            names = [left.name for left in self.leftovers()]
+            if name not in names:
+                raise UnknownName("training", name[:80], names)
+            for job in self.jobs.live("train_field"):
+                if job.params["name"] == name:
+                    raise WorkshopInUse(name, job)
+            remove_workshop(self._settings.data_dir, name)
+        self.storage.outdate()
 
     def remove_set(self, set_id: str) -> None:
         """Delete an uploaded image set.
@@ -113,6 +179,7 @@ class Runner(Scenes):
                 if job.params["source"]["set"] == set_id:
                     raise SetInUse(set_id, job.id)
             self.sets.remove(set_id)
+        self.storage.outdate()
 
     def ensure_demo_scene(self) -> None:
         """Make the first scene as soon as there are objects, in the background; does nothing if there is a scene."""
@@ -147,7 +214,7 @@ class Runner(Scenes):
             if job.params["name"] == name:
                 raise TrainingAlready(name, job.id)
 
-    def _on_job(self, event: JobChanged | JobView) -> None:
+    def _on_job(self, event: JobEvent) -> None:
         self.hub.publish(event)
         if isinstance(event, JobChanged) and event.job.kind == "fetch_assets" and event.job.state == "done":
             self.ensure_demo_scene()

@@ -37,6 +37,12 @@ class Settings(BaseSettings):
     max_scenes: int = Field(default=32, ge=1, description="Scenes kept at once.")
     max_live_worlds: int = Field(default=4, ge=1, description="Scenes whose simulation stays in memory.")
     max_queued_jobs: int = Field(default=20, ge=1, description="Jobs waiting at once.")
+    max_data_bytes: int = Field(
+        default=50 << 30, ge=0, description="That the data directory may hold before new work is refused; 0 for any."
+    )
+    min_free_bytes: int = Field(
+        default=200_000_000, ge=0, description="That must stay free on its disk, or new work is refused."
+    )
     max_stored_events: int = Field(default=1000, ge=10, description="Job events kept for reconnecting pages.")
     image_cache_bytes: int = Field(default=32 << 20, ge=0)
     cancel_grace_s: float = Field(default=0.7, ge=0, description="How long a cancelled job may take to stop by itself.")

@@ -246,6 +246,20 @@ class Store:
             waits_as=f"job {job}" if can_wait else None,
         )
 
+    def forget_job(self, job: str) -> int:
+        """Delete a job with its events; returns the number of the event that says so.
+
+        Raises:
+            CannotStore: if the disk refuses; then nothing is deleted.
+        """
+        its_id = "CASE WHEN json_valid(job) THEN json_extract(job, '$.id') END"
+        return self._write(
+            ("DELETE FROM jobs WHERE id = ?", (job,)),
+            (f"DELETE FROM events WHERE {its_id} = ?", (job,)),
+            ("INSERT INTO events (job) VALUES (?)", (json.dumps({"forgotten": job}),)),
+            ("DELETE FROM events WHERE id <= last_insert_rowid() - ?", (self._max_events,)),
+        )
+
     def jobs(self, parse: Callable[[dict[str, Any]], Any] = dict) -> tuple[tuple[int, Any], ...]:
         """Numbers of all jobs, and what `parse` makes of their fields, oldest first.
 

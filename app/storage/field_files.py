@@ -10,10 +10,14 @@ import contextlib
 import json
 import shutil
 import tempfile
+import uuid
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from app.storage.durable import sync, sync_tree
+from app.storage.usage import folder_bytes
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 
@@ -50,9 +54,50 @@ def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
     return place
 
 
+@dataclass(frozen=True, slots=True)
+class Leftover:
+    """A workshop that is there.
+
+    Attributes:
+        name: of the field.
+        bytes: of all its files.
+        changed_at: when files last came or went, UTC, ISO 8601.
+    """
+
+    name: str
+    bytes: int
+    changed_at: str
+
+
+def workshops(data_dir: Path) -> tuple[Leftover, ...]:
+    """All that are there, sorted by name."""
+    found = []
+    for place in sorted((data_dir / "training").glob("[!.]*")):
+        with contextlib.suppress(OSError):  # one that is being removed must not hide the others
+            if place.is_dir():
+                changed = datetime.fromtimestamp(place.stat().st_mtime, UTC).isoformat(timespec="seconds")
+                found.append(Leftover(place.name, folder_bytes(place), changed.replace("+00:00", "Z")))
+    return tuple(found)
+
+
 def clear_workshop(data_dir: Path, name: str) -> None:
     """Forget what was made for a field that is not finished."""
     shutil.rmtree(workshop(data_dir, name), ignore_errors=True)
+
+
+def remove_workshop(data_dir: Path, name: str) -> None:
+    """Delete a workshop that is there, in one piece; needs no room on the disk.
+
+    Raises:
+        CannotWrite: if that is not allowed.
+    """
+    place = workshop(data_dir, name)
+    aside = place.with_name(f"{_TEMPORARY_PREFIX}{name}-{uuid.uuid4().hex[:12]}")
+    try:
+        place.rename(aside)
+    except OSError as error:
+        raise CannotWrite(Path("training") / name, error.strerror or str(error)) from error
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def install(made: Path, place: Path) -> None:
@@ -94,7 +139,7 @@ def uninstall(place: Path) -> None:
 
 
 def sweep(fields: Path) -> None:
-    """Remove what a killed service left in DATA_DIR/fields; a field that was put aside and has no successor returns."""
+    """Remove what a killed service left half done in a folder; what was put aside and has no successor returns."""
     for aside in fields.glob(f"{_ASIDE_PREFIX}*"):
         for older in aside.glob("*"):
             if not (fields / older.name).exists():

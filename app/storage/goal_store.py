@@ -92,7 +92,7 @@ class GoalStore:
         for path in self._root.glob(f"[!.]*/{_FACTS}"):
             with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
                 records.append(_read(path))
-        return tuple(sorted(records, key=lambda record: record.created_at, reverse=True))
+        return tuple(sorted(records, key=lambda record: (record.created_at, record.id), reverse=True))
 
     def get(self, goal: str) -> GoalRecord:
         """One goal.

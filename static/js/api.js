@@ -48,6 +48,16 @@ export function upload(path, file, onProgress = () => {}, type = "application/zi
 }
 
 export const get = (path) => call("GET", path);
+/** All entries of a list, page by page; only for lists that stay short. */
+export async function getAll(path, key) {
+  const entries = [];
+  for (let after = {}; after; ) {
+    const answer = await get(`${path}?${new URLSearchParams({ limit: 500, ...after })}`);
+    entries.push(...answer[key]);
+    after = answer.next === null ? null : { after: answer.next };
+  }
+  return entries;
+}
 export const post = (path, body) => call("POST", path, body);
 export const patch = (path, body) => call("PATCH", path, body);
 export const remove = (path) => call("DELETE", path);

@@ -149,6 +149,11 @@ function close() {
   if (LIVE.has(job?.state)) openEpisode(job.id);
 }
 
+/** Takes an episode off view that was removed for good. */
+export function dropShown(id) {
+  if (shown?.id === id) close();
+}
+
 /** The step that is on view, for links. */
 export const shownStep = () => timeline.step;
 

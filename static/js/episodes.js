@@ -1,13 +1,18 @@
 // All episodes, newest first, and links to a moment of one: ?episode=ID&step=N.
-import { get } from "./api.js";
-import { byId, el } from "./dom.js";
-import { openEpisode, outcomeOf, showEpisode } from "./episode-view.js";
+import { get, remove } from "./api.js";
+import { byId, el, whileDisabled } from "./dom.js";
+import { doubted } from "./doubt.js";
+import { dropShown, openEpisode, outcomeOf, showEpisode } from "./episode-view.js";
 import { LIVE } from "./jobs.js";
 import { labelOf, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
 
 const FEW = 6;
-let all = [];
+const PAGE = 50;
+const MOST = 500; // that the service tells at once
+let all = []; // those that were fetched
+let total = 0;
+let older = null; // where the others begin
 let showsAll = false;
 let listed = ""; // the latest job's state when the list was fetched
 
@@ -29,25 +34,50 @@ function entry(episode) {
       el("span", { className: "title", textContent: episode.objects.map(labelOf).join(", ") }), badge),
     el("div", { className: "row" },
       el("span", { className: "hint", textContent: `${made}${tookText(episode)}` }),
-      el("button", { type: "button", className: "plain", textContent: "Show", on: { click: () => openEpisode(episode.id) } })),
+      el("span", { className: "row" },
+        el("button", { type: "button", className: "plain", textContent: "Show", on: { click: () => openEpisode(episode.id) } }),
+        LIVE.has(episode.status) ? null : deleteButton(episode))),
   );
   item.dataset.episode = episode.id;
   return item;
+}
+
+function deleteButton({ id }) {
+  return doubted(el("button", { type: "button", className: "plain danger", textContent: "Delete" }), "Really delete", async () => {
+    await remove(`episodes/${encodeURIComponent(id)}?forget=true`);
+    await dropEpisode(id);
+  });
+}
+
+/** Forgets an episode that was removed for good. */
+export async function dropEpisode(id) {
+  dropShown(id);
+  if (all.some((episode) => episode.id === id)) await refreshEpisodes();
 }
 
 function draw() {
   byId("no-episodes").hidden = all.length > 0;
   byId("episode-list").replaceChildren(...(showsAll ? all : all.slice(0, FEW)).map(entry));
   const button = byId("all-episodes");
-  button.hidden = all.length <= FEW;
-  button.textContent = showsAll ? "Fewer" : `All ${all.length}`;
+  button.hidden = total <= FEW;
+  button.textContent = showsAll ? "Fewer" : `All ${total}`;
+  byId("more-episodes").hidden = !showsAll || older === null;
+}
+
+function take(answer, before) {
+  all = [...before, ...answer.episodes];
+  ({ total, next: older } = answer);
+  draw();
 }
 
 export async function refreshEpisodes() {
-  const answer = await tellFailure(() => get("episodes"));
-  if (!answer) return;
-  all = answer.episodes;
-  draw();
+  const limit = Math.min(Math.max(all.length, PAGE), MOST);
+  const answer = await tellFailure(() => get(`episodes?limit=${limit}`));
+  if (answer) take(answer, []);
+}
+
+async function showOlder() {
+  take(await get(`episodes?limit=${PAGE}&after=${older}`), all);
 }
 
 /** Opens what the page's address asks for. */
@@ -68,6 +98,8 @@ export function setUpEpisodes() {
     showsAll = !showsAll;
     draw();
   });
+  const more = byId("more-episodes");
+  more.addEventListener("click", () => whileDisabled(more, () => tellFailure(showOlder)));
   watch("objects", draw);
   watch("episode", (job) => {
     const now = job ? `${job.id} ${job.state}` : "";

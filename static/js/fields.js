@@ -1,5 +1,5 @@
 // Fields: what there is and how good it is, training new ones from a mesh or an uploaded image set, watching it.
-import { get, post, remove, upload } from "./api.js";
+import { get, getAll, post, remove, upload } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
@@ -56,8 +56,8 @@ export async function refreshFields() {
 // Image sets
 
 export async function refreshSets() {
-  const answer = await tellFailure(() => get("fields/sets"));
-  if (answer) drawSets(answer.sets);
+  const uploaded = await tellFailure(() => getAll("fields/sets", "sets"));
+  if (uploaded) drawSets(uploaded);
 }
 
 function drawSets(now) {

@@ -1,13 +1,13 @@
 // The goal: an image of how the table should look. Uploaded, drawn at random, composed, or one of the earlier ones.
-import { get, post, remove, upload } from "./api.js";
+import { getAll, post, remove, upload } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { mayDrive } from "./driver.js";
 import { current, known, set, watch } from "./state.js";
 import { tellFailure, tellMissingScene, toast } from "./toasts.js";
 
-const MAX_SEED = 1_000_000;
-const NAME_MAX = 64;
+const DRAWN_SEEDS = 1_000_000; // short to read, and far fewer than may be asked for
+const NAME_MAX = 100;
 let pickedFor = null; // the scene for which a goal of another table was chosen by hand
 
 const fits = (goal, scene) => goal.source === "upload" || !goal.scene || goal.scene === scene?.id || pickedFor === scene?.id;
@@ -20,8 +20,8 @@ export function takeGoal(goal) {
 }
 
 export async function refreshGoals() {
-  const answer = await tellFailure(() => get("goals"));
-  if (answer) set("goals", answer.goals);
+  const goals = await tellFailure(() => getAll("goals", "goals"));
+  if (goals) set("goals", goals);
 }
 
 /** Keeps the goal that was chosen if it is there still and fits the table; else takes the newest made for it. */
@@ -38,7 +38,7 @@ export function randomGoal() {
   const scene = current();
   if (!scene) return tellMissingScene();
   if (!mayDrive()) return undefined;
-  const seed = Math.floor(Math.random() * MAX_SEED);
+  const seed = Math.floor(Math.random() * DRAWN_SEEDS);
   return whileDisabled(byId("random-goal"), () => tellFailure(async () =>
     takeGoal(await post("goals", { scene: scene.id, random: { seed, moved: null }, name: `Random goal ${seed}` }))));
 }

@@ -1,6 +1,7 @@
 // Long work: starting it, watching it, pausing, cancelling, and taking the results.
 import { get, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
+import { doubted } from "./doubt.js";
 import { refreshObjects } from "./objects.js";
 import { labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
@@ -18,22 +19,24 @@ const FIELDS = {
     number("steps", "Steps each", 50, 1, 1000),
     number("objects", "Objects", 3, 1, 8),
     { name: "policy", label: "Policy", options: [["paper", "random, as in the paper"], ["directed", "seeks contact"]] },
-    number("seed", "Seed", 0, 0, 4294967295),
+    number("seed", "Seed", 0, 0, 2147483647),
   ],
   collect_object: () => [
     { name: "name", label: "Object", options: objects().filter((o) => o.available).map((o) => [o.name, o.label]) },
     number("images", "Images", 300, 60, 5000),
     number("size", "Size in px", 128, 16, 1024),
-    number("seed", "Seed", 0, 0, 4294967295),
+    number("seed", "Seed", 0, 0, 2147483647),
   ],
   collect_table: () => [
     number("images", "Images", 300, 60, 5000),
     number("size", "Size in px", 128, 16, 1024),
-    number("seed", "Seed", 0, 0, 4294967295),
+    number("seed", "Seed", 0, 0, 2147483647),
   ],
 };
+const LATEST = { train_field: "training", estimate: "estimate", episode: "episode" }; // what the page knows of a kind
 const jobs = new Map();
 const nodes = new Map();
+let older = null; // where the jobs that are not shown yet begin
 
 function field({ name, label, options, ...properties }) {
   const input = options
@@ -128,12 +131,19 @@ function showEpisode(job) {
   } } });
 }
 
+function deleteButton({ id }) {
+  return doubted(el("button", { type: "button", className: "plain danger", textContent: "Delete" }), "Really delete", async () => {
+    await remove(`jobs/${id}?forget=true`);
+    dropJob(id);
+  });
+}
+
 function controlsKey(job) {
   return `${job.state} ${job.files.join()}`;
 }
 
 /** Draws a job once and then changes what changed, so that a button under the pointer stays. */
-function draw(job) {
+function draw(job, isOlder) {
   let node = nodes.get(job.id);
   if (!node) {
     node = {
@@ -146,7 +156,7 @@ function draw(job) {
     node.item = el("li", {}, head, order, node.bar, node.text, node.error, node.actions);
     node.item.dataset.job = job.id;
     nodes.set(job.id, node);
-    byId("job-list").prepend(node.item);
+    byId("job-list")[isOlder ? "append" : "prepend"](node.item);
   }
   node.item.dataset.state = job.state;
   node.bar.hidden = !LIVE.has(job.state);
@@ -155,38 +165,71 @@ function draw(job) {
   node.text.textContent = stateText(job);
   node.error.textContent = job.error ?? "";
   node.error.hidden = !job.error;
-  if (node.key !== controlsKey(job)) node.actions.replaceChildren(...controls(job));
+  if (node.key !== controlsKey(job)) {
+    node.actions.replaceChildren(...controls(job), LIVE.has(job.state) ? "" : deleteButton(job));
+  }
   node.key = controlsKey(job);
 }
 
 /** The job of a kind that runs, else the one that was asked for last. */
 function latest(kind) {
   const all = [...jobs.values()].filter((job) => job.kind === kind);
-  return all.find((job) => job.state === "running" || job.state === "paused") ?? all.at(-1);
+  const newest = (last, job) => (last && last.created_at > job.created_at ? last : job);
+  return all.find((job) => job.state === "running" || job.state === "paused") ?? all.reduce(newest, undefined);
 }
 
-export function showJob(job) {
-  const before = jobs.get(job.id);
-  jobs.set(job.id, job);
-  draw(job);
+function tell({ kind }) {
   byId("no-jobs").hidden = jobs.size > 0;
   const live = [...jobs.values()].filter((other) => LIVE.has(other.state)).length;
   byId("jobs-count").textContent = live;
   byId("jobs-count").hidden = live === 0;
-  if (job.kind === "train_field") set("training", latest("train_field"));
-  if (job.kind === "episode") set("episode", latest("episode"));
-  if (job.kind === "estimate") set("estimate", latest("estimate"));
+  if (LATEST[kind]) set(LATEST[kind], latest(kind));
+}
+
+export function showJob(job, { isOlder = false } = {}) {
+  const before = jobs.get(job.id);
+  jobs.set(job.id, job);
+  draw(job, isOlder);
+  tell(job);
   if (job.kind === "fetch_assets" && job.state === "done" && before && before.state !== "done") refreshObjects();
 }
 
+/** Forgets a job that was removed for good. */
+export function dropJob(id) {
+  const job = jobs.get(id);
+  if (!job) return;
+  jobs.delete(id);
+  nodes.get(id).item.remove();
+  nodes.delete(id);
+  tell(job);
+}
+
+function offerOlder(answer) {
+  older = answer.next;
+  byId("more-jobs").hidden = older === null;
+}
+
 export async function refreshJobs() {
+  const before = [...jobs.keys()];
   const answer = await tellFailure(() => get("jobs"));
-  if (answer) for (const job of [...answer.jobs].reverse()) showJob(job);
+  if (!answer) return;
+  const there = new Set(answer.jobs.map(({ id }) => id));
+  for (const id of before) if (!there.has(id)) dropJob(id);
+  for (const job of [...answer.jobs].reverse()) showJob(job);
+  offerOlder(answer);
+}
+
+async function showOlder() {
+  const answer = await get(`jobs?after=${older}`);
+  for (const job of answer.jobs) showJob(job, { isOlder: true });
+  offerOlder(answer);
 }
 
 export function setUpJobs() {
   const form = byId("new-job");
   form.addEventListener("submit", start);
   form.elements.kind.addEventListener("change", drawFields);
+  const more = byId("more-jobs");
+  more.addEventListener("click", () => whileDisabled(more, () => tellFailure(showOlder)));
   watch("objects", drawFields);
 }

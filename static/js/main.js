@@ -8,12 +8,12 @@ import { setUpDrop } from "./drop.js";
 import { setUpEpisode } from "./episode.js";
 import { refreshSettings, setUpEpisodeSettings } from "./episode-settings.js";
 import { refreshShown, setUpEpisodeView, shownStep } from "./episode-view.js";
-import { refreshEpisodes, setUpEpisodes } from "./episodes.js";
+import { dropEpisode, refreshEpisodes, setUpEpisodes } from "./episodes.js";
 import { setUpEstimate } from "./estimate.js";
 import { listen } from "./events.js";
 import { refreshSets, setUpFields } from "./fields.js";
 import { refreshGoals, setUpGoals } from "./goals.js";
-import { refreshJobs, setUpJobs, showJob } from "./jobs.js";
+import { dropJob, refreshJobs, setUpJobs, showJob } from "./jobs.js";
 import { setUpKeyboard } from "./keyboard.js";
 import { setUpLight } from "./light.js";
 import { setUpNeural } from "./neural.js";
@@ -113,7 +113,11 @@ listen(VISITOR, {
   lost: () => status("Reconnecting", "lost"),
   scene: (scene) => set("scene", scene),
   frame: showFrames,
-  job: showJob,
+  job: (job) => showJob(job),
+  forgotten({ job }) {
+    dropJob(job);
+    dropEpisode(job);
+  },
   draft: (draft) => set("draft", draft),
   goals: () => refreshGoals(),
   driver: (driver) => set("driver", driver),

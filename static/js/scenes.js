@@ -1,12 +1,12 @@
 // New scenes and the list of those there are.
-import { get, post, remove } from "./api.js";
+import { getAll, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { current, set, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
 
 const MOST_OBJECTS = 8;
 const form = () => byId("new-scene");
-const randomSeed = () => Math.floor(Math.random() * 1_000_000);
+const randomSeed = () => Math.floor(Math.random() * 1_000_000); // short to read
 
 function chosenObjects() {
   return [...byId("chips").querySelectorAll("input:checked")].map((box) => box.value);
@@ -46,8 +46,7 @@ export function resetScene() {
     tellFailure(async () => set("scene", { ...(await post(`scenes/${scene.id}/reset`)), is_current: true })));
 }
 
-function entry(scene, currentId) {
-  const isCurrent = scene.id === currentId;
+function entry(scene) {
   const show = el("button", { type: "button", className: "plain", textContent: "Show" });
   show.addEventListener("click", () => whileDisabled(show, () => tellFailure(async () => {
     set("scene", await post(`scenes/${scene.id}/activate`));
@@ -65,15 +64,15 @@ function entry(scene, currentId) {
     {},
     el("span", { className: "title", textContent: names || "Empty table" }),
     el("span", { className: "hint", textContent: `Seed ${scene.seed}, made ${made}` }),
-    el("div", { className: "actions" }, isCurrent ? el("span", { className: "current", textContent: "Shown now" }) : show, drop),
+    el("div", { className: "actions" }, scene.is_current ? el("span", { className: "current", textContent: "Shown now" }) : show, drop),
   );
 }
 
 export async function refreshScenes() {
-  const answer = await tellFailure(() => get("scenes"));
-  if (!answer) return;
-  byId("no-scenes").hidden = answer.scenes.length > 0;
-  byId("scene-list").replaceChildren(...[...answer.scenes].reverse().map((scene) => entry(scene, answer.current)));
+  const scenes = await tellFailure(() => getAll("scenes", "scenes"));
+  if (!scenes) return;
+  byId("no-scenes").hidden = scenes.length > 0;
+  byId("scene-list").replaceChildren(...scenes.reverse().map(entry));
 }
 
 export function setUpScenes() {

@@ -221,6 +221,48 @@ def test_collection_shows_progress_and_cancels_within_a_second(page):
     assert not page.is_visible("#jobs-count")
 
 
+def test_a_finished_job_is_deleted_on_all_pages_after_asking_twice(page, service, browser):
+    page.click("#tab-jobs")
+    page.fill('#job-fields input[name="episodes"]', "400")
+    page.click("#new-job [type=submit]")
+    wait_until(lambda: "of 400" in page.locator("#job-list li").first.inner_text(), 40)
+    name = page.locator("#job-list li").first.get_attribute("data-job")
+    job = page.locator(f'#job-list li[data-job="{name}"]')
+    assert job.get_by_text("Delete").count() == 0
+    job.get_by_text("Cancel").click()
+    other = browser.new_page()
+    other.goto(service.url)
+    other.wait_for_selector(f'#job-list li[data-job="{name}"]', state="attached", timeout=WAIT_MS)
+    job.get_by_text("Delete", exact=True).click()
+    assert name in [one["id"] for one in service.get("jobs")["jobs"]]
+    job.get_by_text("Really delete").click()
+    wait_until(lambda: job.count() == 0, 5)
+    wait_until(lambda: other.locator(f'#job-list li[data-job="{name}"]').count() == 0, 5)
+    assert name not in [one["id"] for one in service.get("jobs")["jobs"]]
+    other.close()
+
+
+def test_more_jobs_than_fit_a_page_are_shown_on_demand(page, service, browser):
+    for _ in range(2):
+        body = json.dumps({"kind": "collect_pushes", "params": {"episodes": 100, "objects": 1}}).encode()
+        asked = urllib.request.Request(f"{service.url}/api/jobs", body, {"Content-Type": "application/json"})
+        with urllib.request.urlopen(asked, timeout=20) as answer:
+            name = json.load(answer)["id"]
+        urllib.request.urlopen(urllib.request.Request(f"{service.url}/api/jobs/{name}", method="DELETE"), timeout=20)
+    names = [job["id"] for job in service.get("jobs")["jobs"]]
+    small = browser.new_page()
+    small.route("**/api/jobs", lambda route: route.continue_(url=f"{service.url}/api/jobs?limit=1"))
+    small.goto(service.url)
+    small.click("#tab-jobs")
+    wait_until(lambda: small.locator("#job-list li").count() == 1)
+    small.click("#more-jobs")
+    wait_until(lambda: small.locator("#job-list li").count() == len(names))
+    shown = small.locator("#job-list li").evaluate_all("all => all.map((item) => item.dataset.job)")
+    assert shown == names
+    assert not small.is_visible("#more-jobs")
+    small.close()
+
+
 def test_a_mistake_is_told_in_words(page, service):
     page.click("#tab-scenes")
     page.check('input[name="which"][value="chosen"]')

@@ -1,11 +1,17 @@
 """The REST interface, one module a noun."""
 
-from typing import Any
+from typing import Annotated, Any
+
+from fastapi import Query
 
 PROBLEM_REF = {"$ref": "#/components/schemas/Problem"}
 PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}, "description": "The image."}
 }
+FORGOTTEN: dict[int | str, dict[str, Any]] = {204: {"description": "It is gone, with all its files."}}
+Forget = Annotated[
+    bool, Query(description="Remove one that has finished for good, with all its files; nothing is answered then.")
+]
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -27,5 +33,5 @@ _TEXTS = {
     422: "The input is not valid; the detail says what is allowed.",
     429: "Too many jobs wait already.",
     503: "The simulation, the neural renderer or the predictor is being restarted.",
-    507: "The disk is full.",
+    507: "The disk is full, or the service holds as much as it may.",
 }

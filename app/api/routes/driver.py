@@ -9,11 +9,10 @@ from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.common import Input
+from app.api.schemas.limits import NAME, sized
 
 router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems(), route_class=BoundedRoute)
-Visitor = Annotated[
-    str, Field(min_length=1, max_length=64, pattern="^[A-Za-z0-9_-]+$", description="What a page calls itself.")
-]
+Visitor = Annotated[str, Field(**sized(NAME), pattern="^[A-Za-z0-9_-]+$", description="What a page calls itself.")]
 
 
 class DriverIn(Input):

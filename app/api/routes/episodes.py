@@ -14,9 +14,11 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow, urgent
 from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
-from app.api.routes import PNG, problems
+from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.routes.events import StreamDep, followed
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
+from app.api.schemas.limits import STEP, within
+from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
 from app.jobs.job import Job
@@ -61,12 +63,11 @@ def create(services: ServicesDep, body: EpisodeIn, response: Response) -> Episod
 
 
 @router.get("")
-def list_all(services: ServicesDep) -> EpisodeList:
-    """List all episodes, newest first, without their steps."""
-    episodes = services.episodes
-    return EpisodeList(
-        episodes=[EpisodeOut.of_job(job, episodes.settings(job), None, episodes.files(job)) for job in episodes.all()]
-    )
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> EpisodeList:
+    """List episodes, newest first, without their steps."""
+    episodes, page = services.episodes, services.episodes.page(limit, after)
+    listed = [EpisodeOut.of_job(job, episodes.settings(job), None, episodes.files(job)) for job in page.jobs]
+    return EpisodeList(episodes=listed, total=page.total, next=page.next)
 
 
 @router.get("/{episode}", responses=problems(404, 409))
@@ -75,10 +76,13 @@ def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     return _out(services, job)
 
 
-@router.delete("/{episode}", responses=problems(404, 409))
+@router.delete("/{episode}", response_model=EpisodeOut, responses={**problems(404, 409, 507), **FORGOTTEN})
 @urgent
-def cancel(services: ServicesDep, job: FoundDep) -> EpisodeOut:
+def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EpisodeOut | Response:
     """End an episode, within a second. The steps that it has done are kept."""
+    if forget:
+        services.runner.forget_job(job.id)
+        return Response(status_code=status.HTTP_204_NO_CONTENT)
     return _out(services, services.runner.jobs.cancel(job.id))
 
 
@@ -122,7 +126,7 @@ async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> As
 async def frame(
     services: ServicesDep,
     job: FoundDep,
-    step: Annotated[int, Path(ge=0, le=100_000, description="Number of the step, from 0.")],
+    step: Annotated[int, Path(**within(STEP), description="Number of the step, from 0.")],
     part: Annotated[
         Part,
         Query(description="The goal image, the table then, the estimate as the goal camera would see it, how much "

@@ -13,11 +13,13 @@ from app.api.dependencies import ServicesDep
 from app.api.lanes import urgent
 from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
-from app.api.routes import problems
+from app.api.routes import FORGOTTEN, Forget, problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
 from app.api.routes.events import StreamDep, followed
 from app.api.schemas.common import Seed
 from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
+from app.api.schemas.limits import FILE_NAME, GUESS, NAME, VIEW, sized, within
+from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.jobs.job import Job
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked, Estimates
@@ -36,7 +38,7 @@ _BODY = {
     }
 }
 router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
-View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")]
+View = Annotated[int, Path(**within(VIEW), description="Number of the camera, from 0.")]
 
 
 async def _known_job(
@@ -63,10 +65,9 @@ async def create(
     mode: Annotated[Mode, Query(description="Of an upload; JSON says it in the body.")] = "first",
     seed: Annotated[Seed, Query(description="Of an upload.")] = 0,
     prior: Annotated[
-        str | None,
-        Query(min_length=1, max_length=64, description="Of an upload: the earlier estimate, else its prior.json."),
+        str | None, Query(**sized(NAME), description="Of an upload: the earlier estimate, else its prior.json.")
     ] = None,
-    file_name: Annotated[str, Query(max_length=200, description="Of an upload, for people.")] = "observation.zip",
+    file_name: Annotated[str, Query(**sized(FILE_NAME), description="Of an upload, for people.")] = "observation.zip",
 ) -> EstimateOut:
     """Queue an estimate of the current scene (JSON, or no body at all) or of a zipped observation folder.
 
@@ -87,9 +88,11 @@ async def create(
 
 
 @router.get("")
-def list_all(services: ServicesDep) -> EstimateList:
-    """List all estimates, newest first, without steps and results."""
-    return EstimateList(estimates=[EstimateOut.of_job(job, (), None, None) for job in services.estimates.all()])
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> EstimateList:
+    """List estimates, newest first, without steps and results."""
+    page = services.estimates.page(limit, after)
+    listed = [EstimateOut.of_job(job, (), None, None) for job in page.jobs]
+    return EstimateList(estimates=listed, total=page.total, next=page.next)
 
 
 @router.get("/{estimate}", responses=problems(404, 409), response_model_exclude_unset=True)
@@ -98,10 +101,18 @@ def get(services: ServicesDep, job: FoundDep) -> EstimateOut:
     return _out(services.estimates, job)
 
 
-@router.delete("/{estimate}", responses=problems(404, 409), response_model_exclude_unset=True)
+@router.delete(
+    "/{estimate}",
+    response_model=EstimateOut,
+    responses={**problems(404, 409, 507), **FORGOTTEN},
+    response_model_exclude_unset=True,
+)
 @urgent
-def cancel(services: ServicesDep, job: FoundDep) -> EstimateOut:
+def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> EstimateOut | Response:
     """End an estimate, within a second; what it was given is removed. It stays listed as cancelled."""
+    if forget:
+        services.runner.forget_job(job.id)
+        return Response(status_code=status.HTTP_204_NO_CONTENT)
     return _out(services.estimates, services.runner.jobs.cancel(job.id))
 
 
@@ -123,7 +134,7 @@ async def image(
         Query(description="The difference is absolute, times 4; a comparison is all three side by side."),
     ] = "comparison",
     step: Annotated[
-        int | None, Query(ge=1, le=100_000, description="Whose guess is rendered; the latest if left out.")
+        int | None, Query(**within(GUESS), description="Whose guess is rendered; the latest if left out.")
     ] = None,
 ) -> Response:
     """Show what a camera saw, and what it would see if a step's guess were true."""

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
@@ -18,15 +18,17 @@ from starlette.concurrency import run_in_threadpool
 from app.api.dependencies import Services, ServicesDep
 from app.api.routes import problems
 from app.api.routes.driver import DriverOut
-from app.api.schemas.common import FrameEvent, NoticeEvent
+from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent
 from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
-from app.jobs.job import Job, JobChanged, job_from_fields
+from app.api.schemas.limits import NAME, sized
+from app.jobs.job import Job, JobChanged, JobForgotten, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
 from app.storage.paths import without_places
+from osfcore.errors import UnknownName
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
@@ -34,6 +36,7 @@ FRAME_INTERVAL_S = 0.2
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
+Letter = JobChanged | JobForgotten | Notice | GoalsChanged | DriverChanged
 
 
 async def _counted(services: ServicesDep) -> AsyncIterator[None]:
@@ -50,7 +53,7 @@ class Mailbox:
     def __init__(self, current: str | None) -> None:
         self._loop = asyncio.get_running_loop()
         self._current = current
-        self.letters: deque[JobChanged | Notice | GoalsChanged | DriverChanged] = deque(maxlen=_MAX_WAITING)
+        self.letters: deque[Letter] = deque(maxlen=_MAX_WAITING)
         self.draft: DraftChanged | None = None
         self.is_scene_new = True
         self.frames: FramesTaken | None = None
@@ -74,7 +77,7 @@ class Mailbox:
 
     def _put(self, event: object) -> None:
         match event:
-            case JobChanged() | Notice() | GoalsChanged() | DriverChanged():
+            case JobChanged() | JobForgotten() | Notice() | GoalsChanged() | DriverChanged():
                 self.letters.append(event)
             case DraftChanged():
                 self.draft = event
@@ -94,12 +97,11 @@ async def stream(
     counted: StreamDep,
     frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
     visitor: Annotated[
-        str | None,
-        Query(min_length=1, max_length=64, pattern="^[A-Za-z0-9_-]+$", description="What the page calls itself."),
+        str | None, Query(**sized(NAME), pattern="^[A-Za-z0-9_-]+$", description="What the page calls itself.")
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: "job", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
+    """Follow what happens: "job", "forgotten", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
     del counted
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
@@ -112,14 +114,18 @@ async def stream(
             has_arrived = True
             services.driver.arrive(visitor)
         yield ServerSentEvent(comment="connected", retry=1000)
+        for entry in services.store.set_aside:
+            yield ServerSentEvent(event="notice", data=NoticeEvent(level="warning", text=entry.sentence))
         if services.goals.draft is not None:
             yield _draft_event(services, DraftChanged(services.goals.draft))
         last = 0
         if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
             last = min(int(last_event_id[:19]), _MAX_EVENT)
-            for number, job in await run_in_threadpool(services.store.events_after, last, job_from_fields):
+            for number, fields in await run_in_threadpool(services.store.events_after, last):
                 last = number
-                yield job_event(services, number, job)
+                replayed = _replayed(services, number, fields)
+                if replayed is not None:
+                    yield replayed
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
     finally:
@@ -146,6 +152,8 @@ async def _follow(
                     yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
                     yield job_event(services, letter.event, letter.job)
+                case JobForgotten() if letter.event > last:
+                    yield _replayed(services, letter.event, {"forgotten": letter.job.id})
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
             yield _draft_event(services, changed)
@@ -175,7 +183,9 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
     mailbox = Mailbox(None)
     leave = services.runner.hub.subscribe(mailbox.put)
     try:
-        now = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        with contextlib.suppress(UnknownName):  # one that was just removed for good ends as it was
+            job = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        now = job
         yield job_event(services, 0, now)
         while not now.is_finished and not services.closing.is_set():
             letter = await mailbox.next_job(job.id)
@@ -201,6 +211,22 @@ def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:
 def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
     text = without_places(notice.text, services.settings.data_dir)
     return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
+
+
+def _replayed(services: Services, number: int, fields: dict[str, Any]) -> ServerSentEvent | None:
+    """An event as it was told; None if another version wrote it in a way that makes no sense to this one.
+
+    Args:
+        services: of the app.
+        number: of the event.
+        fields: what the store keeps of it.
+    """
+    if "forgotten" in fields:
+        return ServerSentEvent(event="forgotten", id=str(number), data=ForgottenEvent(job=fields["forgotten"]))
+    try:
+        return job_event(services, number, job_from_fields(fields))
+    except (OsfError, TypeError):
+        return None
 
 
 def _scene_event(services: Services) -> ServerSentEvent:

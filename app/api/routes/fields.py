@@ -11,6 +11,8 @@ from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
+from app.api.schemas.limits import FILE_NAME, sized
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
 
@@ -38,7 +40,7 @@ async def upload_set(
     services: ServicesDep,
     request: Request,
     response: Response,
-    file_name: Annotated[str, Query(max_length=200, description="What the zip is called, for people.")] = "set.zip",
+    file_name: Annotated[str, Query(**sized(FILE_NAME), description="What the zip is called, for people.")] = "set.zip",
 ) -> SetOut:
     """Upload a zipped image set in the OSF format: train/anno.json, test/anno.json and RGBA PNGs beside them."""
     try:
@@ -50,9 +52,10 @@ async def upload_set(
 
 
 @router.get("/sets")
-def list_sets(services: ServicesDep) -> SetList:
+def list_sets(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> SetList:
     """List the uploaded image sets, oldest first."""
-    return SetList(sets=[SetOut.of(record) for record in services.runner.sets.all()])
+    shown, total, following = page(services.runner.sets.all(), limit, after, newest_first=False)
+    return SetList(sets=[SetOut.of(record) for record in shown], total=total, next=following)
 
 
 @router.get("/sets/{set_id}", responses=problems(404))
@@ -88,6 +91,7 @@ def delete(services: ServicesDep, name: FieldName) -> None:
     """Delete a field that was trained here; a shipped one of the same name then counts again."""
     _known_field(services, name)
     services.fields.remove(name)
+    services.runner.storage.outdate()
 
 
 def _out(services: Services, info: FieldInfo) -> FieldOut:

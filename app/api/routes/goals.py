@@ -15,6 +15,8 @@ from app.api.open_file import OpenFile
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
+from app.api.schemas.limits import CAMERA_JSON, GOAL_NAME, sized
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.services.goals import Draft, NoDraft
 from app.storage.goal_store import GoalRecord
 from osfcore.errors import InvalidInput, OsfError
@@ -50,10 +52,12 @@ async def create(
     services: ServicesDep,
     request: Request,
     response: Response,
-    name: Annotated[str, Query(min_length=1, max_length=100, description="Of a photo, for people.")] = "Photo",
+    name: Annotated[str, Query(**sized(GOAL_NAME), description="Of a photo, for people.")] = "Photo",
     camera: Annotated[
         str | None,
-        Query(max_length=4000, description="Of a photo: its camera as JSON, as in scene.json; else the goal camera."),
+        Query(
+            **sized(CAMERA_JSON), description="Of a photo: its camera as JSON, as in scene.json; else the goal camera."
+        ),
     ] = None,
 ) -> GoalOut:
     """Keep a photo (PNG or JPEG) of how the table should look, or make a goal image of objects that lie elsewhere.
@@ -81,9 +85,10 @@ async def create(
 
 
 @router.get("")
-def list_all(services: ServicesDep) -> GoalList:
-    """List all goals, newest first."""
-    return GoalList(goals=[GoalOut.of(record) for record in services.goals.all()])
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> GoalList:
+    """List goals, newest first."""
+    shown, total, following = page(services.goals.all(), limit, after, newest_first=True)
+    return GoalList(goals=[GoalOut.of(record) for record in shown], total=total, next=following)
 
 
 @router.post("/draft", status_code=status.HTTP_201_CREATED, responses=problems(409, 503))

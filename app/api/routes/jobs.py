@@ -10,8 +10,9 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import urgent
 from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
-from app.api.routes import PNG, problems
+from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
+from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.jobs.job import Job, check_file_name
 from app.jobs.kinds.fields import PREVIEW
 
@@ -26,7 +27,7 @@ _FILE = {
 }
 
 
-@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429))
+@router.post("", status_code=status.HTTP_202_ACCEPTED, responses=problems(409, 429, 507))
 def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Response) -> JobOut:
     """Queue a job; one runs at a time. Outputs go to the data directory's collections/ID."""
     job = services.runner.submit_job(body.kind, body.params.model_dump())
@@ -35,9 +36,10 @@ def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Resp
 
 
 @router.get("")
-async def list_all(services: ServicesDep) -> JobList:
-    """List all jobs, newest first."""
-    return JobList(jobs=[JobOut.of(job) for job in services.runner.jobs.all()])
+async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> JobList:
+    """List jobs, newest first."""
+    page = services.runner.jobs.page(limit, after)
+    return JobList(jobs=[JobOut.of(job) for job in page.jobs], total=page.total, next=page.next)
 
 
 @router.get("/{job}", responses=problems(404))
@@ -46,11 +48,14 @@ async def get(services: ServicesDep, job: JobId) -> JobOut:
     return JobOut.of(_known_job(services, job))
 
 
-@router.delete("/{job}", responses=problems(404, 409))
+@router.delete("/{job}", response_model=JobOut, responses={**problems(404, 409, 507), **FORGOTTEN})
 @urgent
-def cancel(services: ServicesDep, job: JobId) -> JobOut:
+def cancel(services: ServicesDep, job: JobId, forget: Forget = False) -> JobOut | Response:
     """Take a job out of the queue or end it; what it has made is removed. It stays listed as cancelled."""
     _known_job(services, job)
+    if forget:
+        services.runner.forget_job(job)
+        return Response(status_code=status.HTTP_204_NO_CONTENT)
     return JobOut.of(services.runner.jobs.cancel(job))
 
 

@@ -10,6 +10,7 @@ from app.api.lanes import slow
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
 from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS
@@ -38,10 +39,13 @@ def create(services: ServicesDep, body: SceneIn, response: Response) -> SceneOut
 
 
 @router.get("")
-async def list_all(services: ServicesDep) -> SceneList:
-    """List all scenes, oldest first."""
+async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> SceneList:
+    """List scenes, oldest first."""
     runner = services.runner
-    return SceneList(scenes=[services.scene_out(record) for record in runner.scenes()], current=runner.current)
+    shown, total, following = page(runner.scenes(), limit, after, newest_first=False)
+    return SceneList(
+        scenes=[services.scene_out(record) for record in shown], current=runner.current, total=total, next=following
+    )
 
 
 @router.get("/{scene}", responses=problems(404))

@@ -11,27 +11,36 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from app.api.schemas.limits import (
+    ACTIONS,
+    COORDINATE_M,
+    IMAGE_SIDE,
+    NAME,
+    OBJECTS,
+    QUATERNION_COMPONENT,
+    SEED,
+    sized,
+    within,
+)
+from app.api.schemas.paging import PageOut
 from app.processes.messages.scene_messages import SceneRecord
-from app.services.scenes import MAX_SEED
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, default_cameras, goal_camera
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.scene_file import CameraJson, ObjectJson, PointJson
 from osfcore.objects.asset import ObjectInfo
 
-# Bounds far beyond anything on a table keep numbers away whose squares overflow.
-Component = Annotated[FiniteFloat, Field(ge=-1.1, le=1.1)]
-Coordinate = Annotated[FiniteFloat, Field(ge=-100, le=100)]
+Component = Annotated[FiniteFloat, Field(**within(QUATERNION_COMPONENT))]
+Coordinate = Annotated[FiniteFloat, Field(**within(COORDINATE_M))]
 Quaternion = Annotated[list[Component], Field(min_length=4, max_length=4, description="Unit quaternion (w, x, y, z).")]
 Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3, description="[m], world frame.")]
 Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Velocity = Annotated[
     Vector3, Field(description="Pusher velocity (vx, vy, 0) [m/s], |vx| and |vy| at most 0.3, held for 0.2 s.")
 ]
-ImageSize = Annotated[int, Field(ge=MIN_IMAGE_SIDE, le=MAX_IMAGE_SIDE, description="Side of the square images [px].")]
-Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
-ObjectName = Annotated[str, Field(min_length=1, max_length=64, examples=["006_mustard_bottle"])]
+ImageSize = Annotated[int, Field(**within(IMAGE_SIDE), description="Side of the square images [px].")]
+Seed = Annotated[int, Field(**within(SEED))]
+ObjectName = Annotated[str, Field(**sized(NAME), examples=["006_mustard_bottle"])]
 
 
 class Input(BaseModel):
@@ -137,12 +146,12 @@ class ObjectPose(Input):
 class SceneIn(Input):
     """What a new scene shall contain; everything left out is drawn from the seed."""
 
-    objects: list[ObjectName] | None = Field(None, min_length=1, max_length=MAX_OBJECTS, description="Which objects.")
-    count: int = Field(3, ge=1, le=MAX_OBJECTS, description="How many objects, where they are not named.")
+    objects: list[ObjectName] | None = Field(None, **sized(OBJECTS), description="Which objects.")
+    count: int = Field(3, **within(OBJECTS), description="How many objects, where they are not named.")
     seed: Seed | None = Field(None, description="The same seed gives the same scene; null for any.")
     light: LightIn | None = None
     poses: list[ObjectPose] | None = Field(
-        None, min_length=1, max_length=MAX_OBJECTS, description="Exact poses, instead of random resting ones."
+        None, **sized(OBJECTS), description="Exact poses, instead of random resting ones."
     )
     image_size: ImageSize = DEFAULT_IMAGE_SIDE
 
@@ -151,13 +160,13 @@ class ScenePatch(Input):
     """What to move by hand, all or nothing."""
 
     light: LightIn | None = None
-    objects: list[ObjectPose] | None = Field(None, max_length=MAX_OBJECTS)
+    objects: list[ObjectPose] | None = Field(None, max_length=OBJECTS[1])
 
 
 class ActionsIn(Input):
     """Velocities of the pusher, one after the other."""
 
-    actions: list[Velocity] = Field(min_length=1, max_length=50, examples=[[[0.2, 0.0, 0.0]]])
+    actions: list[Velocity] = Field(**sized(ACTIONS), examples=[[[0.2, 0.0, 0.0]]])
 
 
 class SceneObject(ObjectJson):
@@ -222,7 +231,7 @@ def _cameras(size: int) -> list[CameraJson]:
     return [CameraJson.of(camera) for camera in (*default_cameras(size), goal_camera(size))]
 
 
-class SceneList(BaseModel):
+class SceneList(PageOut):
     """All scenes, oldest first."""
 
     scenes: list[SceneOut]
@@ -235,6 +244,12 @@ class FrameEvent(BaseModel):
     scene: str
     revision: int
     cameras: dict[str, str] = Field(description="Camera name to JPEG data URL.")
+
+
+class ForgottenEvent(BaseModel):
+    """A job was removed for good, the data of a "forgotten" event."""
+
+    job: str
 
 
 class NoticeEvent(BaseModel):

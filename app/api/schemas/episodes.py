@@ -8,16 +8,15 @@ from pydantic import BaseModel, Field
 
 from app.api.schemas.common import Input, Seed
 from app.api.schemas.goals import Poses, SceneRef
+from app.api.schemas.limits import HORIZON, NAME, SAMPLES, STEPS, TEMPERATURE, sized, within
+from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.services.episodes import AskedEpisode, flat
-from osfcore.control.episode_settings import MAX_STEPS, CostKind, EpisodeSettings
-from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
-
-SAMPLES, HORIZON, STEPS, TEMPERATURE = (8, MAX_SEQUENCES), (1, MAX_HORIZON), (1, MAX_STEPS), (1e-6, 1e6)
+from osfcore.control.episode_settings import CostKind, EpisodeSettings
 
 
 def _between(bounds: tuple[float, float], text: str) -> Any:  # noqa: ANN401  what pydantic's Field returns
-    return Field(None, ge=bounds[0], le=bounds[1], description=text)
+    return Field(None, **within(bounds), description=text)
 
 
 class SettingsIn(Input):
@@ -44,7 +43,7 @@ class EpisodeIn(Input):
     """An episode: give either goal or poses."""
 
     scene: SceneRef
-    goal: str | None = Field(None, min_length=1, max_length=64, description="Identifier of a goal image.")
+    goal: str | None = Field(None, **sized(NAME), description="Identifier of a goal image.")
     poses: Poses | None = Field(None, description="Where all objects shall be.")
     seed: Seed = 0
     settings: SettingsIn = SettingsIn()  # pyright: ignore[reportCallIssue]
@@ -198,7 +197,7 @@ class EpisodeOut(BaseModel):
         )
 
 
-class EpisodeList(BaseModel):
+class EpisodeList(JobPageOut):
     """Episodes, newest first, without their steps."""
 
     episodes: list[EpisodeOut]

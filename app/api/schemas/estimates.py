@@ -7,6 +7,8 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from app.api.schemas.common import Input, Seed
+from app.api.schemas.limits import NAME, sized
+from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked
@@ -21,9 +23,9 @@ class EstimateIn(Input):
         description='"first" from masks alone, "next" without masks from an earlier estimate, "goal" from one view '
         "without masks and without the pusher.",
     )
-    scene: str | None = Field(None, min_length=1, max_length=64, description="Null for the one that is shown.")
+    scene: str | None = Field(None, **sized(NAME), description="Null for the one that is shown.")
     prior: str | None = Field(
-        None, min_length=1, max_length=64, description="The earlier estimate; null for the latest one of the scene."
+        None, **sized(NAME), description="The earlier estimate; null for the latest one of the scene."
     )
     seed: Seed = 0
 
@@ -131,7 +133,7 @@ class EstimateOut(BaseModel):
         )
 
 
-class EstimateList(BaseModel):
+class EstimateList(JobPageOut):
     """Estimates, newest first, without their steps."""
 
     estimates: list[EstimateOut]

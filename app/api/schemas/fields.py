@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from app.api.schemas.paging import PageOut
 from app.services.image_sets import SetRecord
 
 
@@ -43,7 +44,7 @@ class SetOut(BaseModel):
         return SetOut.model_validate(record, from_attributes=True)
 
 
-class SetList(BaseModel):
+class SetList(PageOut):
     """Uploaded image sets, oldest first."""
 
     sets: list[SetOut]

@@ -7,24 +7,25 @@ from typing import Annotated
 from pydantic import BaseModel, Field, model_validator
 
 from app.api.schemas.common import Input, LightIn, ObjectPose, SceneObject, Seed
+from app.api.schemas.limits import GOAL_NAME, NAME, OBJECTS, sized, within
+from app.api.schemas.paging import PageOut
 from app.services.goals import Draft
 from app.storage.goal_store import GoalRecord, Source
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.scene_file import CameraJson, ObjectJson
 
-GoalName = Annotated[str, Field(min_length=1, max_length=100, description="For people.")]
+GoalName = Annotated[str, Field(**sized(GOAL_NAME), description="For people.")]
 SceneRef = Annotated[
-    str | None, Field(None, min_length=1, max_length=64, description="Identifier; null for the scene that is shown.")
+    str | None, Field(None, **sized(NAME), description="Identifier; null for the scene that is shown.")
 ]
-Poses = Annotated[list[ObjectPose], Field(min_length=1, max_length=MAX_OBJECTS)]
+Poses = Annotated[list[ObjectPose], Field(**sized(OBJECTS))]
 
 
 class RandomLayout(Input):
     """Some objects elsewhere, each 7.5 to 20 cm away."""
 
     seed: Seed = 0
-    moved: int | None = Field(None, ge=1, le=MAX_OBJECTS, description="How many; null as the seed will have it.")
+    moved: int | None = Field(None, **within(OBJECTS), description="How many; null as the seed will have it.")
 
 
 class GoalIn(Input):
@@ -94,7 +95,7 @@ class GoalOut(BaseModel):
         )
 
 
-class GoalList(BaseModel):
+class GoalList(PageOut):
     """Goals, newest first."""
 
     goals: list[GoalOut]

@@ -7,17 +7,28 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, model_validator
 
 from app.api.schemas.common import ImageSize, Input, ObjectName, Seed
+from app.api.schemas.limits import (
+    FETCHED,
+    IMAGES,
+    NAME,
+    OBJECTS,
+    PUSH_EPISODES,
+    PUSH_STEPS,
+    TRAINING_MINUTES,
+    sized,
+    within,
+)
+from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, Kind, State
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
-from osfcore.geometry.states import MAX_OBJECTS
 
 
 class CollectPushesParams(Input):
     """Episodes of random pushes for learning dynamics, as one HDF5 file."""
 
-    episodes: int = Field(1000, ge=1, le=100_000)
-    steps: int = Field(50, ge=1, le=1000, description="Actions of 0.2 s an episode.")
-    objects: int = Field(3, ge=1, le=MAX_OBJECTS, description="Objects a scene, drawn at random.")
+    episodes: int = Field(1000, **within(PUSH_EPISODES))
+    steps: int = Field(50, **within(PUSH_STEPS), description="Actions of 0.2 s an episode.")
+    objects: int = Field(3, **within(OBJECTS), description="Objects a scene, drawn at random.")
     policy: Literal["paper", "directed"] = Field(
         "paper", description="Uniform random velocities, or a pusher that seeks sustained contact."
     )
@@ -28,7 +39,7 @@ class CollectPushesParams(Input):
 class CollectTableParams(Input):
     """Images of the bare table under many lights."""
 
-    images: int = Field(300, ge=60, le=5000)
+    images: int = Field(300, **within(IMAGES))
     size: ImageSize = DEFAULT_IMAGE_SIDE
     seed: Seed = 0
 
@@ -42,14 +53,14 @@ class CollectObjectParams(CollectTableParams):
 class FetchAssetsParams(Input):
     """Objects to fetch from the package index."""
 
-    names: list[ObjectName] = Field(default=[], max_length=64, description="Empty for all that it has.")
+    names: list[ObjectName] = Field(default=[], **sized(FETCHED), description="Empty for all that it has.")
 
 
 class FieldSource(Input):
     """What to learn a field from: a mesh, of which images are then taken first, or an uploaded image set."""
 
     mesh: ObjectName | None = Field(None, description="An object whose mesh is on this machine.")
-    set: str | None = Field(None, min_length=1, max_length=64, description="Identifier of an uploaded image set.")
+    set: str | None = Field(None, **sized(NAME), description="Identifier of an uploaded image set.")
 
     @model_validator(mode="after")
     def _names_one(self) -> FieldSource:
@@ -63,9 +74,9 @@ class TrainFieldParams(Input):
 
     name: ObjectName = Field(description="Of the field; scenes need a mesh of the same name.")
     source: FieldSource
-    minutes: float = Field(30, ge=0.1, le=1440, description="How long to train [min].")
+    minutes: float = Field(30, **within(TRAINING_MINUTES), description="How long to train [min].")
     seed: Seed = 0
-    images: int = Field(300, ge=60, le=5000, description="Images to take of a mesh; a set has its own.")
+    images: int = Field(300, **within(IMAGES), description="Images to take of a mesh; a set has its own.")
     hollow: bool = Field(False, description="The object has hollows that no silhouette shows, such as a bowl's.")
 
 
@@ -134,7 +145,7 @@ class JobOut(BaseModel):
         return JobOut.model_validate(job, from_attributes=True)
 
 
-class JobList(BaseModel):
+class JobList(JobPageOut):
     """Jobs, newest first."""
 
     jobs: list[JobOut]

@@ -8,14 +8,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 from app.api.schemas.common import Input, LightIn, ObjectName, Position, Quaternion, Vector3, Velocity
+from app.api.schemas.limits import HORIZON, OBJECTS, SEQUENCES, sized
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.rollouts import MAX_HORIZON
-from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.geometry.states import SceneState
 
-MAX_SEQUENCES_IN = 1000
 _OVERHEAD = (0.0, 0.0, 1.0)
-Sequence = Annotated[list[Velocity], Field(min_length=1, max_length=MAX_HORIZON), FailFast()]
+Sequence = Annotated[list[Velocity], Field(**sized(HORIZON)), FailFast()]
 _STATE_EXAMPLE = {
     "objects": [{"name": "006_mustard_bottle", "position": [0.0, 0.0, 0.095], "quaternion": [1.0, 0.0, 0.0, 0.0]}],
     "light": {"position": [0.3, -0.4, 0.8]},
@@ -46,7 +45,7 @@ class Place(Told):
 class StateIn(Told):
     """Where everything is: what scene.json, state.json and /api/scenes tell can be sent as it is."""
 
-    objects: list[PlacedObject] = Field(min_length=1, max_length=MAX_OBJECTS)
+    objects: list[PlacedObject] = Field(**sized(OBJECTS))
     light: Place | None = Field(None, description="Pushes do not depend on it.")
     pusher: Place | None = Field(None, description="Centre of the pusher; a prediction needs one.")
 
@@ -65,8 +64,7 @@ class PredictionIn(Input):
     """Sequences of actions to try, and from where."""
 
     actions: list[Sequence] = Field(
-        min_length=1,
-        max_length=MAX_SEQUENCES_IN,
+        **sized(SEQUENCES),
         description="K sequences of T velocities of the pusher (vx, vy, 0) [m/s], each held for 0.2 s.",
         examples=[[[[0.3, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.0]]]],
     )

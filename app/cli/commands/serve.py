@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import ipaddress
-import logging
 import secrets
 import socket
 import sys
@@ -42,12 +41,13 @@ class Serve:
     port: int = 8000
     """Port of page, REST and viewer alike; 0 takes a free one."""
     data_dir: Path = field(default_factory=default_data_dir)
-    """Objects, database and collections."""
+    """Objects, database, collections and logs."""
     json: bool = False
     """Print a JSON object as the last line when the service has stopped."""
 
     def run(self) -> dict[str, Any]:
         """Serve until interrupted."""
+        from app.cli.service_log import start_log
         from app.storage.database import check_data_dir
 
         listener = bound_socket(self.host, self.port)
@@ -55,7 +55,7 @@ class Serve:
             check_data_dir(self.data_dir)  # tells now, in one sentence, if it cannot be used
             url = _url(self.host, listener.getsockname()[1])
             settings, login = _settings(self)
-            logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
+            start_log(self.data_dir)
             with contextlib.suppress(KeyboardInterrupt):  # the server raises it again once everything has stopped
                 _server(settings, url + login).run(sockets=[listener])
         return {"url": url}
@@ -145,6 +145,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
             app,
             workers=1,  # the state is in the process
             lifespan="on",
+            log_config=None,  # its errors go where all others go
             log_level="warning",
             access_log=False,
             http=PromptProtocol,

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.jobs.job import Job
+from app.jobs.job import Job, JobPage
 from app.jobs.job_folders import JobFolders
 from app.jobs.kinds.estimates import STATE
 from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, errors_of, examine
 from app.services.fields import FieldCatalogue, MissingFields
 from app.storage.database import now_utc
 from app.storage.uploads import UploadRefused
+from app.storage.usage import StorageMeter
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.estimated_state import EstimatedState
@@ -59,8 +60,15 @@ class Jobs(JobFolders):
     def all(self):
         return tuple(self._all)
 
-    def get(self, name):
-        return next(job for job in self._all if job.id == name)
+    def page(self, limit, before, kind):
+        shown = [job for job in self._all if job.kind == kind]
+        return JobPage(tuple(shown[:limit]), len(shown), None)
+
+    def get(self, name, kind=None):
+        for job in self._all:
+            if job.id == name and kind in (None, job.kind):
+                return job
+        raise UnknownName(kind, name, [])
 
     def finish(self, job, state="done", estimate=None):
         ended = replace(job, state=state, finished_at=now_utc())
@@ -80,6 +88,10 @@ class Runner:
         self.library = library
         self.current = "s"
         self.names = (BOX, MUSTARD)
+        self.storage = StorageMeter(data_dir)
+
+    def submit_with_inputs(self, kind, params, inputs):
+        return self.jobs.submit(kind, params, inputs)
 
     def scene(self, scene):
         if scene != "s":

@@ -3,6 +3,7 @@
 import io
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from app.services.scenes import SceneHeld
 from app.storage.database import CannotStore
 from app.storage.goal_store import GoalStore, TooManyGoals
 from app.storage.photos import PhotoRefused, read_photo
+from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
@@ -37,6 +39,7 @@ class Runner:
         self.hub, self.told, self.commands = Hub(), [], []
         self.hub.subscribe(self.told.append)
         self.current, self.error = "s", None
+        self.storage = StorageMeter(Path())
         self.start = (("x", at(0.0)), ("y", at(0.2)))
 
     def scene(self, scene):

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from app.jobs.job import JobChanged, TrainingAlready
+from app.jobs.job import JobChanged, SceneNeeded, TrainingAlready
 from app.processes.messages.scene_messages import DropScene, SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
 from app.services.runner import Runner
@@ -182,11 +182,41 @@ def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
     for command in (
         lambda: runner.act(scene.id, [(0.1, 0, 0)]),
         lambda: runner.reset_scene(scene.id),
-        lambda: runner.delete_scene(scene.id),
         lambda: runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0]))),
     ):
         with pytest.raises(SceneHeld, match=job.id):
             command()
+
+
+@pytest.mark.parametrize("state", ["queued", "running", "paused"])
+def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(open_runner, state):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    busy = runner.jobs.submit(LONG[0], dict(LONG[1]))
+    until(lambda: runner.jobs.get(busy.id).done > 0)
+    needs = busy
+    if state == "queued":
+        needs = runner.jobs.submit(LONG[0], {**LONG[1], "scene": scene.id})
+    else:
+        runner.jobs.change(busy.id, {"scene": scene.id})
+    if state == "paused":
+        runner.jobs.pause(busy.id)
+        runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))  # hands may move things meanwhile
+    with pytest.raises(SceneNeeded, match=f"Job {needs.id} is {state} and needs scene {scene.id}; cancel it first"):
+        runner.delete_scene(scene.id)
+    assert runner.scene(scene.id).id == scene.id
+    runner.jobs.cancel(needs.id)
+    runner.delete_scene(scene.id)
+    assert runner.scenes() == ()
+
+
+def test_a_job_is_not_queued_for_a_scene_that_was_deleted_meanwhile(open_runner):
+    runner = open_runner(demo_scene=False)
+    with runner.jobs.new_inputs() as folder:
+        folder.mkdir(parents=True)
+        with pytest.raises(UnknownName, match="no scene named 'gone'"):
+            runner.submit_with_inputs("episode", {"scene": "gone"}, folder)
+    assert runner.jobs.all() == ()
 
 
 def test_an_image_is_made_once_for_each_revision(open_runner):

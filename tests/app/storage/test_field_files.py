@@ -2,7 +2,16 @@ from pathlib import Path
 
 import pytest
 
-from app.storage.field_files import clear_workshop, install, open_workshop, sweep, uninstall, workshop
+from app.storage.field_files import (
+    clear_workshop,
+    install,
+    open_workshop,
+    remove_workshop,
+    sweep,
+    uninstall,
+    workshop,
+    workshops,
+)
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 
@@ -15,6 +24,19 @@ def made(tmp_path):
     (folder / METRICS_FILE).write_text("{}")
     (folder / "field.partial").write_bytes(b"not wanted")
     return folder
+
+
+def test_what_a_kill_left_of_a_removed_workshop_goes_at_the_next_start(tmp_path):
+    (open_workshop(tmp_path, "a", {}) / "checkpoint").write_bytes(b"12345")
+    (tmp_path / "training" / ".writing-b-0123").mkdir()
+    (left,) = workshops(tmp_path)
+    assert (left.name, left.bytes) == ("a", 5 + len("{}"))
+    sweep(tmp_path / "training")
+    assert [path.name for path in (tmp_path / "training").iterdir()] == ["a"]
+    remove_workshop(tmp_path, "a")
+    assert list((tmp_path / "training").iterdir()) == []
+    with pytest.raises(CannotWrite, match=r"^training/a cannot be written"):
+        remove_workshop(tmp_path, "a")
 
 
 def test_the_same_order_finds_what_it_left_and_another_does_not(tmp_path):

@@ -79,6 +79,20 @@ def test_jobs_are_told_with_numbers_and_replayed(live):
     assert [number for _, number, _ in replayed] == numbers[1:]
 
 
+def test_pages_are_told_what_was_removed_for_good_also_when_they_come_back(live):
+    with Stream(live) as stream:
+        stream.next("scene")
+        _, job = live.request("POST", "/api/jobs", TABLE)
+        while stream.next("job")[2]["state"] != "done":
+            pass
+        before = live.services.store.add_event({"forgotten": "another"})
+        live.request("DELETE", f"/api/jobs/{job['id']}?forget=true")
+        kind, number, data = stream.next("forgotten")
+        assert (kind, data) == ("forgotten", {"job": job["id"]})
+    with Stream(live, last=before) as again:
+        assert again.next("job", "forgotten") == ("forgotten", number, {"job": job["id"]})
+
+
 @pytest.mark.parametrize("last", ["", "x", "-1", "9" * 40, "\u00b2"])
 def test_nonsense_as_last_number_is_no_matter(live, last):
     with Stream(live, last=last.encode("latin-1").decode("latin-1")) as stream:

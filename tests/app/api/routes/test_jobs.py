@@ -6,7 +6,7 @@ import h5py
 import pytest
 
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import LONG, full_disk, until
+from tests.app.conftest import LONG, full_disk, keep_busy, until
 
 TABLE = {"kind": "collect_table", "params": {"images": 60, "size": 16}}
 
@@ -94,3 +94,31 @@ def test_a_job_that_cannot_be_stored_is_not_answered_202(service, services):
     assert "service.sqlite3 cannot be written" in detail
     assert str(services.settings.data_dir) not in detail
     assert service.get("/api/jobs").json() == before
+
+
+def test_a_finished_job_is_removed_for_good_and_a_live_one_is_not(service, services):
+    busy = keep_busy(service)
+    detail = is_problem(service.delete(f"/api/jobs/{busy}", params={"forget": True}), 409)["detail"]
+    assert detail == f"Job {busy} is paused, so it cannot be removed; cancel it first."
+    service.delete(f"/api/jobs/{busy}")
+    is_problem(service.delete(f"/api/jobs/{busy}"), 409)
+    gone = service.delete(f"/api/jobs/{busy}", params={"forget": True})
+    assert (gone.status_code, gone.content) == (204, b"")
+    is_problem(service.get(f"/api/jobs/{busy}"), 404)
+    is_problem(service.delete(f"/api/jobs/{busy}", params={"forget": True}), 404)
+    assert busy not in [job["id"] for job in service.get("/api/jobs").json()["jobs"]]
+    assert not services.runner.jobs.folder(busy).exists()
+
+
+@pytest.mark.parametrize("kind", ["episodes", "estimates"])
+def test_finished_episodes_and_estimates_are_removed_for_good(service, services, scene, kind):
+    busy = keep_busy(service)
+    poses = [{key: entry[key] for key in ("name", "position", "quaternion")} for entry in scene["objects"]]
+    body = {"scene": scene["id"], **({"poses": poses} if kind == "episodes" else {})}
+    made = service.post(f"/api/{kind}", json=body).json()["id"]
+    assert "queued" in is_problem(service.delete(f"/api/{kind}/{made}", params={"forget": True}), 409)["detail"]
+    assert service.delete(f"/api/{kind}/{made}").json()["status"] == "cancelled"
+    assert service.delete(f"/api/{kind}/{made}", params={"forget": True}).status_code == 204
+    is_problem(service.get(f"/api/{kind}/{made}"), 404)
+    assert not services.runner.jobs.folder(made).exists()
+    service.delete(f"/api/jobs/{busy}")

@@ -104,6 +104,40 @@ def test_a_killed_service_leaves_no_process_and_can_start_again(serve, data_dir)
     assert get(address(again), "/api/health") == 200
 
 
+def garbage(port):
+    """A request that the server logs."""
+    with socket.create_connection(("127.0.0.1", port), 20) as client:
+        client.sendall(b"no request at all\r\n\r\n")
+        client.recv(1000)
+
+
+def test_what_goes_wrong_stands_in_the_log_file_too(serve, data_dir):
+    process = serve(data_dir)
+    port = address(process)
+    garbage(port)
+    log = data_dir / "logs" / "service.log"
+    assert until(lambda: log.exists() and log.read_text())
+    assert re.fullmatch(r"[0-9T:-]+Z WARNING uvicorn.error: Invalid HTTP request received.\n", log.read_text())
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=30)
+    assert err == log.read_text()
+
+
+def test_a_log_file_that_cannot_be_written_stops_nothing_and_is_told_once(serve, data_dir):
+    (data_dir / "logs").mkdir()
+    os.symlink("/dev/full", data_dir / "logs" / "service.log")
+    process = serve(data_dir)
+    port = address(process)
+    for _ in range(3):
+        garbage(port)
+    assert get(port, "/api/health") == 200
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=30)
+    assert err.count("No space left on device") == 1
+    assert err.count("Invalid HTTP request received") == 3
+    assert len(err.splitlines()) == 4
+
+
 def test_without_objects_the_page_starts_and_says_how_to_get_them(serve, tmp_path):
     process = serve(tmp_path / "empty")
     port = address(process)

@@ -1,0 +1,69 @@
+"""Lists in pages. A page begins after a given entry, not at a count, so that nothing that comes or goes shifts it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Protocol, TypeVar
+
+from fastapi import Query
+from pydantic import BaseModel, Field
+
+from app.api.schemas.limits import CURSOR, CURSOR_TEXT, PAGE, sized, within
+
+DEFAULT_PAGE = 100
+Limit = Annotated[int, Query(**within(PAGE), description="Entries at most.")]
+_AFTER = "The `next` of the page before; the list begins with its first entry if left out."
+AfterJob = Annotated[int | None, Query(**within(CURSOR), description=_AFTER)]
+AfterEntry = Annotated[str | None, Query(**sized(CURSOR_TEXT), description=_AFTER)]
+
+
+class Entry(Protocol):
+    """What is listed by when it was made."""
+
+    @property
+    def id(self) -> str:
+        """Identifier."""
+        ...
+
+    @property
+    def created_at(self) -> str:
+        """UTC, ISO 8601."""
+        ...
+
+
+Listed = TypeVar("Listed", bound=Entry)
+
+
+class JobPageOut(BaseModel):
+    """Where a page of jobs of whatever kind stands in the list."""
+
+    total: int = Field(description="Entries in all.")
+    next: int | None = Field(description="Give it as `after` to have the next page; null at the end.")
+
+
+class PageOut(BaseModel):
+    """Where a page stands in its list."""
+
+    total: int = Field(description="Entries in all.")
+    next: str | None = Field(description="Give it as `after` to have the next page; null at the end.")
+
+
+def page(
+    entries: Sequence[Listed], limit: int, after: str | None, *, newest_first: bool
+) -> tuple[list[Listed], int, str | None]:
+    """Some of the entries, how many there are, and where the next page begins (None at the end).
+
+    Args:
+        entries: all of them, in any order.
+        limit: how many at most.
+        after: key of the entry before the page; it may be gone meanwhile.
+        newest_first: the order.
+    """
+    ordered = sorted(entries, key=_key, reverse=newest_first)
+    rest = [e for e in ordered if after is None or (_key(e) < after if newest_first else _key(e) > after)]
+    shown = rest[:limit]
+    return shown, len(entries), _key(shown[-1]) if len(rest) > limit else None
+
+
+def _key(entry: Entry) -> str:
+    return f"{entry.created_at}_{entry.id}"

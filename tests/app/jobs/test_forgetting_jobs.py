@@ -1,0 +1,69 @@
+import pytest
+
+from app.jobs.job import Job, WrongJobState, ended, job_fields
+from app.jobs.registry import Jobs
+from app.storage.database import CannotStore, Store
+from osfcore.errors import UnknownName
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path)
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def jobs(store, tmp_path):
+    """A registry that took over a finished job with files; it begins no work."""
+    done = ended(Job("done", "collect_table", {}), "done")
+    store.save_job("done", 1, job_fields(done))
+    jobs = Jobs(store, tmp_path, lambda _: None)
+    (jobs.folder("done") / "inputs").mkdir(parents=True)
+    (jobs.folder("done") / "table.zip").write_bytes(b"much")
+    jobs.start()
+    yield jobs
+    jobs.stop()
+
+
+def test_a_finished_job_is_forgotten_with_all_its_files(jobs, tmp_path):
+    jobs.forget("done")
+    assert jobs.all() == ()
+    assert list((tmp_path / "collections").iterdir()) == []
+    with pytest.raises(UnknownName):
+        jobs.forget("done")
+
+
+def test_one_without_files_is_forgotten_too(jobs):
+    (jobs.folder("done") / "table.zip").unlink()
+    (jobs.folder("done") / "inputs").rmdir()
+    jobs.folder("done").rmdir()
+    jobs.forget("done")
+    assert jobs.all() == ()
+
+
+def test_a_job_that_waits_is_not_forgotten(jobs):
+    jobs.stop()
+    waiting = jobs.submit("collect_table", {})
+    with pytest.raises(WrongJobState, match=f"Job {waiting.id} is queued, so it cannot be removed; cancel it first"):
+        jobs.forget(waiting.id)
+    assert waiting in jobs.all()
+
+
+def test_where_the_disk_refuses_record_and_files_stay(jobs, store):
+    store.close()
+    with pytest.raises(CannotStore):
+        jobs.forget("done")
+    assert jobs.get("done").id == "done"
+    assert (jobs.folder("done") / "table.zip").read_bytes() == b"much"
+
+
+def test_what_a_kill_left_half_removed_goes_at_the_next_start(jobs, store, tmp_path):
+    jobs.stop()
+    jobs.folder("done").rename(tmp_path / "collections" / ".new-000000000000")
+    again = Jobs(store, tmp_path, lambda _: None)
+    again.start()
+    again.stop()
+    assert list((tmp_path / "collections").iterdir()) == []
+    again.forget("done")
+    assert again.all() == ()
