@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from app.cli.commands.serve import CannotListen, Serve, bound_socket
-from app.storage.database import FILE
+from app.storage.schema import FILE
 from osfcore.errors import InvalidInput
 from tests.app.conftest import until
 from tests.app.processes.test_child_process import is_running
+from tests.app.storage.test_database import change
 
 START = "from app.cli.commands.serve import Serve; from pathlib import Path; import sys\nif __name__ == '__main__':\n"
 
@@ -112,13 +113,23 @@ def test_without_objects_the_page_starts_and_says_how_to_get_them(serve, tmp_pat
     assert "osf assets fetch" in err
 
 
-def test_a_damaged_database_stops_it_in_one_sentence(serve, data_dir):
-    (data_dir / FILE).write_bytes(b"no database" * 1000)
+def test_the_database_of_another_program_stops_it_in_one_sentence(serve, data_dir):
+    change(data_dir, ("CREATE TABLE other (x)",))
     process = serve(data_dir)
     out, err = process.communicate(timeout=30)
     assert out == ""
     assert err.splitlines()[-1].startswith("osfcore.errors.CorruptFile")
-    assert "damaged" in err
+    assert "another program" in err
+
+
+def test_a_damaged_database_is_put_aside_and_told(serve, data_dir):
+    (data_dir / FILE).write_bytes(b"no database" * 1000)
+    process = serve(data_dir)
+    assert get(address(process), "/api/health") == 200
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert err.count(f"it is named {FILE}.damaged now") == 1
+    assert (data_dir / f"{FILE}.damaged").read_bytes() == b"no database" * 1000
 
 
 def test_a_senseless_setting_is_told(data_dir, monkeypatch):
