@@ -28,7 +28,7 @@ from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
 from app.storage.paths import without_places
-from osfcore.errors import UnknownName
+from osfcore.errors import OsfError, UnknownName
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
@@ -153,7 +153,7 @@ async def _follow(
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
                     yield job_event(services, letter.event, letter.job)
                 case JobForgotten() if letter.event > last:
-                    yield _replayed(services, letter.event, {"forgotten": letter.job.id})
+                    yield _forgotten(letter.event, letter.job.id)
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
             yield _draft_event(services, changed)
@@ -213,6 +213,10 @@ def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
     return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
 
 
+def _forgotten(number: int, job: str) -> ServerSentEvent:
+    return ServerSentEvent(event="forgotten", id=str(number), data=ForgottenEvent(job=job))
+
+
 def _replayed(services: Services, number: int, fields: dict[str, Any]) -> ServerSentEvent | None:
     """An event as it was told; None if another version wrote it in a way that makes no sense to this one.
 
@@ -222,7 +226,7 @@ def _replayed(services: Services, number: int, fields: dict[str, Any]) -> Server
         fields: what the store keeps of it.
     """
     if "forgotten" in fields:
-        return ServerSentEvent(event="forgotten", id=str(number), data=ForgottenEvent(job=fields["forgotten"]))
+        return _forgotten(number, fields["forgotten"])
     try:
         return job_event(services, number, job_from_fields(fields))
     except (OsfError, TypeError):

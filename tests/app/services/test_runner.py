@@ -64,7 +64,7 @@ def test_the_first_start_shows_a_scene_by_itself(open_runner):
     until(lambda: runner.current is not None)
     (record,) = runner.scenes()
     assert (record.seed, len(record.state.names)) == (0, 3)
-    assert any(isinstance(event, CurrentScene) for event in runner.events)
+    until(lambda: any(isinstance(event, CurrentScene) for event in runner.events))
 
 
 def test_without_objects_there_is_no_scene_until_some_come(open_runner, data_dir, tmp_path):
