@@ -80,12 +80,13 @@ class Runner(Scenes):
         return self._store.unwritten
 
     def storing_problem(self) -> str | None:
-        """Why nothing can be stored now, for people; None if all is well. Tries it now and then."""
+        """Why something is not stored, for people; None if all is. Tries to write now and then."""
+        if self.unwritten:
+            changed = "one scene or job" if self.unwritten == 1 else f"{self.unwritten} scenes and jobs"
+            return f"What has become of {changed} could not be stored; it is tried again."
         if time.monotonic() - self._probed_at > _PROBE_S:
             self._probed_at, self._refusal = time.monotonic(), self._store.probe()
-        if self._refusal is None or not self.unwritten:
-            return self._refusal
-        return f"{self._refusal} {self.unwritten} changes of scenes and jobs wait for it."
+        return self._refusal
 
     @property
     def uptime_s(self) -> float:

@@ -41,7 +41,7 @@ class Watched:
 
     def work(self, number):
         """Let some job run, now an episode, now a training."""
-        jobs = call(self.port, "GET", "jobs")["jobs"]
+        jobs = call(self.port, "GET", "jobs?limit=500")["jobs"]
         if all(job["state"] in FINISHED for job in jobs):
             if number % 3:
                 self.jobs.add(begun(self.port, self.scene, SMALL))
@@ -50,7 +50,7 @@ class Watched:
 
     def check(self):
         """Whatever was promised is still there."""
-        known = {job["id"]: job for job in call(self.port, "GET", "jobs")["jobs"]}
+        known = {job["id"]: job for job in call(self.port, "GET", "jobs?limit=500")["jobs"]}
         assert self.jobs <= known.keys()
         for episode in (job["id"] for job in known.values() if job["kind"] == "episode"):
             steps = call(self.port, "GET", f"episodes/{episode}")["steps"]
@@ -66,7 +66,7 @@ class Watched:
             if is_stopped(victim):
                 return False
             with contextlib.suppress(urllib.error.HTTPError, OSError):
-                jobs = call(self.port, "GET", "jobs")["jobs"]
+                jobs = call(self.port, "GET", "jobs?limit=500")["jobs"]
                 is_driven = any(job["state"] == "running" and job["kind"] == "episode" for job in jobs)
                 if not is_driven:
                     call(self.port, "POST", f"scenes/{self.scene}/actions", {"actions": [[0.0, 0, 0]]})

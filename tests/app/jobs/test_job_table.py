@@ -23,7 +23,7 @@ def table(store, told, tmp_path):
     """Ten jobs of two kinds in turn, of which the last three wait."""
     table = JobTable(store, tmp_path, told.append)
     for number in range(10):
-        table.add(Job(f"j{number}", ("even", "odd")[number % 2], {}))
+        table.add(Job(f"j{number}", ("collect_table", "collect_pushes")[number % 2], {}))
     for number in range(7):
         table.set(ended(table[f"j{number}"], "done"))
     return table
@@ -36,7 +36,7 @@ def ids(page):
 def test_pages_follow_each_other_whatever_comes_and_goes_meanwhile(table):
     first = table.page(4)
     assert (ids(first), first.total) == (["j9", "j8", "j7", "j6"], 10)
-    table.add(Job("new", "even", {}))
+    table.add(Job("new", "collect_table", {}))
     table.forget(table["j6"])  # the very one after which the next page begins
     table.forget(table["j3"])
     second = table.page(4, first.next)
@@ -47,9 +47,9 @@ def test_pages_follow_each_other_whatever_comes_and_goes_meanwhile(table):
 
 
 def test_pages_of_a_kind_count_only_that_kind(table):
-    first = table.page(3, kind="odd")
+    first = table.page(3, kind="collect_pushes")
     assert (ids(first), first.total) == (["j9", "j7", "j5"], 5)
-    rest = table.page(3, first.next, "odd")
+    rest = table.page(3, first.next, "collect_pushes")
     assert (ids(rest), rest.next) == (["j3", "j1"], None)
 
 
@@ -60,9 +60,9 @@ def test_every_way_to_a_waiting_job_tells_its_place(table):
 
 
 def test_a_job_of_another_kind_is_not_found_and_names_of_the_kind_are_told(table):
-    assert table.get("j8", "even").id == "j8"
-    with pytest.raises(UnknownName, match=r"no odd named 'j8'; known: j1, j3, j5, j7, j9\."):
-        table.get("j8", "odd")
+    assert table.get("j8", "collect_table").id == "j8"
+    with pytest.raises(UnknownName, match=r"no collect_pushes named 'j8'; known: j1, j3, j5, j7, j9\."):
+        table.get("j8", "collect_pushes")
 
 
 def test_a_forgotten_job_is_gone_and_pages_that_come_back_are_told(table, store, told, tmp_path):

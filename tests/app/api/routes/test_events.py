@@ -83,9 +83,10 @@ def test_pages_are_told_what_was_removed_for_good_also_when_they_come_back(live)
     with Stream(live) as stream:
         stream.next("scene")
         _, job = live.request("POST", "/api/jobs", TABLE)
-        while stream.next("job")[2]["state"] != "done":
-            pass
-        before = live.services.store.add_event({"forgotten": "another"})
+        state = before = None
+        while state != "done":
+            _, before, told = stream.next("job")
+            state = told["state"]
         live.request("DELETE", f"/api/jobs/{job['id']}?forget=true")
         kind, number, data = stream.next("forgotten")
         assert (kind, data) == ("forgotten", {"job": job["id"]})
