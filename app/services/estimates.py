@@ -102,7 +102,7 @@ class Estimates:
     def __init__(self, runner: Runner, fields: FieldCatalogue) -> None:
         self._runner = runner
         self._fields = fields
-        self._examiner: Examiner[Uploaded] = Examiner(examine, "observation", _names)
+        self._examiner: Examiner[Uploaded] = Examiner(examine, "observation", _names, _ARCHIVE)
 
     def stop(self) -> None:
         """End the process that looks at an upload, if there is one. Calling it again does nothing."""

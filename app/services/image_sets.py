@@ -88,7 +88,7 @@ class ImageSets:
         self._max_sets = max_sets
         self._check_storage = check_room
         self._keeping = threading.Lock()
-        self._examiner = Examiner(examine, "set", _names)
+        self._examiner = Examiner(examine, "set", _names, _ARCHIVE)
 
     def start(self) -> None:
         """Remove what an earlier service left half done."""

@@ -18,7 +18,8 @@ from app.processes.child_process import limit_memory, own_group
 from app.processes.process_client import ProcessClient, ProcessHangs, ProcessUnavailable
 from app.processes.process_server import ProcessServer
 from app.storage.database import CannotStore
-from osfcore.errors import CannotWrite, OsfError
+from osfcore.errors import CannotWrite, CorruptFile, OsfError
+from osfcore.io.archives import check_zip
 
 _WRITE_BYTES = 1 << 20
 _PATIENCE_S = 600.0
@@ -61,10 +62,18 @@ class Examiner(Generic[Found]):
         look: a function of a module; unpacks and judges, raises OsfError, returns what crosses to the service.
         what: that is uploaded, for people, such as "set".
         names: what the look's sentences call places on disk, in words that the uploader knows; asked for a folder.
+        archive: name of the zip in the folder, if one was uploaded.
     """
 
-    def __init__(self, look: Callable[[Path], Found], what: str, names: Callable[[Path], dict[str, str]]) -> None:
+    def __init__(
+        self,
+        look: Callable[[Path], Found],
+        what: str,
+        names: Callable[[Path], dict[str, str]],
+        archive: str | None = None,
+    ) -> None:
         self._look = look
+        self._archive = archive
         self._what = what
         self._names = names
         self._one_at_a_time = asyncio.Lock()  # decoding takes much memory
@@ -87,8 +96,16 @@ class Examiner(Generic[Found]):
             UploadRefused: if it cannot be used.
             UploadNotStored: if the disk is full.
         """
+        if self._archive is not None:  # what is no zip at all need not wait for a process
+            await run_in_threadpool(self._check, folder / self._archive)
         async with self._one_at_a_time:
             return await run_in_threadpool(self._examine, folder)
+
+    def _check(self, archive: Path) -> None:
+        try:
+            check_zip(archive)
+        except CorruptFile as error:
+            raise UploadRefused(self._plain(str(error), archive.parent)) from error
 
     def _examine(self, folder: Path) -> Found:
         with self._lock:

@@ -22,6 +22,7 @@ from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals
 from app.services.predictions import Predictions
 from app.services.runner import Runner
+from app.storage.paths import without_places
 from app.viewer.nodes.episode_nodes import EpisodeNodes
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import Client, SceneNodes
@@ -206,7 +207,8 @@ class Viewer:
             command()
         except OsfError as error:
             if client is not None:
-                client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+                sentence = without_places(str(error), self._runner.library.root.parent)
+                client.add_notification("Not possible", sentence, color="orange", auto_close_seconds=6.0)
         except Exception:
             _log.exception("a command from the viewer failed")
 

@@ -94,6 +94,24 @@ def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, 
     return unpack(archive, out, _OBSERVATION, max_bytes, max_files)
 
 
+def check_zip(archive: Path, max_files: int = MAX_FILES) -> None:
+    """Refuse what is no zip at all, or lists too much, without unpacking anything: this takes milliseconds.
+
+    Raises:
+        CorruptFile: if it is no zip archive, or holds more than `max_files` files.
+    """
+    try:
+        with Path(archive).open("rb") as raw:
+            check_directory(raw, max_files)
+            zipfile.ZipFile(raw).close()
+    except _DAMAGE as error:
+        if isinstance(error, CorruptFile):
+            raise
+        raise CorruptFile(archive, "it is no zip archive or a damaged one") from error
+    except (RuntimeError, NotImplementedError) as error:
+        raise CorruptFile(archive, "it is packed in a way that cannot be read; a plain zip is expected") from error
+
+
 def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
     """Unpack what belongs to a kind of archive, under the same guards.
 
