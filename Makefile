@@ -57,8 +57,10 @@ lint: dev
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 
+# Half an hour: ten thousand malformed requests, a hundred kills, full disks, a quarter of an hour of episodes.
+# OSF_SOAK_HOURS=8 makes a night of it.
 soak: dev
-	$(BIN)/pytest -m soak
+	$(BIN)/pytest -m soak -s
 
 bench: dev
 	$(BIN)/python -m tests.bench.bench_world

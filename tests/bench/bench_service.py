@@ -1,18 +1,14 @@
-"""How responsive the service stays while the world steps, or during an episode. Run alone on the machine.
+"""How responsive the service stays while the world steps: REST latencies and viewer updates. Run alone on the machine.
 
-REST latencies with some clients and listeners to events, and viewer updates:
-
-python -m tests.bench.bench_service [--data-dir DIR] [--seconds 20] [--clients 20 --listeners 5 --episode]
+python -m tests.bench.bench_service [--data-dir DIR] [--seconds 20]
 """
 
 import asyncio
-import http.client
 import json
 import tempfile
 import threading
 import time
 import urllib.request
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,12 +32,6 @@ class Arguments:
     """Where fetched objects are; nothing is written there."""
     seconds: float = 20.0
     """How long to measure."""
-    clients: int = 1
-    """How many ask, 40 times a second in all."""
-    listeners: int = 0
-    """How many follow events, live images included."""
-    episode: bool = False
-    """Whether an episode runs, rather than pushes one after the other."""
 
 
 def call(url: str, body: object = None) -> dict:
@@ -76,46 +66,17 @@ async def viewer_updates(url: str, seconds: float) -> float:
         return received / (time.monotonic() - start)
 
 
-def latencies(port: int, paths: list[str], seconds: float, clients: int) -> dict[str, np.ndarray]:
-    """Milliseconds of requests for each path, 40 a second in all, each client on a connection of its own."""
+def latencies(url: str, paths: list[str], seconds: float) -> dict[str, np.ndarray]:
+    """Milliseconds of requests for each path, 40 a second in all."""
     times: dict[str, list[float]] = {path: [] for path in paths}
     deadline = time.monotonic() + seconds
-
-    def ask(number: int) -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-        time.sleep(0.025 * number)
-        turn = number
-        while time.monotonic() < deadline:
-            path = paths[turn % len(paths)]
+    while time.monotonic() < deadline:
+        for path in paths:
             start = time.perf_counter()
-            connection.request("GET", path)
-            connection.getresponse().read()
+            urllib.request.urlopen(url + path, timeout=30).read()
             times[path].append(1000 * (time.perf_counter() - start))
-            turn += 1
-            time.sleep(0.025 * clients)
-        connection.close()
-
-    with ThreadPoolExecutor(clients) as askers:
-        for done in [askers.submit(ask, number) for number in range(clients)]:
-            done.result()
+            time.sleep(0.025)
     return {path: np.array(values) for path, values in times.items()}
-
-
-def listen(url: str, stop: threading.Event) -> None:
-    """Follow events as a page does."""
-    with urllib.request.urlopen(f"{url}/api/events?frames=true", timeout=60) as stream:
-        while not stop.is_set():
-            stream.readline()
-
-
-def begin_episode(url: str, scene: str) -> None:
-    """Let an episode run whose goal is far away, and wait until it pushes."""
-    goal = call(f"{url}/api/goals", {"random": {"seed": 1}})["id"]
-    episode = call(f"{url}/api/episodes", {"scene": scene, "goal": goal, "settings": {"steps": 100}})["id"]
-    while not (now := call(f"{url}/api/episodes/{episode}"))["steps"]:
-        if now["status"] not in ("queued", "running"):
-            raise RuntimeError(f"the episode is {now['status']}: {now['error']}")
-        time.sleep(1)
 
 
 def main() -> None:
@@ -128,30 +89,22 @@ def main() -> None:
         with live_service(data_dir) as url:
             scene = call(f"{url}/api/scenes", {"count": 3, "seed": 1})["id"]
             stop, actions, rate = threading.Event(), [], []
-            threads = [threading.Thread(target=listen, args=(url, stop)) for _ in range(arguments.listeners)]
-            if arguments.episode:
-                begin_episode(url, scene)
-            else:
-                threads.append(threading.Thread(target=push_on, args=(url, scene, stop, actions)))
-            threads.append(
-                threading.Thread(target=lambda: rate.append(asyncio.run(viewer_updates(url, arguments.seconds))))
-            )
-            for thread in threads:
-                thread.start()
+            pusher = threading.Thread(target=push_on, args=(url, scene, stop, actions))
+            watcher = threading.Thread(target=lambda: rate.append(asyncio.run(viewer_updates(url, arguments.seconds))))
+            pusher.start()
+            watcher.start()
             start = time.monotonic()
             paths = ["/api/health", f"/api/scenes/{scene}", "/api/objects", "/api/jobs"]
-            measured = latencies(int(url.rpartition(":")[2]), paths, arguments.seconds, arguments.clients)
+            measured = latencies(url, paths, arguments.seconds)
             elapsed = time.monotonic() - start
             stop.set()
-            for thread in threads:
-                thread.join()
+            pusher.join()
+            watcher.join()
     every = np.concatenate(list(measured.values()))
     for path, values in measured.items():
         where = path.replace(scene, "ID")
         print(f"GET {where}: median {np.median(values):.1f} ms, p99 {np.quantile(values, 0.99):.1f} ms")
     print(f"all: median {np.median(every):.1f} ms, p99 {np.quantile(every, 0.99):.1f} ms over {len(every)} requests")
-    clients = f"{arguments.clients} clients, {arguments.listeners} listeners"
-    print(f"with {clients}{', during an episode' if arguments.episode else ''}")
     print(f"meanwhile {sum(actions) / elapsed:.1f} actions of 0.2 s a second, viewer updates {rate[0]:.0f} a second")
 
 
