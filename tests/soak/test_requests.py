@@ -10,6 +10,7 @@ import random
 import socket
 import threading
 import time
+import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -175,6 +176,13 @@ def test_malformed_requests_are_refused_at_once_and_leave_nothing(service):
     job = call(port, "POST", "jobs", LONG)["id"]  # it keeps its turn, so that nothing else that is accepted runs
     until(lambda: call(port, "GET", f"jobs/{job}")["done"] > 0, 60)
     call(port, "POST", f"jobs/{job}/pause")
+    call(
+        port, "POST", "predictions", {"actions": [[[0.1, 0, 0]]]}
+    )  # the processes that are started when they are needed
+    photo = call(port, "GET", f"goals/{goal}/image.png")
+    urllib.request.urlopen(
+        urllib.request.Request(f"http://127.0.0.1:{port}/api/goals", photo, {"Content-Type": "image/png"})
+    ).close()
     schema = call(port, "GET", "openapi.json")
     routes = [
         (path, method.upper())
@@ -191,7 +199,7 @@ def test_malformed_requests_are_refused_at_once_and_leave_nothing(service):
             ]
             return [part.result() for part in parts]
 
-    attack(REQUESTS // 5, 100)
+    attack(REQUESTS, 100)  # until caches are full
     before_mb, is_over = resident_mb(pid), threading.Event()
     with ThreadPoolExecutor(1) as watcher:
         longest = watcher.submit(stalls, port, is_over)
