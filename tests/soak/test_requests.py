@@ -5,6 +5,7 @@ OSF_SOAK_REQUESTS says how many (10000).
 
 import http.client
 import json
+import logging
 import os
 import random
 import socket
@@ -24,6 +25,9 @@ from tests.live import call, free_port, resident_mb, start_service, stop_service
 pytestmark = pytest.mark.soak
 REQUESTS = int(os.environ.get("OSF_SOAK_REQUESTS", "10000"))
 SLOWEST_S = 2.0
+PROTOCOL = f"viser-v{viser.__version__}"
+SILENT = logging.getLogger(__name__)  # of sockets that the service has closed
+SILENT.disabled = True
 CLIENTS = 4
 ENDLESS = ("/events",)
 JUNK = (
@@ -124,7 +128,7 @@ class Attacker:
         rng = self.rng
         address = f"ws://127.0.0.1:{self.port}/viewer"
         try:
-            with connect(address, subprotocols=[f"viser-v{viser.__version__}"], proxy=None, max_size=None) as browser:
+            with connect(address, subprotocols=[PROTOCOL], proxy=None, max_size=None, logger=SILENT) as browser:
                 for _ in range(rng.randrange(20)):
                     browser.send(
                         rng.choice([rng.randbytes(rng.randrange(300)), "text", bytes(1 << 17), json.dumps(JUNK[1])])
@@ -176,9 +180,7 @@ def test_malformed_requests_are_refused_at_once_and_leave_nothing(service):
     job = call(port, "POST", "jobs", LONG)["id"]  # it keeps its turn, so that nothing else that is accepted runs
     until(lambda: call(port, "GET", f"jobs/{job}")["done"] > 0, 60)
     call(port, "POST", f"jobs/{job}/pause")
-    call(
-        port, "POST", "predictions", {"actions": [[[0.1, 0, 0]]]}
-    )  # the processes that are started when they are needed
+    call(port, "POST", "predictions", {"actions": [[[0.1, 0, 0]]]})  # starts what is started only when it is needed
     photo = call(port, "GET", f"goals/{goal}/image.png")
     urllib.request.urlopen(
         urllib.request.Request(f"http://127.0.0.1:{port}/api/goals", photo, {"Content-Type": "image/png"})
