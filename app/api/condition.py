@@ -21,7 +21,7 @@ def problems(runner: Runner, data_dir: Path) -> tuple[str, ...]:
         runner: holds the simulation and the jobs.
         data_dir: where everything is stored.
     """
-    found = [runner.jobs.problem, _disk_problem(data_dir), runner.storing_problem()]
+    found = [runner.jobs.problem, _disk_problem(data_dir), runner.storage.problem, runner.storing_problem()]
     if runner.simulation_status == "restarting":
         found.append("The simulation has stopped and is being restarted.")
     return tuple(sentence for sentence in found if sentence is not None)

@@ -111,8 +111,20 @@ class StorageMeter:
                 return None
             return Usage(self._bytes, time.monotonic() - self._measured_at)
 
-    def check_room(self) -> None:
+    @property
+    def problem(self) -> str | None:
+        """Why nothing more may be written, by the latest figures; None if it may."""
+        try:
+            self.check_room(wait_s=0)
+        except StorageFull as error:
+            return str(error)
+        return None
+
+    def check_room(self, wait_s: float = _PATIENCE_S) -> None:
         """Refuse what would write more.
+
+        Args:
+            wait_s: for new figures, if the latest are old.
 
         Raises:
             StorageFull: if the directory holds too much, or too little is free on its disk.
@@ -121,7 +133,7 @@ class StorageMeter:
         if free < self.min_free_bytes:
             limit = f"{_size(self.min_free_bytes)} must stay free (OSF_MIN_FREE_BYTES)"
             raise StorageFull(f"{_size(free)} are free on the disk of the data directory, but {limit}; {_advice({})}.")
-        usage = self.usage() if self.max_bytes else None
+        usage = self.usage(wait_s) if self.max_bytes else None
         if usage is not None and usage.total >= self.max_bytes:
             limit = f"it may hold {_size(self.max_bytes)} (OSF_MAX_DATA_BYTES)"
             raise StorageFull(f"The data directory holds {_size(usage.total)}, but {limit}; {_advice(usage.bytes)}.")

@@ -39,6 +39,12 @@ def disk(library, tmp_path):
     assert ran("umount", "-l", str(place))
 
 
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """The service may use the small disk up to its end."""
+    monkeypatch.setenv("OSF_MIN_FREE_BYTES", "0")
+
+
 @pytest.fixture
 def service(disk):
     port = free_port()

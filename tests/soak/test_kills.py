@@ -106,6 +106,7 @@ def test_nothing_is_lost_whatever_is_killed_or_stopped(watched):
             how = signal.SIGKILL  # whoever stops the service wants it to stand still
         with contextlib.suppress(ProcessLookupError):
             os.kill(victim, how)
+        time.sleep(0.05)  # until the system has done it
         if victim == watched.process.pid:
             watched.restart()
         took_s.append(watched.heals(victim))

@@ -110,3 +110,11 @@ def test_the_figures_for_prometheus_tell_room(service):
     text = service.get("/api/metrics").text
     assert 'osf_data_bytes{kind="objects"}' in text
     assert "osf_disk_free_bytes" in text
+
+
+def test_health_tells_that_there_is_no_room(library, tmp_path):
+    with running(library, tmp_path, min_free_bytes=1 << 60) as client:
+        health = client.get("/api/health").json()
+        is_problem(client.post("/api/jobs", json=TABLE), 507)
+    assert health["status"] == "degraded"
+    assert "OSF_MIN_FREE_BYTES" in health["problems"][0]
