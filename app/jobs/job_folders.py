@@ -61,11 +61,6 @@ class JobFolders:
             raise CannotStore(self.folder(job), error.strerror or str(error)) from error
         return aside
 
-    def put_back(self, job: str, aside: Path) -> None:
-        """Undo `put_aside`."""
-        if aside.is_dir():
-            aside.rename(self.folder(job))
-
     def take(self, job: str, inputs: Path) -> None:
         """Make a folder from `new_inputs` a job's own.
 

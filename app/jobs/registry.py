@@ -23,7 +23,7 @@ from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, after
 from app.processes.messages.job_messages import ChangeJob, PauseJob, ResumeJob, StepJob
 from app.processes.messages.scene_messages import Command
-from app.storage.database import Store
+from app.storage.database import CannotStore, Store
 from osfcore.errors import OsfError
 
 _RETRY_S = 1.0  # after the job loop has failed
@@ -185,7 +185,7 @@ class Jobs:
         Raises:
             UnknownName: if there is no such job.
             WrongJobState: if it has not finished.
-            CannotStore: if the disk refuses; then it stays.
+            CannotStore: if the disk refuses; then it is still listed, perhaps without files.
         """
         with self._changed:
             known = self.get(job)
@@ -194,9 +194,9 @@ class Jobs:
             aside = self._folders.put_aside(job)
             try:
                 self._table.forget(known)
-            except OsfError:
-                self._folders.put_back(job, aside)
-                raise
+            except CannotStore:  # on a full disk the files must go first, to make room for saying so
+                shutil.rmtree(aside, ignore_errors=True)
+                self._table.forget(known)
         shutil.rmtree(aside, ignore_errors=True)
 
     def pause(self, job: str) -> Job:
