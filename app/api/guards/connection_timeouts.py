@@ -47,10 +47,10 @@ class PromptProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """Wait a while until the client has read what was sent, and no longer."""
+        """Wait until the client has read what was sent, as long as it keeps reading."""
         super().pause_writing()
         if self._stalled is None:
-            self._stalled = self.loop.call_later(self.stall_s, self.transport.abort)
+            self._watch_reading()
 
     def resume_writing(self) -> None:
         """Go on: the client has read."""
@@ -58,6 +58,17 @@ class PromptProtocol(H11Protocol):
             self._stalled.cancel()
             self._stalled = None
         super().resume_writing()
+
+    def _watch_reading(self) -> None:
+        unread = self.transport.get_write_buffer_size()
+        self._stalled = self.loop.call_later(self.stall_s, self._check_reading, unread)
+
+    def _check_reading(self, unread: int) -> None:
+        if self.transport.get_write_buffer_size() < unread:
+            self._watch_reading()
+        else:
+            self._stalled = None
+            self.transport.abort()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         """Hand the connection over: it may now be silent for as long as it likes."""
