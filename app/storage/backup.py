@@ -19,7 +19,7 @@ from typing import Literal
 from app.storage.database import now_utc
 from app.storage.durable import put_in_place, sync, sync_tree
 from app.storage.schema import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.io.archives import ArchiveKind, unpack
 from osfcore.io.files import folder_at_once, read_json
 from osfcore.io.json_codec import Entry, Text, decode
@@ -28,8 +28,13 @@ from osfcore.io.output_paths import check_place
 FOLDERS = ("objects", "fields", "goals", "sets", "collections", "training", "dynamics")
 MANIFEST = "manifest.json"
 _PROGRAM = "osf-manipulation"
+_MOST_PARTS, _MOST_NAME_BYTES = 16, 200  # of a path, as unpacking takes it
 _BACKUP = ArchiveKind(
-    "backup", PurePosixPath(MANIFEST), (MANIFEST, FILE, *FOLDERS), "a zip that 'osf backup' wrote", max_depth=16
+    "backup",
+    PurePosixPath(MANIFEST),
+    (MANIFEST, FILE, *FOLDERS),
+    "a zip that 'osf backup' wrote",
+    max_depth=_MOST_PARTS,
 )
 _MAX_BYTES, _MAX_FILES = 1 << 40, 10_000_000  # a data directory has no bounds of its own
 _CHUNK_BYTES = 1 << 20
@@ -54,7 +59,7 @@ def back_up(data_dir: Path, out: Path) -> Manifest:
         out: FILE.zip.
 
     Raises:
-        InvalidInput: if the name has another suffix.
+        InvalidInput: if the name has another suffix, or a file has a name that no backup can keep.
         CorruptFile: if nothing is stored there, or the database cannot be used.
         CannotWrite: if the disk refuses; then nothing is left.
     """
@@ -96,7 +101,8 @@ def restore(archive: Path, data_dir: Path) -> Manifest:
         raise InvalidInput(
             "data directory", data_dir, "a new or empty folder; name one with --data-dir, or move this one away"
         )
-    with folder_at_once(data_dir.absolute()) as folder:
+    data_dir = data_dir.resolve()  # a link to an empty folder is as good as the folder
+    with folder_at_once(data_dir) as folder:
         unpack(archive, folder, _BACKUP, _MAX_BYTES, _MAX_FILES)
         manifest = _checked(archive, folder)
         try:
@@ -104,7 +110,7 @@ def restore(archive: Path, data_dir: Path) -> Manifest:
             sync_tree(folder)
         except OSError as error:
             raise CannotWrite(data_dir, error.strerror or str(error)) from error
-    sync(data_dir.absolute().parent)
+    sync(data_dir.parent)
     return manifest
 
 
@@ -124,7 +130,7 @@ def _fill(archive: zipfile.ZipFile, data_dir: Path, database: Path) -> Manifest:
         sizes.append(_add(archive, database, FILE))
     for path in _files(data_dir):
         with contextlib.suppress(FileNotFoundError):  # deleted since the folder was listed
-            sizes.append(_add(archive, path, path.relative_to(data_dir).as_posix()))
+            sizes.append(_add(archive, path, _name(path.relative_to(data_dir))))
     manifest = Manifest(
         program=_PROGRAM,
         version=version(_PROGRAM),
@@ -138,18 +144,37 @@ def _fill(archive: zipfile.ZipFile, data_dir: Path, database: Path) -> Manifest:
 
 
 def _files(data_dir: Path) -> Iterator[Path]:
-    """Plain files that are worth keeping; hidden ones are half-made."""
+    """Plain files that are worth keeping, in linked folders too; hidden ones are half-made.
+
+    In each folder what describes the others (JSON) comes last: if it is being deleted meanwhile, no part of it counts.
+    """
+    seen: set[str] = set()  # folders: links may lead back to where they are
 
     def unless_gone(error: OSError) -> None:
         if not isinstance(error, FileNotFoundError):
             raise error
 
     for name in FOLDERS:
-        for place, folders, names in os.walk(data_dir / name, onerror=unless_gone):
+        for place, folders, names in os.walk(data_dir / name, onerror=unless_gone, followlinks=True):
+            real = os.path.realpath(place)
+            if real in seen:
+                folders.clear()
+                continue
+            seen.add(real)
             folders[:] = sorted(folder for folder in folders if not folder.startswith("."))
-            for path in (Path(place, file) for file in sorted(names) if not file.startswith(".")):
+            ordered = sorted(names, key=lambda file: (file.endswith(".json"), file))
+            for path in (Path(place, file) for file in ordered if not file.startswith(".")):
                 if path.is_file():
                     yield path
+
+
+def _name(path: Path) -> str:
+    """What a file is called in the archive; refused now if restoring would refuse it."""
+    name = path.as_posix()
+    is_short = len(path.parts) <= _MOST_PARTS and all(len(os.fsencode(part)) <= _MOST_NAME_BYTES for part in path.parts)
+    if not is_short or not name.isprintable() or "\\" in name:
+        raise InvalidInput("name of a stored file", shown(repr(name)), "short and printable; rename it")
+    return name
 
 
 def _add(archive: zipfile.ZipFile, path: Path, name: str) -> int:

@@ -234,3 +234,42 @@ def test_names_and_links_that_lead_elsewhere_are_refused(archive, tmp_path, name
         file.writestr(info, "/etc/passwd")
     refused(archive, tmp_path, words)
     assert not (tmp_path / "evil").exists()
+
+
+def test_objects_that_are_links_come_along_and_links_in_a_circle_do_no_harm(tmp_path):
+    elsewhere, data = tmp_path / "elsewhere" / "mug", tmp_path / "data"
+    elsewhere.mkdir(parents=True)
+    (elsewhere / "object.json").write_text("{}")
+    (data / "objects").mkdir(parents=True)
+    (data / "objects" / "mug").symlink_to(elsewhere)
+    (elsewhere / "circle").symlink_to(data / "objects")
+    back_up(data, tmp_path / "b.zip")
+    restore(tmp_path / "b.zip", tmp_path / "back")
+    assert (tmp_path / "back" / "objects" / "mug" / "object.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("name", [b"x" * 210, b"a\tb", b"\xff", b"a\\b"])
+def test_a_name_that_could_not_be_restored_is_told_at_once(tmp_path, name):
+    folder = tmp_path / "data" / "collections" / "job"
+    folder.mkdir(parents=True)
+    (folder / os.fsdecode(name)).write_text("x")
+    with pytest.raises(InvalidInput, match="rename it"):
+        back_up(tmp_path / "data", tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+
+
+def test_what_describes_a_folder_comes_after_what_is_in_it(tmp_path):
+    goal = tmp_path / "data" / "goals" / "a"
+    goal.mkdir(parents=True)
+    for name in ("goal.json", "goal.png"):
+        (goal / name).write_text("x")
+    back_up(tmp_path / "data", tmp_path / "b.zip")
+    with zipfile.ZipFile(tmp_path / "b.zip") as archive:
+        assert archive.namelist()[:2] == ["goals/a/goal.png", "goals/a/goal.json"]
+
+
+def test_a_link_to_an_empty_folder_is_as_good_as_the_folder(archive, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "empty")
+    restore(archive, tmp_path / "link")
+    assert (tmp_path / "link" / FILE).is_file()
