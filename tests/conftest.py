@@ -15,6 +15,7 @@ from osfcore.objects.fetch import fetch
 from osfcore.objects.sources import FolderSource, WheelSource
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
+os.environ.setdefault("OSF_STANDBY", "0")  # a process in reserve would take time from tests that need none
 # Timing lives in benchmarks: a busy machine is no failure.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")

@@ -39,6 +39,8 @@ from app.api.routes import (
     scenes,
     status,
     storage,
+    stories,
+    views,
 )
 from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
@@ -69,7 +71,7 @@ _DESCRIPTION = (
 
 _ROUTES = (
     status, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs,
-    driver, storage, events,
+    driver, views, stories, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"

@@ -31,6 +31,7 @@ STATUS_OF_KIND = {
     "MissingFields": 409,
     "NoScene": 409,
     "NoTable": 409,
+    "NoTrajectory": 409,
     "NoDraft": 404,
     "DraftUnsound": 409,
     "TooManyGoals": 409,

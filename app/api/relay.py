@@ -8,10 +8,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
+from typing import Annotated
 from urllib.parse import urlsplit
 
 import websockets
-from fastapi import APIRouter, HTTPException, Request, WebSocket
+from fastapi import APIRouter, HTTPException, Path, Request, WebSocket
 from fastapi.responses import FileResponse
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
@@ -21,7 +22,8 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.guards.rate_limit import RateLimit
 from app.api.guards.security import is_same_origin
 from app.api.guards.viewer_messages import BURST, RATE, is_allowed
-from app.viewer.private_server import SECRET_HEADER
+from app.api.schemas.limits import NAME, VISITOR, sized
+from app.viewer.private_server import PAGE_HEADER, SECRET_HEADER
 from osfcore.errors import shown
 
 router = APIRouter(include_in_schema=False)
@@ -31,16 +33,18 @@ _OPEN_TIMEOUT_S = 5.0
 
 
 _LOOKS = ("hideViserLogo", "darkMode")  # what the page asks of viser's client
-_RECORDING = re.compile(r"/api/episodes/[A-Za-z0-9_-]+/files/recording\.viser")
+_VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
 
 
 @router.get("/viewer")
 @router.get("/viewer/")
+@router.get("/viewer/{visitor}")
+@router.get("/viewer/{visitor}/")
 def page(request: Request, services: ServicesDep) -> FileResponse:
-    """The viewer's client, one file.
+    """The viewer's client, one file; below what a page calls itself, it is the view of that page.
 
     It obeys its address: `websocket` and `playbackPath` name where its messages come from, and messages may hold
-    scripts. So nothing but looks and this service's own recordings may be asked for.
+    scripts. So nothing but looks and this service's own relay (viser writes it there) may be asked for.
     """
     for name, value in request.query_params.multi_items():
         if name not in _LOOKS and not _is_own(name, value, request, services):
@@ -50,25 +54,34 @@ def page(request: Request, services: ServicesDep) -> FileResponse:
 
 
 def _is_own(name: str, address: str, request: Request, services: Services) -> bool:
-    """Whether an address names this service's relay (viser writes it into the page's own) or one of its recordings."""
+    """Whether an address is where this service's relay is."""
     try:
         parts = urlsplit(address)
     except ValueError:
         return False
-    scheme = {"ws": "http", "wss": "https"}.get(parts.scheme, parts.scheme)
+    scheme = {"ws": "http", "wss": "https"}.get(parts.scheme)
     is_here = parts.netloc.lower() == request.headers.get("host", "").lower()
     is_known = f"{scheme}://{parts.netloc}" in services.settings.allowed_origins
-    if scheme not in ("http", "https") or parts.query or not (is_here or is_known):
-        return False
     path = parts.path.removeprefix(request.scope.get("root_path", ""))
-    if name == "websocket":
-        return path.rstrip("/") == "/viewer" and scheme != parts.scheme
-    return name == "playbackPath" and scheme == parts.scheme and bool(_RECORDING.fullmatch(path))
+    is_relay = scheme is not None and not parts.query and bool(_VIEWER.fullmatch(path))
+    return name == "websocket" and is_relay and (is_here or is_known)
 
 
 @router.websocket("/viewer")
 async def relay(browser: WebSocket, services: ServicesDep) -> None:
     """Pass frames both ways between a browser and the viewer on loopback."""
+    await _relay(browser, services, {})
+
+
+@router.websocket("/viewer/{visitor}")
+async def relay_of_page(
+    browser: WebSocket, services: ServicesDep, visitor: Annotated[str, Path(**sized(NAME), pattern=f"^{VISITOR}$")]
+) -> None:
+    """Likewise, telling the viewer in which page the browser shows it."""
+    await _relay(browser, services, {PAGE_HEADER: visitor})
+
+
+async def _relay(browser: WebSocket, services: Services, headers: dict[str, str]) -> None:
     if not is_same_origin(browser, services.settings.allowed_origins):
         await browser.close(code=1008)  # before accepting: the browser sees 403
         return
@@ -78,7 +91,7 @@ async def relay(browser: WebSocket, services: ServicesDep) -> None:
         upstream = await connect(
             f"ws://127.0.0.1:{services.viewer.port}",
             subprotocols=offered or None,
-            additional_headers={SECRET_HEADER: services.viewer.server.secret},
+            additional_headers={SECRET_HEADER: services.viewer.server.secret, **headers},
             compression=None,
             max_size=None,
             proxy=None,

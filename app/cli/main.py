@@ -18,6 +18,7 @@ from app.cli.commands.episode import RunEpisode
 from app.cli.commands.estimate import Estimate
 from app.cli.commands.evaluate import Evaluate
 from app.cli.commands.predict import Predict
+from app.cli.commands.record import Record
 from app.cli.commands.render import Render
 from app.cli.commands.serve import Serve
 from app.cli.commands.train import Train
@@ -46,6 +47,7 @@ Commands = Annotated[
     | Annotated[Estimate, tyro.conf.subcommand("estimate", description="Find poses and light in images.")]
     | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
     | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
+    | Annotated[Record, tyro.conf.subcommand("record", description="Make the stories that the page plays.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
     | Annotated[Backup, tyro.conf.subcommand("backup", description="Write all that the service keeps to one zip.")]

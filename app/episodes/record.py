@@ -1,4 +1,4 @@
-"""What an episode leaves in its folder: report.json, steps.csv, frames, video, a recording, the goal image."""
+"""What an episode leaves in its folder: report.json, its course, steps.csv, frames, video, a recording, the goal."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
+from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
 from app.episodes.frames import TILE_PX, frame, read_frames, write_video
+from app.episodes.replay_clock import ReplayClock
+from app.episodes.trajectory import write_trajectory
+from app.episodes.trajectory_recorder import TrajectoryRecorder
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.geometry.cameras import Camera
@@ -68,11 +71,7 @@ class EpisodeRecord:
         table: that the episode is about.
         about: what it was asked to be.
 
-    Attributes:
-        states: true ones, at the beginning and after each action.
     """
-
-    states: list[SceneState]
 
     def __init__(self, folder: Path, table: Table, about: About) -> None:
         self._folder, self._table, self._about = folder, table, about
@@ -84,9 +83,14 @@ class EpisodeRecord:
         self._actions: list[list[float]] = []
         self._end: Finished | None = None
         self._start = table.truth()
-        self.states = [self._start]
+        self._course = TrajectoryRecorder(self._start)
         for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
             left.unlink()
+
+    @property
+    def states(self) -> list[SceneState]:
+        """True ones, at the beginning and after each action."""
+        return self._course.states
 
     def take(self, event: Event) -> None:
         """Note an event, and draw a frame where a step is over.
@@ -94,6 +98,7 @@ class EpisodeRecord:
         Raises:
             CannotWrite: if the disk refuses.
         """
+        self._course.take(event, self._table)
         match event:
             case Observed():
                 self._views = event.observation.images
@@ -102,7 +107,6 @@ class EpisodeRecord:
                 write_png(self._folder / GOAL_FILE, to_uint8(event.image))
             case ActionExecuted():
                 self._actions.append(event.action.tolist())
-                self.states.append(self._table.truth())
             case Noticed():
                 self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
             case Stepped():
@@ -128,6 +132,7 @@ class EpisodeRecord:
         """Report and table so far: an episode that is broken off leaves what it has done."""
         report = self._report()
         write_json(self._folder / REPORT_FILE, report)
+        write_trajectory(self._folder / TRAJECTORY_FILE, self._course.trajectory)
         self._write_csv()
         return report
 
@@ -189,6 +194,7 @@ class EpisodeRecord:
             "goal": None if self._goal is None else _goal_to_json(self._goal),
             "noticed": self._notices,
             "actions": self._actions,
+            "step_s": [round(at_s, 3) for at_s in ReplayClock(self._course.trajectory).step_s],
             "steps": self._steps,
         }
         if about.goal is not None:

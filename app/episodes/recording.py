@@ -11,6 +11,7 @@ import viser
 
 from app.processes.messages.scene_messages import SceneRecord
 from app.storage.database import now_utc
+from app.viewer.nodes.room import add_room
 from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S
@@ -33,7 +34,8 @@ def write_recording(path: Path, library: AssetLibrary, states: Iterable[SceneSta
     with contextlib.redirect_stdout(io.StringIO()):  # viser greets
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
-        drawing = SceneNodes(server, library, lambda *_: None, lambda *_: None)
+        add_room(server)
+        drawing = SceneNodes(server, library)
         drawing.show(SceneRecord("recording", 0, now_utc(), 128, first, first, 0.0, 0))
         serializer = server.get_scene_serializer()
         for state in later:

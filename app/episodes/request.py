@@ -13,7 +13,8 @@ from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.goal import GoalImage
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import Camera, goal_camera
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
+from osfcore.geometry.light import Light
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import reading_png
 from osfcore.objects.asset_library import AssetLibrary
@@ -36,6 +37,10 @@ class EpisodeOrder:
         seed: of the scene, its light, a random goal, and the searches.
         goal: PNG of how the table should look, from the goal camera; None for a random goal.
         moved: how many objects a random goal moves; as the seed will have it if None.
+        light: on the table; as the seed will have it if None.
+        goal_seed: of a random goal; the same as that of the scene if None.
+        goal_light: in a random goal's image; that of the table if None.
+        goal_side: of that image [px].
         settings: how it goes.
         device: that computes.
     """
@@ -47,6 +52,10 @@ class EpisodeOrder:
     seed: int = 0
     goal: Path | None = None
     moved: int | None = None
+    light: Light | None = None
+    goal_seed: int | None = None
+    goal_light: Light | None = None
+    goal_side: int = DEFAULT_IMAGE_SIDE
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     device: str = "cpu"
 
@@ -97,7 +106,7 @@ def given(order: EpisodeOrder) -> Given:
     for name in order.names or ():
         fields.info(name)
     among = tuple(name for name in fields.names() if assets.has(name))
-    world = Tabletop(assets, request=SceneRequest(names=order.names, count=order.objects, among=among))
+    world = Tabletop(assets, request=SceneRequest(order.names, order.objects, order.light, among))
     try:
         return _begun(order, world)
     except BaseException:
@@ -112,8 +121,10 @@ def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
         if order.moved is not None:
             raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
         return Given(world, goal, None, ())
-    start, camera = world.truth(), goal_camera()
-    task = random_goal(world, order.seed, order.moved)
+    start, camera = world.truth(), goal_camera(order.goal_side)
+    task = random_goal(world, order.seed if order.goal_seed is None else order.goal_seed, order.moved)
+    if order.goal_light is not None:
+        world.set_light(order.goal_light)
     image = world.render((camera,), with_pusher=False).images[0]
     world.restore(start)
     return Given(world, GoalImage(camera, image), *task)

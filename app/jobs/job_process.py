@@ -16,7 +16,7 @@ from app.processes.messages.job_messages import CancelJob, JobCancelled, RunJob
 from app.processes.process_client import ProcessClient, ProcessFrozen, ProcessUnavailable
 from osfcore.errors import OsfError
 
-_WHO = "job"
+WHO = "job"
 _CHECK_S, _CANCELLED_CHECK_S = 0.2, 0.05
 
 
@@ -28,17 +28,29 @@ class JobProcess:
         data_dir: of the service.
         folder: the job's own; exists.
         on_event: called from another thread with everything that the job tells.
+        client: a process that runs already, and passes on what it tells; started here if None.
+        on_end: called once the process has ended.
 
     Raises:
         OSError: if there can be no more processes.
     """
 
-    def __init__(self, job: Job, data_dir: Path, folder: Path, on_event: Callable[[object], None]) -> None:
+    def __init__(
+        self,
+        job: Job,
+        data_dir: Path,
+        folder: Path,
+        on_event: Callable[[object], None],
+        *,
+        client: ProcessClient | None = None,
+        on_end: Callable[[], None] = lambda: None,
+    ) -> None:
         self.id = job.id
         self.clock = JobClock()
         self._cancel_at = math.inf  # when patience with a cancelled job ends
-        self._client = ProcessClient(job_main, (), _WHO, answer_s=math.inf, on_event=on_event)
-        self._client.start()
+        self._on_end = on_end
+        self._client = client or ProcessClient(job_main, (), WHO, answer_s=math.inf, on_event=on_event)
+        self._client.start()  # does nothing where it runs
         self._answer = self._client.submit(RunJob(job.kind, job.params, data_dir, folder))
 
     @property
@@ -68,7 +80,7 @@ class JobProcess:
         except FutureTimeoutError:
             return JobCancelled() if time.monotonic() > self._cancel_at else None
         except ProcessUnavailable as error:
-            if error.who != _WHO:
+            if error.who != WHO:
                 return error
             return JobDied("was frozen and had to be ended") if isinstance(error, ProcessFrozen) else JobDied()
         except OsfError as error:
@@ -77,3 +89,4 @@ class JobProcess:
     def end(self) -> None:
         """End the process and its children."""
         self._client.stop()
+        self._on_end()

@@ -79,9 +79,17 @@ _WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
 _NOT_EXTRA = ("done", "total", "note", "view")
 
 
-def job_main(server: ProcessServer) -> None:
-    """Do the job that is asked for."""
+_LOADED = (  # by a process that waits for its job
+    "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.scene_models",
+    "app.jobs.kinds.remote_world", "app.jobs.kinds.estimates", "app.episodes.record", "app.episodes.recording",
+)  # fmt: skip
+
+
+def job_main(server: ProcessServer, is_in_reserve: bool = False) -> None:
+    """Do the job that is asked for; one in reserve loads code beforehand."""
     own_group()
+    for module in _LOADED if is_in_reserve else ():
+        import_quietly(module)
     control = JobControl(server.send)
     # A service that died leaves nobody who wants the result, and what is half-written counts as never begun.
     server.serve(lambda job, _: run_job(job, control, server.send), on_message=control.take, on_lost=end_own_group)

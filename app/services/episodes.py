@@ -9,13 +9,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, RECORDING_FILE, REPORT_FILE, VIDEO_FILE
+from app.episodes.file_names import (
+    CSV_FILE,
+    FRAMES_FOLDER,
+    GOAL_FILE,
+    PREPARED_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    TRAJECTORY_FILE,
+    VIDEO_FILE,
+)
 from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
 from app.jobs.job import Job, JobPage
 from app.jobs.kinds.episodes import settings_of
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals import Goals, NoTable
 from app.services.runner import Runner
+from app.services.stories import Stories
 from app.storage.database import CannotStore
 from app.storage.goal_store import Poses, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings
@@ -37,6 +47,15 @@ class NoGoal(OsfError):
 
     def __init__(self) -> None:
         super().__init__("An episode needs a goal: name a goal image (goal), or give poses of all objects (poses).")
+
+
+class NoTrajectory(OsfError):
+    """An episode that cannot be replayed."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "This episode cannot be replayed in 3D: it has not looked at anything yet, or an earlier version ran it."
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,6 +148,9 @@ class Episodes:
                 return {"id": None, "camera": None, "poses": poses, "truth": poses}
             goal = self._goals.get(asked.goal)
             shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
+            prepared = None if goal.example is None or goal.scene != scene else Stories().prepared(goal.example)
+            if prepared is not None:
+                shutil.copyfile(prepared, folder / PREPARED_FILE)
         except OSError as error:
             raise CannotStore(folder, error.strerror or str(error)) from error
         is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
@@ -162,6 +184,17 @@ class Episodes:
         """
         path = self._folder(job) / REPORT_FILE
         return read_json(path, _as_report) if path.is_file() else None
+
+    def trajectory(self, job: Job) -> Path:
+        """The file with an episode's course so far, see `app.episodes.trajectory`.
+
+        Raises:
+            NoTrajectory: if there is none yet, or the episode was run by an earlier version.
+        """
+        path = self._folder(job) / TRAJECTORY_FILE
+        if not path.is_file():
+            raise NoTrajectory
+        return path
 
     def frame(self, job: Job, step: int, part: Part) -> bytes:
         """PNG of one frame, or of one of its pictures.

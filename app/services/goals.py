@@ -161,7 +161,13 @@ class Goals:
         return self._made("composed", ComposeGoal(self._scene(scene), poses, light=light, size=GOAL_SIDE), name)
 
     def draw(
-        self, scene: str | None, seed: int, moved: int | None, name: str, light: Light | None = None
+        self,
+        scene: str | None,
+        seed: int,
+        moved: int | None,
+        name: str,
+        light: Light | None = None,
+        example: str | None = None,
     ) -> GoalRecord:
         """Keep a goal in which some objects of a scene lie elsewhere at random.
 
@@ -171,6 +177,7 @@ class Goals:
             moved: how many objects lie elsewhere; None to draw the number too.
             name: for people.
             light: in which it is seen; None for the scene's.
+            example: whose goal it is; None if it is anybody's own.
 
         Raises:
             NoTable, UnknownName: if there is no such scene.
@@ -178,17 +185,24 @@ class Goals:
             OsfError: if there is no room, or as `receive`.
         """
         command = ComposeGoal(self._scene(scene), seed=seed, moved=moved, light=light, size=GOAL_SIDE)
-        return self._made("drawn", command, name)
+        return self._made("drawn", command, name, example)
 
-    def _made(self, source: Source, command: ComposeGoal, name: str) -> GoalRecord:
+    def _made(self, source: Source, command: ComposeGoal, name: str, example: str | None = None) -> GoalRecord:
         made = self._runner.compose(command)
-        return self._keep(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png)
+        return self._keep(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png, example)
 
     def _keep(
-        self, source: Source, name: str, scene: str | None, camera: Camera, poses: Poses | None, png: bytes
+        self,
+        source: Source,
+        name: str,
+        scene: str | None,
+        camera: Camera,
+        poses: Poses | None,
+        png: bytes,
+        example: str | None = None,
     ) -> GoalRecord:
         self._runner.storage.check_room()
-        record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses)
+        record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses, example)
         self._store.keep(record, png)
         self._runner.hub.publish(GoalsChanged())
         return record

@@ -95,7 +95,7 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     """
     scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light)
     try:
-        goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light)
+        goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light, chosen.id)
     except BaseException:
         runner.delete_scene(scene.id)
         raise

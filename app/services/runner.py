@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobEvent, SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse, check_params
+from app.jobs.job_process import JobProcess
 from app.jobs.registry import Jobs
+from app.jobs.standby import Standby
 from app.jobs.stored import check_stored
 from app.processes.messages.scene_messages import Act, Command
 from app.services.event_hub import Notice
@@ -35,6 +37,7 @@ class Runner(Scenes):
 
     def __init__(self, settings: Settings, store: Store, library: AssetLibrary) -> None:
         super().__init__(settings, store, library)
+        self._standby = Standby() if settings.standby else None
         self.jobs = Jobs(
             store,
             settings.data_dir,
@@ -42,6 +45,7 @@ class Runner(Scenes):
             settings.max_queued_jobs,
             settings.cancel_grace_s,
             self._serve,
+            start_process=JobProcess if self._standby is None else self._standby.process,
             check=check_stored,
         )
         self.storage = StorageMeter(settings.data_dir, settings.max_data_bytes, settings.min_free_bytes)
@@ -58,6 +62,8 @@ class Runner(Scenes):
             sweep(self._settings.data_dir / folder)
         super().start()
         self.jobs.start()
+        if self._standby is not None:
+            self._standby.prepare()
         for entry in self._store.set_aside:
             _log.warning(entry.sentence)
             self.hub.publish(Notice("warning", entry.sentence))
@@ -67,6 +73,8 @@ class Runner(Scenes):
         """End all processes. Calling it again does nothing."""
         self.sets.stop()
         self.jobs.stop()
+        if self._standby is not None:
+            self._standby.stop()
         super().stop()
         self.storage.stop()
 

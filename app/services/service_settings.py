@@ -45,6 +45,9 @@ class Settings(BaseSettings):
     )
     max_stored_events: int = Field(default=1000, ge=10, description="Job events kept for reconnecting pages.")
     image_cache_bytes: int = Field(default=32 << 20, ge=0)
+    standby: bool = Field(
+        default=True, description="Whether a process waits for the next episode, with its code loaded."
+    )
     cancel_grace_s: float = Field(default=0.7, ge=0, description="How long a cancelled job may take to stop by itself.")
     stage_timeout_s: float = Field(default=60.0, gt=0, description="How long one command to the simulation may take.")
 

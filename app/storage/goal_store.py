@@ -45,6 +45,7 @@ class GoalRecord:
         scene: that it was made from; None for an upload.
         camera: that took the image.
         poses: of the objects in it, where they are known.
+        example: that it belongs to; None if it is anybody's own.
     """
 
     id: str
@@ -54,6 +55,7 @@ class GoalRecord:
     scene: str | None
     camera: Camera
     poses: Poses | None
+    example: str | None = None
 
 
 class GoalJson(Entry):
@@ -66,6 +68,7 @@ class GoalJson(Entry):
     scene: Text | None
     camera: CameraJson
     objects: list[ObjectJson] | None
+    example: Text | None = None
 
 
 class GoalStore:
@@ -153,7 +156,7 @@ def poses_to_json(poses: Poses) -> list[dict[str, Any]]:
 
 
 def _to_json(record: GoalRecord) -> dict[str, Any]:
-    facts = {key: getattr(record, key) for key in ("id", "name", "created_at", "source", "scene")}
+    facts = {key: getattr(record, key) for key in ("id", "name", "created_at", "source", "scene", "example")}
     objects = None if record.poses is None else poses_to_json(record.poses)
     return {**facts, "camera": camera_to_json(record.camera), "objects": objects}
 

@@ -12,6 +12,7 @@ import http
 import io
 import secrets
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any
 
 import viser
@@ -19,7 +20,9 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-SECRET_HEADER = "X-OSF-Viewer-Secret"
+SECRET_HEADER, PAGE_HEADER = "X-OSF-Viewer-Secret", "X-OSF-Page"
+# Set during a handshake; whatever viser does for that connection afterwards runs in the same context.
+_page: ContextVar[str | None] = ContextVar("page", default=None)
 
 
 class PrivateViser(viser.ViserServer):
@@ -36,10 +39,27 @@ class PrivateViser(viser.ViserServer):
         # The banner would tell the port. viser has no hook for handshakes, so its call of `serve` is given one.
         with contextlib.redirect_stdout(io.StringIO()), _guarding(self._refuse):
             super().__init__(host="127.0.0.1", port=0, verbose=False)
+        self._pages: dict[int, str] = {}
+        self.on_client_connect(self._note_page)
+        self.on_client_disconnect(self._forget_page)
+
+    def page_of(self, client: int) -> str | None:
+        """What the page calls itself in which a browser shows the view; None where it is on its own."""
+        return self._pages.get(client)
+
+    async def _note_page(self, client: viser.ClientHandle) -> None:
+        """Asynchronous, so that it runs in the connection's context, and before other callbacks."""
+        page = _page.get()
+        if page is not None:
+            self._pages[client.client_id] = page
+
+    async def _forget_page(self, client: viser.ClientHandle) -> None:
+        self._pages.pop(client.client_id, None)
 
     def _refuse(self, connection: ServerConnection, request: Request) -> Response | None:
         given = request.headers.get_all(SECRET_HEADER)
         if len(given) == 1 and hmac.compare_digest(given[0].encode(), self.secret.encode()):
+            _page.set(request.headers.get(PAGE_HEADER))
             return None
         return connection.respond(http.HTTPStatus.FORBIDDEN, "The 3D view is at /viewer/ of the service.\n")
 

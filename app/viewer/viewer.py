@@ -25,7 +25,9 @@ from app.services.runner import Runner
 from app.storage.paths import without_places
 from app.viewer.nodes.episode_nodes import EpisodeNodes
 from app.viewer.nodes.estimate_nodes import EstimateNodes
+from app.viewer.nodes.room import add_room
 from app.viewer.nodes.scene_nodes import Client, SceneNodes
+from app.viewer.page_views import PageViews
 from app.viewer.panels.episode_panel import EpisodePanel
 from app.viewer.panels.estimate_panel import EstimatePanel
 from app.viewer.panels.goal_panel import GoalPanel
@@ -35,6 +37,7 @@ from app.viewer.panels.push_panel import PushPanel
 from app.viewer.playback import Playback
 from app.viewer.private_server import PrivateViser
 from osfcore.errors import OsfError
+from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 
@@ -94,8 +97,12 @@ class Viewer:
     def start(self) -> None:
         """Open the loopback server and draw what there is."""
         self._server = PrivateViser()
-        self._drawing = SceneNodes(self._server, self._runner.library, self._move_object, self._move_light)
+        add_room(self._server)
+        self._drawing = SceneNodes(
+            self._server, self._runner.library, self._move_object, self._move_light, cameras=default_cameras()
+        )
         self._playback = Playback(self._drawing)
+        self.pages = PageViews(self._runner.library, self._server.page_of)
         self._add_controls(self._server)
         self._panels = self._make_panels(self._server)
         self._server.on_client_connect(self._add_client)
@@ -138,7 +145,7 @@ class Viewer:
         drawings = table, EpisodeNodes(server, library, table.has)
         episode = EpisodePanel(server, drawings, jobs, self._run_command, estimate.forget)
         push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
-        return neural, estimate, self._goal_panel, episode, push
+        return self.pages, neural, estimate, self._goal_panel, episode, push
 
     def _add_client(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(1)

@@ -33,6 +33,7 @@ from osfcore.control.events import (
 )
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
 from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, offsets
+from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels
 from osfcore.control.world_protocol import World
@@ -46,7 +47,7 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import Observation, SceneState
 from osfcore.planning.image_cost import ImageCost
 from osfcore.planning.mppi import MPPIPlanner
 from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal
@@ -72,6 +73,7 @@ class Episode:
         settings: may be replaced while the episode runs.
         rng: draws everything.
         start: what is known of the first frame already; without it, it is estimated from images with masks.
+        prepared: estimates that are used in place of new ones where they explain the images.
     """
 
     settings: EpisodeSettings
@@ -84,11 +86,12 @@ class Episode:
         settings: EpisodeSettings,
         rng: np.random.Generator,
         start: EstimatedState | None = None,
+        prepared: PreparedLooks | None = None,
     ) -> None:
         self.settings = settings
         self._world, self._models, self._target, self._rng = world, models, goal, rng
         self._planner = MPPIPlanner(models.dynamics.rollout, PushProposals(models.shapes), settings.plan)
-        self._start = start
+        self._start, self._prepared = start, prepared
         self._number = 0
         self._progress = ProgressMonitor()
         self._doubted: dict[str, int] = {}
@@ -133,8 +136,8 @@ class Episode:
         self._check_objects(observation.names)
         yield Observed(0, observation)
         if self._start is None:
-            self._estimate = yield from self._run_estimator("first", estimate_first(
-                self._models.appearance, observation, self._rng))  # fmt: skip
+            steps = estimate_first(self._models.appearance, observation, self._rng)
+            self._estimate = yield from self._look("first", observation, steps)
         else:
             self._estimate = self._start
         self._estimate = _with_pusher(self._estimate, observation.pusher)
@@ -142,6 +145,17 @@ class Episode:
         self._weak = frozenset(_doubted(self._estimate))
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
+
+    def _look(
+        self, look: Look, observation: Observation, steps: Iterator[EstimateStep]
+    ) -> Iterator[Event]:  # returns the EstimatedState
+        """What was prepared, if it fits; else what an estimator finds."""
+        with self._measure_time(look):
+            step = None if self._prepared is None else self._prepared.step(look, self._models.appearance, observation)
+        if step is None:
+            return (yield from self._run_estimator(look, steps))
+        yield Looking(self._number, look, step)
+        return step.estimate
 
     def _check_objects(self, names: tuple[str, ...]) -> None:
         if isinstance(self._target, PoseGoal) and set(self._target.names) != set(names):
@@ -215,11 +229,12 @@ class Episode:
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
         target, state, estimate, doubts = self._target, self._estimate.state, None, ""
         if isinstance(target, GoalImage):
-            steps = estimate_goal(self._models.appearance, target.observed(state.names), state)
-            estimate = yield from self._run_estimator("goal", steps)
+            seen = target.observed(state.names)
+            steps = estimate_goal(self._models.appearance, seen, state)
+            estimate = yield from self._look("goal", seen, steps)
             estimate = prefer_current_poses(self._models.appearance, target, estimate, state)
-            goal, light, camera, image = _poses_of(estimate.state), estimate.state.light, target.camera, target.image
-            doubts = estimate.reason
+            goal, doubts = PoseGoal(estimate.state.names, estimate.state.poses), estimate.reason
+            light, camera, image = estimate.state.light, target.camera, target.image
         else:
             goal, light, camera = target, state.light, goal_camera()
             image = self._rendered(replace(state, poses=_in_order(target, state.names)), camera, light)
@@ -323,10 +338,6 @@ def _doubted(estimate: EstimatedState) -> list[str]:
 def _with_pusher(estimate: EstimatedState, pusher: Float[np.ndarray, "3"] | None) -> EstimatedState:
     """The robot knows its hand."""
     return replace(estimate, state=replace(estimate.state, pusher=pusher))
-
-
-def _poses_of(state: SceneState) -> PoseGoal:
-    return PoseGoal(state.names, state.poses)
 
 
 def _in_order(goal: PoseGoal, names: tuple[str, ...]) -> Pose:

@@ -59,5 +59,6 @@ export async function getAll(path, key) {
   return entries;
 }
 export const post = (path, body) => call("POST", path, body);
+export const put = (path, body) => call("PUT", path, body);
 export const patch = (path, body) => call("PATCH", path, body);
 export const remove = (path) => call("DELETE", path);

@@ -9,6 +9,7 @@ import { current, inWords, known, labelOf, set, watch } from "./state.js";
 import { scrollTo } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { tellFailure, toast } from "./toasts.js";
+import { replay, showLive } from "./viewer.js";
 
 let shown = null; // the episode, as fetched last
 let wanted = null; // {id, step} to be fetched next; no step: stay where one is, at the end if there
@@ -16,6 +17,7 @@ let isFetching = false;
 let timeline = null;
 let followed = ""; // the job that was put on view by itself
 let seen = ""; // how far the job was when it was fetched for
+let isLive = true; // whether the 3D view is left on the live table
 
 const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
 const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
@@ -69,8 +71,9 @@ export function showEpisode(episode, step) {
   const last = episode.steps.length - 1;
   if (Number.isFinite(step) && last >= 0 && step > last) toast(`This episode has steps 0 to ${last}; showing the last one.`, "warning");
   const at = Number.isFinite(step) ? Math.min(step, last) : wasAtEnd ? last : timeline.step;
-  timeline.set(last, at);
+  timeline.set(last, at, episode.step_s);
   drawResults(episode, isOther);
+  if (isOther) show3D(LIVE.has(episode.status) && !Number.isFinite(step) ? null : { at_s: timeline.at(at), plays: false, speed: 1 });
   if (!isOther) return;
   if (LIVE.has(episode.status)) scrollTo(byId("shown"));
   else byId("shown").scrollIntoView({ block: "start" }); // somebody asked for it
@@ -103,6 +106,20 @@ function drawHead(episode) {
     el("button", { type: "button", className: "plain", textContent: `Step ${notice.step}`, on: { click: () => timeline.go(notice.step) } }),
     el("span", { textContent: inWords(notice.text) }),
   )));
+}
+
+/** Shows a moment of the episode in the 3D view, or the live table for null. */
+function show3D(moment) {
+  const isAtEnd = !moment || (!moment.plays && moment.at_s >= timeline.at(timeline.last));
+  isLive = !moment || (isAtEnd && LIVE.has(shown.status));
+  if (isLive) showLive();
+  else if (shown.steps.length) replay({ episode: shown.id, ...moment }, `Recorded: ${shown.objects.map(labelOf).join(", ")}`);
+}
+
+/** Somebody wants to see the live table in the 3D view again. */
+export function followLive() {
+  isLive = true;
+  timeline.pause();
 }
 
 function drawStep(at) {
@@ -145,6 +162,7 @@ function close() {
   timeline.pause();
   shown = null;
   byId("shown").hidden = true;
+  showLive();
   const job = known("episode");
   if (LIVE.has(job?.state)) openEpisode(job.id);
 }
@@ -164,7 +182,7 @@ export function refreshShown() {
 
 export function setUpEpisodeView() {
   setUpPictures();
-  timeline = new Timeline(drawStep);
+  timeline = new Timeline(drawStep, show3D);
   setUpProgress(() => timeline.last, (step) => timeline.go(step));
   byId("close-shown").addEventListener("click", close);
   watch("objects", () => {

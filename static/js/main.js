@@ -7,7 +7,7 @@ import { VISITOR, setUpDriver } from "./driver.js";
 import { setUpDrop } from "./drop.js";
 import { setUpEpisode } from "./episode.js";
 import { refreshSettings, setUpEpisodeSettings } from "./episode-settings.js";
-import { refreshShown, setUpEpisodeView, shownStep } from "./episode-view.js";
+import { followLive, refreshShown, setUpEpisodeView, shownStep } from "./episode-view.js";
 import { dropEpisode, refreshEpisodes, setUpEpisodes } from "./episodes.js";
 import { setUpEstimate } from "./estimate.js";
 import { listen } from "./events.js";
@@ -24,6 +24,7 @@ import { setUpPush } from "./push.js";
 import { setUpResults } from "./results.js";
 import { refreshScenes, setUpScenes } from "./scenes.js";
 import { expectOlder, set } from "./state.js";
+import { setUpStory } from "./story.js";
 import { setUpTabs } from "./tabs.js";
 import { setUpTheme } from "./theme.js";
 import { toast } from "./toasts.js";
@@ -65,9 +66,9 @@ async function followHealth(again) {
   }
 }
 
-setUpTheme(() => { if (isViewerShown()) showViewer(); });
+setUpTheme();
 setUpTabs();
-setUpViewer();
+setUpViewer(followLive);
 setUpDriver();
 setUpCameras();
 setUpNeural();
@@ -89,6 +90,7 @@ setUpEpisodeSettings();
 setUpEpisode();
 setUpEpisodes();
 setUpWelcome();
+setUpStory();
 setUpKeyboard();
 refreshObjects();
 refreshSets();

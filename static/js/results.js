@@ -1,14 +1,11 @@
-// What can be taken away from an episode: its film, a replay in 3D, a link to this moment, files.
+// What can be taken away from an episode: its film, a link to this moment, files.
 import { ApiError, problemOf } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { LIVE } from "./jobs.js";
-import { labelOf } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
-import { replay } from "./viewer.js";
 
 const VIDEO = "video.mp4";
-const RECORDING = "episode.viser";
-const FILES = { [VIDEO]: "Video", "report.json": "Report", "steps.csv": "CSV", [RECORDING]: "Recording", "goal.png": "Goal" };
+const FILES = { [VIDEO]: "Video", "report.json": "Report", "steps.csv": "CSV", "episode.viser": "Recording", "goal.png": "Goal" };
 let shown = null;
 let stepOf = () => 0;
 
@@ -44,13 +41,6 @@ async function watchVideo() {
   video.play().catch(() => {}); // a browser that does not play by itself shows its own button
 }
 
-async function replayIn3D() {
-  const url = new URL(fileUrl(RECORDING), document.baseURI).href;
-  await prepared(url);
-  replay(url, `Recorded: ${shown.objects.map(labelOf).join(", ")}`);
-  byId("viewer").scrollIntoView({ block: "nearest" });
-}
-
 async function copyLink() {
   const url = new URL(document.baseURI);
   url.search = new URLSearchParams({ episode: shown.id, step: stepOf() });
@@ -76,15 +66,12 @@ export function drawResults(episode, isOther) {
   }
   byId("shown-actions").hidden = episode.steps.length === 0;
   byId("watch-video").hidden = !files.includes(VIDEO);
-  byId("replay-3d").hidden = !files.includes(RECORDING);
   byId("downloads").replaceChildren(...files.map((name) =>
     el("a", { href: fileUrl(name), textContent: FILES[name] ?? name, download: `${episode.id}-${name}` })));
 }
 
 export function setUpResults(step) {
   stepOf = step;
-  for (const [id, action] of [["watch-video", watchVideo], ["replay-3d", replayIn3D]]) {
-    byId(id).addEventListener("click", () => busily(byId(id), action));
-  }
+  byId("watch-video").addEventListener("click", () => busily(byId("watch-video"), watchVideo));
   byId("copy-link").addEventListener("click", copyLink);
 }

@@ -6,18 +6,17 @@ const KEY = "osf-theme";
 
 export const isDark = () => document.documentElement.dataset.theme === "dark";
 
-function apply(listener) {
+function apply() {
   const dark = (localStorage.getItem(KEY) ?? (system.matches ? "dark" : "light")) === "dark";
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   byId("theme-button").textContent = dark ? "Light" : "Dark";
-  listener(dark);
 }
 
-export function setUpTheme(listener = () => {}) {
-  apply(() => {});
-  system.addEventListener("change", () => apply(listener));
+export function setUpTheme() {
+  apply();
+  system.addEventListener("change", apply);
   byId("theme-button").addEventListener("click", () => {
     localStorage.setItem(KEY, isDark() ? "light" : "dark");
-    apply(listener);
+    apply();
   });
 }

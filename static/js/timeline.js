@@ -1,22 +1,23 @@
-// A slider over the steps of an episode, and a player that moves it.
+// A slider over the steps of an episode, and a player that moves it: at the pace of the replay, in which pushes are
+// as fast as they were and looks are short.
 import { byId } from "./dom.js";
 
-const ACTION_MS = 200;
+const TICK_MS = 50;
+const STEP_S = 0.6; // for episodes of earlier versions, which do not tell when a step is over
 
 export class Timeline {
-  /** `onStep` is told the step that shall be seen. */
-  constructor(onStep) {
+  /** `onStep` is told the step that shall be seen; `onMove` the moment, and whether and how fast it goes on from there. */
+  constructor(onStep, onMove = () => {}) {
     this.onStep = onStep;
+    this.onMove = onMove;
     this.timer = 0;
+    this.times = [0];
     this.slider = byId("timeline");
     this.button = byId("timeline-play");
-    this.slider.addEventListener("input", () => {
-      this.pause();
-      this.#tell();
-    });
+    this.slider.addEventListener("input", () => this.go(this.step));
     this.button.addEventListener("click", () => (this.timer ? this.pause() : this.play()));
-    this.speed = byId("timeline-speed");
-    this.speed.addEventListener("change", () => { if (this.timer) this.#run(); });
+    this.chosen = byId("timeline-speed");
+    this.chosen.addEventListener("change", () => { if (this.timer) this.#run(this.#now()); });
   }
 
   get step() {
@@ -27,50 +28,71 @@ export class Timeline {
     return Number(this.slider.max);
   }
 
-  /** Steps 0 to `last`, and where to be. */
-  set(last, step) {
+  get speed() {
+    return Number(this.chosen.value);
+  }
+
+  /** When a step is over [s]. */
+  at(step) {
+    return this.times[Math.min(Math.max(step, 0), this.times.length - 1)] ?? 0;
+  }
+
+  /** Steps 0 to `last`, where to be, and when each step is over [s]. */
+  set(last, step, times = []) {
+    this.times = times.length > last ? times : Array.from({ length: Math.max(last, 0) + 1 }, (_, i) => STEP_S * i);
     this.slider.max = Math.max(last, 0);
-    this.slider.value = step;
     this.slider.disabled = this.button.disabled = last < 1;
-    this.#tell();
+    if (this.timer) return this.#tell(Math.min(this.step, last));
+    return this.#tell(step);
   }
 
   go(step) {
     this.pause();
-    this.slider.value = step;
-    this.#tell();
+    this.#tell(step);
+    this.onMove({ at_s: this.at(this.step), plays: false, speed: this.speed });
   }
 
   play() {
-    if (this.step >= this.last) this.slider.value = 0;
-    this.#run();
-    this.#tell();
+    this.#run(this.step >= this.last ? 0 : this.at(this.step));
   }
 
   pause() {
+    if (this.timer) this.onMove({ at_s: this.#now(), plays: false, speed: this.speed });
     clearInterval(this.timer);
     this.#draw(0);
   }
 
-  #run() {
+  #run(from) {
     clearInterval(this.timer);
-    this.#draw(setInterval(() => this.#next(), ACTION_MS / Number(this.speed.value)));
+    this.from = from;
+    this.rate = this.speed;
+    this.since = performance.now();
+    this.#draw(setInterval(() => this.#tick(), TICK_MS));
+    this.onMove({ at_s: from, plays: true, speed: this.rate });
+    this.#tick();
   }
 
-  #next() {
-    const isEnd = this.step >= this.last;
-    if (isEnd && !byId("timeline-loop").checked) return this.pause();
-    this.slider.value = isEnd ? 0 : this.step + 1;
-    return this.#tell();
+  #now() {
+    return this.from + (this.rate * (performance.now() - this.since)) / 1000;
+  }
+
+  #tick() {
+    const now = this.#now();
+    const next = this.times.findIndex((time) => time > now);
+    const step = Math.min(next < 0 ? this.last : Math.max(next - 1, 0), this.last);
+    if (step !== this.step) this.#tell(step);
+    if (now < this.at(this.last)) return undefined;
+    return byId("timeline-loop").checked ? this.#run(0) : this.pause();
   }
 
   #draw(timer) {
     this.timer = timer;
     this.button.textContent = timer ? "❚❚" : "▶";
-    this.button.setAttribute("aria-label", timer ? "Pause the pictures" : "Play the pictures");
+    this.button.setAttribute("aria-label", timer ? "Pause the episode" : "Play the episode");
   }
 
-  #tell() {
+  #tell(step) {
+    this.slider.value = step;
     byId("timeline-step").textContent = `${this.step} / ${this.last}`;
     this.slider.setAttribute("aria-valuetext", `Step ${this.step} of ${this.last}`);
     this.onStep(this.step);

@@ -1,31 +1,57 @@
-// The 3D view in its frame: the live table, or a recording in its place until someone wants the live one back.
+// The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
+import { put } from "./api.js";
 import { byId } from "./dom.js";
-import { isDark } from "./theme.js";
+import { VISITOR } from "./driver.js";
+import { Newest } from "./newest.js";
+import { tellFailure } from "./toasts.js";
 
-let recording = null; // {url, text} while one is shown
+let text = ""; // of what is replayed; "" while the live table is on view
+let onLive = () => {};
 
-/** Loads the frame again with what it should show; also after the service was lost, or the theme has changed. */
+/** Loads the frame, again after the service was lost; what this page replays there is shown again by itself. */
 export function showViewer() {
-  const frame = byId("viewer");
-  const query = recording ? `&${new URLSearchParams({ playbackPath: recording.url })}` : "";
-  frame.src = `viewer/?hideViserLogo${isDark() ? "&darkMode" : ""}${query}`;
-  frame.hidden = false;
+  // Of one look whatever the page's theme is: a table under a lamp is seen best before something dark.
+  byId("viewer").src = `viewer/${VISITOR}/?hideViserLogo&darkMode`;
+  byId("viewer").hidden = false;
   byId("viewer-wait").hidden = true;
-  byId("replaying").hidden = !recording;
-  byId("replaying-text").textContent = recording?.text ?? "";
 }
 
 export const isViewerShown = () => !byId("viewer").hidden;
 
-/** Plays a recording, whose address must be absolute. */
-export function replay(url, text) {
-  recording = { url, text };
-  showViewer();
+const wish = new Newest((replay) => put(`views/${VISITOR}`, { replay }));
+
+function draw(told) {
+  text = told;
+  byId("replaying").hidden = !told;
+  byId("replaying-text").textContent = told;
 }
 
-export function setUpViewer() {
+/** Shows a moment of an episode: {episode, at_s, plays, speed}. `told` says what it is. */
+export function replay(what, told) {
+  draw(told);
+  wish.ask(what);
+}
+
+/** Likewise for a story, without a word over it; resolves to whether the view is open already. */
+export async function replayStory(what) {
+  draw("");
+  const answer = await tellFailure(() => put(`views/${VISITOR}`, { replay: what }));
+  return answer?.is_open;
+}
+
+/** Back to the live table. */
+export function showLive() {
+  draw("");
+  wish.ask(null);
+}
+
+export const isReplaying = () => Boolean(text);
+
+/** `listener` is told when somebody wants the live table back. */
+export function setUpViewer(listener) {
+  onLive = listener;
   byId("back-to-live").addEventListener("click", () => {
-    recording = null;
-    showViewer();
+    showLive();
+    onLive();
   });
 }

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.viewer.nodes.scene_nodes import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
+from app.viewer.nodes.room import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
 from osfcore.geometry.cameras import Camera
 from tests.app.processes.fields import write_box, write_exact_table
 from tests.e2e.conftest import watch_errors

@@ -138,7 +138,7 @@ class SecurityMiddleware:
 
 
 def _add_headers(headers: MutableHeaders, path: str) -> None:
-    if path.rstrip("/") == "/viewer":
+    if path == "/viewer" or path.startswith("/viewer/"):
         policy = _VIEWER_POLICY
     elif path == "/docs":
         policy = _DOCS_POLICY

@@ -9,10 +9,10 @@ from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
 from app.api.routes import problems
 from app.api.schemas.common import Input
-from app.api.schemas.limits import NAME, sized
+from app.api.schemas.limits import NAME, VISITOR, sized
 
 router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems(), route_class=BoundedRoute)
-Visitor = Annotated[str, Field(**sized(NAME), pattern="^[A-Za-z0-9_-]+$", description="What a page calls itself.")]
+Visitor = Annotated[str, Field(**sized(NAME), pattern=f"^{VISITOR}$", description="What a page calls itself.")]
 
 
 class DriverIn(Input):

@@ -21,7 +21,7 @@ from app.api.routes.driver import DriverOut
 from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent
 from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
-from app.api.schemas.limits import NAME, sized
+from app.api.schemas.limits import NAME, VISITOR, sized
 from app.jobs.job import Job, JobChanged, JobForgotten, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
@@ -97,7 +97,7 @@ async def stream(
     counted: StreamDep,
     frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
     visitor: Annotated[
-        str | None, Query(**sized(NAME), pattern="^[A-Za-z0-9_-]+$", description="What the page calls itself.")
+        str | None, Query(**sized(NAME), pattern=f"^{VISITOR}$", description="What the page calls itself.")
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:

@@ -156,6 +156,7 @@ class EpisodeOut(BaseModel):
     text: str | None = Field(description="The outcome in a sentence.")
     notices: list[NoticeOut]
     steps: list[EpisodeStepOut]
+    step_s: list[float] = Field(description="When each step is over in the episode's replay, see /api/views [s].")
     files: list[str] = Field(description="Names to download from /api/episodes/{id}/files/{name}.")
 
     @staticmethod
@@ -193,6 +194,7 @@ class EpisodeOut(BaseModel):
             text=result.get("text"),
             notices=[NoticeOut(**notice) for notice in report.get("noticed", ())],
             steps=[EpisodeStepOut.model_validate(step) for step in report.get("steps", ())],
+            step_s=report.get("step_s", []),
             files=list(files),
         )
 

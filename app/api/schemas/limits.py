@@ -31,6 +31,7 @@ FETCHED = (0, 64)  # names of objects to fetch
 
 # Lengths of texts
 NAME = (1, 64)  # also of identifiers
+VISITOR = "[A-Za-z0-9_-]+"  # what a page calls itself
 GOAL_NAME = (1, 100)
 FILE_NAME = (0, 200)
 CAMERA_JSON = (0, 4000)
@@ -41,6 +42,10 @@ STEPS = (1, MAX_STEPS)
 SAMPLES = (8, MAX_SEQUENCES)
 HORIZON = (1, MAX_HORIZON)
 TEMPERATURE = (1e-6, 1e6)
+
+# Replays
+REPLAY_S = (0, 86_400)
+REPLAY_SPEED = (0.1, 16)
 
 # Predictions
 SEQUENCES = (1, 1000)

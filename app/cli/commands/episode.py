@@ -65,8 +65,8 @@ class RunEpisode:
         settings = EpisodeSettings(self.steps, self.replan_every, self.cost, plan, despite_doubts=self.despite_doubts)
         check_place(self.out / REPORT_FILE)
         order = EpisodeOrder(
-            self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.moved, settings,
-            str(pick_device(self.device)),
+            self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.moved,
+            settings=settings, device=str(pick_device(self.device)),
         )  # fmt: skip
         last = follow(run_episode(order))
         assert last is not None

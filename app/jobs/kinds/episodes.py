@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.episodes.file_names import GOAL_FILE, RECORDING_FILE
+from app.episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
 from app.jobs.job import INPUTS
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
+from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import ObjectJson, camera_from_json
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from osfcore.control.episode_settings import EpisodeSettings
     from osfcore.control.events import Event
     from osfcore.control.goal import GoalImage
+    from osfcore.control.prepared_look import PreparedLooks
     from osfcore.planning.pose_cost import PoseGoal
 
 _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
@@ -94,7 +96,9 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     about = About(params["seed"], settings, target, _moved(start, target), models.symmetries)
     record = EpisodeRecord(place.folder, world, about)
     rng = np.random.default_rng([params["seed"], 1])
-    episode = Episode(world, models, _goal(goal, names, place.folder / INPUTS), settings, rng)
+    inputs = place.folder / INPUTS
+    prepared = _prepared(inputs / PREPARED_FILE)
+    episode = Episode(world, models, _goal(goal, names, inputs), settings, rng, prepared=prepared)
     progress = EpisodeProgress(0, 0, "Looking")
     for event in episode.run():
         for change in place.orders.changes():
@@ -154,6 +158,13 @@ def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> Goa
     if given["poses"] is None:
         return read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
     return PoseGoal(names, _poses(given["poses"], names))
+
+
+def _prepared(path: Path) -> PreparedLooks | None:
+    """What was found out beforehand about an example, if the goal is an example's."""
+    from osfcore.control.prepared_look import prepared_from_json
+
+    return read_json(path, prepared_from_json) if path.is_file() else None
 
 
 def _poses(data: object, names: tuple[str, ...]) -> Pose:

@@ -5,9 +5,11 @@ from collections.abc import Iterator
 
 import viser
 
+Target = viser.ViserServer | viser.ClientHandle  # what draws for all browsers, or for one
+
 
 @contextlib.contextmanager
-def atomic(server: viser.ViserServer) -> Iterator[None]:
+def atomic(server: Target) -> Iterator[None]:
     """Send what changes inside as one message, at once."""
     with server.atomic():
         yield

@@ -11,7 +11,7 @@ import viser
 from jaxtyping import Float, UInt8
 
 from app.processes.plan_summary import PlanSketch
-from app.viewer.nodes.atomic import atomic
+from app.viewer.nodes.atomic import Target, atomic
 from app.viewer.nodes.estimate_nodes import Colour, EstimateNodes
 from app.viewer.nodes.future_nodes import FutureNodes
 from app.viewer.nodes.ghosts import mesh_of
@@ -36,34 +36,41 @@ _NOWHERE = np.zeros((1, 2, 3), np.float32)
 
 
 class EpisodeNodes:
-    """Nodes below /episode. Any thread may call.
+    """Nodes below one of their own. Any thread may call.
 
     Args:
         server: to draw in.
         library: meshes of the objects.
         is_named: whether an object is labelled already, since it is on the table.
+        root: below which everything is drawn.
     """
 
     def __init__(
-        self, server: viser.ViserServer, library: AssetLibrary, is_named: Callable[[str], bool] = lambda _: True
+        self,
+        server: Target,
+        library: AssetLibrary,
+        is_named: Callable[[str], bool] = lambda _: True,
+        *,
+        root: str = "/episode",
     ) -> None:
+        self._root = root
         self._server = server
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
         # What is below a hidden node is hidden with it.
-        self._roots = {part: self._scene.add_frame(f"/episode/{part}", show_axes=False) for part in PARTS}
-        self._now = EstimateNodes(server, library, is_named, root="/episode/estimate")
+        self._roots = {part: self._scene.add_frame(f"{root}/{part}", show_axes=False) for part in PARTS}
+        self._now = EstimateNodes(server, library, is_named, root=f"{root}/estimate")
         self._goal_look = EstimateNodes(
-            server, library, is_named, root="/episode/goal/look", colour=_linear(GOAL), has_light=False
+            server, library, is_named, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
-        self._future = FutureNodes(server.scene, library, "/episode/plan/future", _linear(PREDICTED))
+        self._future = FutureNodes(server.scene, library, f"{root}/plan/future", _linear(PREDICTED))
         add = self._scene.add_line_segments
         # Lines that begin in one colour for all would stay white once each has its own.
         each = np.array([[_linear(CHEAP)] * 2], np.uint8)
-        self._ways = add("/episode/plan/ways", _NOWHERE, each, thickness=_WAY_M, visible=False)
-        self._best = add("/episode/plan/best", _NOWHERE, PREDICTED, thickness=_BEST_M, visible=False)
+        self._ways = add(f"{root}/plan/ways", _NOWHERE, each, thickness=_WAY_M, visible=False)
+        self._best = add(f"{root}/plan/best", _NOWHERE, PREDICTED, thickness=_BEST_M, visible=False)
 
     @property
     def shows_light(self) -> bool:
@@ -109,10 +116,14 @@ class EpisodeNodes:
 
     def play(self, seconds: float) -> None:
         """Let the best future be as it is some time after it began; over and over, faster than it would be."""
+        self.play_to(min(seconds % (PLAY_S + REST_S) / PLAY_S, 1.0))
+
+    def play_to(self, share: float) -> None:
+        """Let the best future be as it is after a share of its time."""
         with self._lock:
             if self._future.steps and self._roots["plan"].visible:
                 with atomic(self._server):
-                    self._future.at(self._future.steps * min(seconds % (PLAY_S + REST_S) / PLAY_S, 1.0))
+                    self._future.at(self._future.steps * share)
 
     def clear(self) -> None:
         """Remove everything."""
@@ -134,7 +145,7 @@ class EpisodeNodes:
 
     def _goal_copy(self, name: str) -> viser.MeshHandle:
         return self._scene.add_mesh_simple(
-            f"/episode/goal/where/{name}",
+            f"{self._root}/goal/where/{name}",
             *mesh_of(self._library, name, _CELLS),
             color=GOAL,
             opacity=_GOAL_OPACITY,

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from app.viewer.nodes.atomic import atomic
+from app.viewer.nodes.atomic import Target, atomic
 from app.viewer.nodes.ghosts import (
     Mesh,
     add_ghosts,
@@ -22,7 +22,8 @@ from app.viewer.nodes.ghosts import (
     spread,
     top_m,
 )
-from app.viewer.nodes.scene_nodes import LIGHT_COLOUR, LIGHT_CUBE_M
+from app.viewer.nodes.light_marker import AT, LightMarker
+from app.viewer.nodes.scene_nodes import LIGHT_COLOUR
 from osfcore.errors import OsfError
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
@@ -60,7 +61,7 @@ class EstimateNodes:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: Target,
         library: AssetLibrary,
         is_named: Callable[[str], bool] = lambda _: True,
         *,
@@ -80,7 +81,7 @@ class EstimateNodes:
         self._guesses: dict[str, viser.BatchedMeshHandle] = {}
         self._verdicts: list[viser.SceneNodeHandle] = []
         self._has_candidates = True
-        self._lamp: tuple[viser.BoxHandle, viser.LineSegmentsHandle, viser.LabelHandle] | None = None
+        self._lamp: LightMarker | None = None
         self._tried_lights = self._copies(
             f"{root}/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, colour=LIGHT_COLOUR, opacity=0.5
         )
@@ -127,8 +128,8 @@ class EstimateNodes:
         with self._lock, atomic(self._server):
             self._begin(())
             self._clear_verdicts()
-            for node in self._lamp or ():
-                node.remove()
+            if self._lamp is not None:
+                self._lamp.remove()
             self._lamp, self._tried_lights.visible = None, False
 
     def _begin(self, names: tuple[str, ...]) -> None:
@@ -180,28 +181,13 @@ class EstimateNodes:
     def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
         if not self._has_light:
             return
-        cube, ray, label = self._lamp = self._lamp or self._add_lamp()
-        cube.position = label.position = light.position
-        ray.points = np.stack([0.55 * light.position, light.position])[None].astype(np.float32)
-        label.text = text
+        self._lamp = self._lamp or LightMarker(self._scene, f"{self._root}/light", LIGHT_COLOUR, is_below=True)
+        self._lamp.place(light.position)
+        self._lamp.show(is_on=True, text=text)
         if tried is not None:
             turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(tried), 1))
-            move_ghosts(self._tried_lights, spread(Pose(np.asarray(tried, float), turns), GHOSTS))
+            move_ghosts(self._tried_lights, spread(Pose(AT * np.asarray(tried, float), turns), GHOSTS))
         self._tried_lights.visible = tried is not None and self._has_candidates
-
-    def _add_lamp(self) -> tuple[viser.BoxHandle, viser.LineSegmentsHandle, viser.LabelHandle]:
-        scene, nowhere = self._scene, np.zeros((1, 2, 3), np.float32)
-        return (
-            scene.add_box(
-                f"{self._root}/light",
-                color=LIGHT_COLOUR,
-                dimensions=(LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M),
-                cast_shadow=False,
-                receive_shadow=False,
-            ),
-            scene.add_line_segments(f"{self._root}/light_ray", nowhere, LIGHT_COLOUR, thickness=0.004),
-            scene.add_label(f"{self._root}/light_name", "", font_screen_scale=0.8, anchor="top-center"),
-        )
 
     # The verdict
 

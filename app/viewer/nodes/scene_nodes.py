@@ -10,22 +10,25 @@ import numpy as np
 import viser
 
 from app.processes.messages.scene_messages import SceneRecord
-from app.viewer.nodes.atomic import atomic
+from app.viewer.nodes.atomic import Target, atomic
+from app.viewer.nodes.light_marker import AT, LightMarker
+from app.viewer.nodes.room import colour_of
+from app.viewer.nodes.shadow_nodes import ShadowNodes
 from osfcore.errors import OsfError
-from osfcore.geometry.cameras import Camera, default_cameras
-from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.imaging.optics import TABLE_ALBEDO
 
-VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.95, -0.95, 0.9), (0.0, 0.0, 0.1), 0.8
-TABLE_THICKNESS_M = 0.04
-LIGHT_CUBE_M = 0.06
+# Everything that is drawn of the live table, here and elsewhere; the room around it is not.
+LIVE_NODES = (
+    "/objects", "/names", "/handles", "/shadows", "/cameras", "/pusher", "/lamp", "/light", "/light_ray", "/light_name",
+    "/light_handle", "/episode", "/estimate", "/push", "/goal",
+)  # fmt: skip
 LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
 LABEL_GAP_M = 0.01
-AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
@@ -36,20 +39,26 @@ class SceneNodes:
     """The nodes of one viser scene. Nodes are made once; afterwards only what changes is assigned.
 
     Args:
-        server: to draw in.
+        server: to draw in, for all browsers or for one.
         library: meshes, sizes and labels of the objects.
-        on_move: called on viser's loop with name, pose [m, world] and client when an object was let go.
-        on_light: called on viser's loop with light and client when the light was let go.
+        on_move: called on viser's loop with name, pose [m, world] and client when an object was let go; None where
+            objects have no handles.
+        on_light: called on viser's loop with light and client when the light was let go; None likewise.
+        cameras: that are drawn.
+        root: below which everything is drawn.
     """
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: Target,
         library: AssetLibrary,
-        on_move: Callable[[str, Pose, Client], None],
-        on_light: Callable[[Light, Client], None],
+        on_move: Callable[[str, Pose, Client], None] | None = None,
+        on_light: Callable[[Light, Client], None] | None = None,
+        *,
+        cameras: tuple[Camera, ...] = (),
+        root: str = "",
     ) -> None:
-        self._server = server
+        self._server, self._root = server, root
         self._scene = server.scene
         self._library = library
         self._on_move = on_move
@@ -66,29 +75,36 @@ class SceneNodes:
         self._has_names = True
         self._has_gizmos = False
         self._light_requests: dict[str, tuple[bool, str]] = {}
-        self._has_lamp = True
-        self._add_room()
+        self._lamp_look = True, ""
+        self._shadows = ShadowNodes(self._scene, library, f"{root}/shadows")
+        self._add_pusher()
         self._add_light()
-        self._frustums = {camera.name: self._frustum(camera) for camera in default_cameras()}
+        self._frustums = {camera.name: self._frustum(camera) for camera in cameras}
 
     def show(self, record: SceneRecord | None) -> None:
         """Begin with a scene, or clear the table."""
-        names = () if record is None else record.state.names
+        self.begin(None if record is None else record.state)
+
+    def begin(self, state: SceneState | None) -> None:
+        """Begin with a state of any objects, or clear the table."""
+        names = () if state is None else state.names
         with self._lock:
             for name in set(self._bodies) - set(names):
                 for nodes in (self._bodies, self._labels, self._gizmos):
-                    nodes.pop(name).remove()
+                    if name in nodes:
+                        nodes.pop(name).remove()
             for name in names:
                 if name not in self._bodies:
                     self._add_object(name)
             self._grabbed.clear()
             self._is_light_held = False
-            self._pusher.visible = record is not None
-            self._ray.visible = self._has_lamp and record is not None
+            self._pusher.visible = state is not None
+            self._show_marker()
             for frustum in self._frustums.values():
                 frustum.image = None
-            if record is not None:
-                self.place(record.state)
+            self._shadows.show(None)
+            if state is not None:
+                self.place(state)
         self._on_change()
 
     def watch(self, on_change: Callable[[], None]) -> None:
@@ -114,7 +130,9 @@ class SceneNodes:
                 _put(self._pusher, state.pusher)
             if not self._is_light_held:
                 self._place_light(state.light.position)
-                _put(self._light_gizmo, state.light.position)
+                if self._light_gizmo is not None:
+                    _put(self._light_gizmo, AT * state.light.position)
+            self._draw_shadows()
         self._on_change()
 
     def show_frames(self, names: tuple[str, ...], images: np.ndarray) -> None:
@@ -147,11 +165,10 @@ class SceneNodes:
             self._light_requests[by] = is_on, name
             others = [request for request in self._light_requests.values() if request != (True, "")]
             is_on, name = max(others, default=(True, ""))
-            self._cube.visible = self._light_gizmo.visible = self._has_lamp = is_on
-            self._ray.visible = is_on and self._pusher.visible
-            self._cube.color = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
-            self._ray.colors = np.array(self._cube.color, np.uint8)
-            self._lamp_name.text, self._lamp_name.visible = name, is_on and bool(name)
+            self._lamp_look = is_on, name
+            if self._light_gizmo is not None:
+                self._light_gizmo.visible = is_on
+            self._show_marker()
 
     def show_names(self, is_on: bool) -> None:
         """Show or hide the objects' names."""
@@ -168,48 +185,30 @@ class SceneNodes:
                 for gizmo in self._gizmos.values():
                     gizmo.visible = is_on
 
-    def _add_room(self) -> None:
-        scene = self._scene
-        scene.set_up_direction("+z")
-        scene.configure_default_lights(False)
-        scene.configure_environment_map(None)
-        camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.up = VIEW_FROM, VIEW_AT, (0.0, 0.0, 1.0)
-        camera.fov = VIEW_FOV_RAD
-        camera.near, camera.far = 0.01, 20.0
-        scene.add_box(
-            "/table",
-            color=_colour(TABLE_ALBEDO),
-            dimensions=(TABLE_SIDE_M, TABLE_SIDE_M, TABLE_THICKNESS_M),
-            position=(0.0, 0.0, -TABLE_THICKNESS_M / 2),
-            cast_shadow=False,
-        )
-        corner = (0.06 - TABLE_SIDE_M / 2, 0.06 - TABLE_SIDE_M / 2, 0.002)
-        scene.add_frame("/axes", position=corner, axes_length=AXES_M, axes_radius=0.004, origin_radius=0.006)
-        for name, offset in (("x", (AXES_M, 0, 0)), ("y", (0, AXES_M, 0))):
-            scene.add_label(f"/axes/{name}", name, position=offset, font_screen_scale=0.8)
-        self._pusher = scene.add_cylinder(
-            "/pusher", radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, color=_colour(PUSHER_ALBEDO), visible=False
+    def _add_pusher(self) -> None:
+        self._pusher = self._scene.add_cylinder(
+            f"{self._root}/pusher",
+            radius=PUSHER_RADIUS_M,
+            height=PUSHER_HEIGHT_M,
+            color=colour_of(PUSHER_ALBEDO),
+            visible=False,
         )
 
     def _add_light(self) -> None:
         scene = self._scene
         start = (0.0, 0.0, 1.0)
+        root = self._root
         # three.js divides by pi what Lambert's law does not
-        scene.add_light_ambient("/ambient", intensity=float(np.pi * AMBIENT))
-        self._lamp = scene.add_light_directional(
-            "/lamp", intensity=float(np.pi * DIFFUSE), cast_shadow=True, position=start
-        )
-        cube = (LIGHT_CUBE_M, LIGHT_CUBE_M, LIGHT_CUBE_M)
-        self._cube = scene.add_box(
-            "/light", color=LIGHT_COLOUR, dimensions=cube, position=start, cast_shadow=False, receive_shadow=False
-        )
-        self._ray = scene.add_line_segments("/light_ray", _ray_from(np.array(start)), LIGHT_COLOUR, thickness=0.004)
-        self._lamp_name = scene.add_label(
-            "/light_name", "", position=start, visible=False, font_screen_scale=0.8, anchor="bottom-center"
-        )
-        self._light_gizmo = scene.add_transform_controls(
-            "/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
+        self._lamp = scene.add_light_directional(f"{root}/lamp", intensity=float(np.pi * DIFFUSE), position=start)
+        self._marker = LightMarker(scene, f"{root}/light", LIGHT_COLOUR)
+        self._place_light(np.array(start))
+        self._light_gizmo = None if self._on_light is None else self._add_light_handle(self._on_light, start)
+
+    def _add_light_handle(
+        self, on_light: Callable[[Light, Client], None], start: tuple[float, float, float]
+    ) -> viser.TransformControlsHandle:
+        gizmo = self._scene.add_transform_controls(
+            f"{self._root}/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
         )
 
         async def drag(event: viser.TransformControlsEvent) -> None:
@@ -218,15 +217,17 @@ class SceneNodes:
                 self._is_light_held = True
                 if light is not None:
                     self._place_light(light.position)
+                    self._draw_shadows()
                     self._on_change()
                 return
             self._is_light_held = False
             if light is not None:
                 self._place_light(light.position)
-                event.target.position = tuple(light.position)
-                self._on_light(light, event.client)
+                event.target.position = tuple(AT * light.position)
+                on_light(light, event.client)
 
-        self._light_gizmo.on_update(drag)
+        gizmo.on_update(drag)
+        return gizmo
 
     def _frustum(self, camera: Camera) -> viser.CameraFrustumHandle:
         pose = camera.T_world_camera
@@ -245,20 +246,26 @@ class SceneNodes:
 
     def _add_object(self, name: str) -> None:
         try:
-            body = self._scene.add_glb(f"/objects/{name}", self._library.viewer_glb(name))
+            body = self._scene.add_glb(f"{self._root}/objects/{name}", self._library.viewer_glb(name))
             self._sizes_m[name] = self._library.size_m(name)
             label = self._library.info(name).label
         except OsfError as error:  # removed or damaged since the scene was made: its name still shows where it is
             _log.warning("%s is not drawn: %s", name, error)
-            body, label = self._scene.add_frame(f"/objects/{name}", axes_length=0.05, axes_radius=0.002), name
+            body, label = (
+                self._scene.add_frame(f"{self._root}/objects/{name}", axes_length=0.05, axes_radius=0.002),
+                name,
+            )
         self._bodies[name] = body
         self._labels[name] = self._scene.add_label(
-            f"/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
+            f"{self._root}/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
         )
+        if self._on_move is not None:
+            self._gizmos[name] = self._add_handle(name, self._on_move)
+
+    def _add_handle(self, name: str, on_move: Callable[[str, Pose, Client], None]) -> viser.TransformControlsHandle:
         gizmo = self._scene.add_transform_controls(
-            f"/handles/{name}", scale=0.12, visible=self._has_gizmos, depth_test=False
+            f"{self._root}/handles/{name}", scale=0.12, visible=self._has_gizmos, depth_test=False
         )
-        self._gizmos[name] = gizmo
 
         async def drag(event: viser.TransformControlsEvent) -> None:
             body = self._bodies.get(name)
@@ -268,12 +275,14 @@ class SceneNodes:
             turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
             pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
             self._follow(name, pose)
+            self._draw_shadows()
             self._on_change()
             if event.phase == "end":
                 self._grabbed.pop(name, None)
-                self._on_move(name, pose, event.client)
+                on_move(name, pose, event.client)
 
         gizmo.on_update(drag)
+        return gizmo
 
     def _follow(self, name: str, pose: Pose) -> None:
         body, label = self._bodies.get(name), self._labels.get(name)
@@ -285,22 +294,25 @@ class SceneNodes:
 
     def _place_object(self, name: str, pose: Pose) -> None:
         self._follow(name, pose)
-        _put(self._gizmos[name], pose.position, NO_TURN)
+        if name in self._gizmos:
+            _put(self._gizmos[name], pose.position, NO_TURN)
+
+    def _draw_shadows(self) -> None:
+        if self._bodies:
+            self._shadows.show(self.state())
 
     def _place_light(self, position: np.ndarray) -> None:
-        _put(self._cube, position)
         _put(self._lamp, position)
-        _put(self._lamp_name, position)
-        self._ray.points = _ray_from(position)
+        self._marker.place(position)
+
+    def _show_marker(self) -> None:
+        is_on, name = self._lamp_look
+        colour = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
+        self._marker.show(is_on=is_on, has_ray=self._pusher.visible, text=name, colour=colour)
 
 
 def _nothing() -> None:
     """The callback until `watch` is called."""
-
-
-def _ray_from(position: np.ndarray) -> np.ndarray:
-    """A stretch of the line along which the light falls, so that a light outside the view can be found."""
-    return np.stack([0.55 * position, position])[None].astype(np.float32)
 
 
 def light_toward(position: np.ndarray) -> Light | None:
@@ -317,8 +329,3 @@ def _put(node: viser.SceneNodeHandle, position: np.ndarray, quaternion: np.ndarr
         node.position = np.asarray(position, float)
     if quaternion is not None and np.abs(np.asarray(node.wxyz) - quaternion).max() > _STILL:
         node.wxyz = np.asarray(quaternion, float)
-
-
-def _colour(albedo: tuple[float, float, float]) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * channel) for channel in albedo)
-    return red, green, blue

@@ -90,7 +90,7 @@ class ClientView:
             depth = np.where(depth > 0, depth + np.float32(_BEHIND_M), np.float32(_NOTHING_M))
         quality = _JPEG_QUALITY[is_sharp]
         self.client.scene.set_background_image(picture.image, "jpeg", jpeg_quality=quality, depth=depth)
-        self._hide({"/table", "/pusher", *(f"/objects/{name}" for name in names)})
+        self._hide({"/table", "/pusher", "/shadows", *(f"/objects/{name}" for name in names)})
         self._stop_waiting()
         self._is_clear = False
 

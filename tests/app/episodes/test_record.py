@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
+from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
 from app.episodes.frames import HEIGHT, WIDTH, part_of, read_frame
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import SimulatedTable
@@ -191,7 +191,8 @@ def test_whatever_is_broken_off_has_left_every_step_until_then(told):
         assert len(list((told.out / FRAMES_FOLDER).iterdir())) == number
         told.act(record, number)
         told.step(record, number, {"estimate": 0.5})
-    assert {path.name for path in told.out.iterdir()} == {REPORT_FILE, CSV_FILE, GOAL_FILE, FRAMES_FOLDER}
+    files = {REPORT_FILE, CSV_FILE, GOAL_FILE, TRAJECTORY_FILE, FRAMES_FOLDER}
+    assert {path.name for path in told.out.iterdir()} == files
 
 
 def test_what_is_noticed_is_in_the_file_at_once(told):

@@ -10,6 +10,7 @@ import pytest
 import viser
 from viser._gui_handles import GuiProgressBarHandle
 
+from app.viewer.nodes.light_marker import AT
 from app.viewer.private_server import PrivateViser
 from tests.app.conftest import until
 
@@ -110,7 +111,7 @@ class ViewerDriver:
         """Whether everything on the table is where a scene of the REST interface says."""
         objects = {o["name"]: o for o in scene["objects"]}
         light = scene["light"]["position"]
-        places = {"/pusher": scene["pusher"]["position"], "/light": light, "/lamp": light}
+        places = {"/pusher": scene["pusher"]["position"], "/light": AT * np.array(light), "/lamp": light}
         places |= {f"/objects/{name}": o["position"] for name, o in objects.items()}
         return (
             self.below("/objects") == set(objects)

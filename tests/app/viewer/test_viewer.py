@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from app.jobs.job import JobChanged, JobView
-from app.viewer.nodes.scene_nodes import VIEW_FROM
+from app.viewer.nodes.room import VIEW_FROM
 from app.viewer.private_server import PrivateViser
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M
 from tests.app.conftest import until

@@ -3,6 +3,7 @@ import pytest
 
 from app.processes.plan_summary import PlanSketch
 from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeNodes, cost_colours
+from app.viewer.nodes.light_marker import AT
 from osfcore.control.events import Look, Looking
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
@@ -109,7 +110,7 @@ def test_estimates_follow_without_words_and_doubted_objects_have_another_colour(
     assert not driver.shows(f"/episode/estimate/tried/{BOX}")
     assert not np.array_equal(before.batched_colors, guess(driver, CAN).batched_colors)
     assert driver.below(f"/episode/estimate/verdict/{BOX}") == set()
-    np.testing.assert_allclose(driver.node("/episode/estimate/light").position, LIGHT.position)
+    np.testing.assert_allclose(driver.node("/episode/estimate/light").position, AT * LIGHT.position)
 
 
 def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(drawing, driver):

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from app.viewer.nodes.estimate_nodes import GHOSTS, EstimateNodes
+from app.viewer.nodes.light_marker import AT
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -73,8 +74,8 @@ def test_the_guess_and_its_light_follow_and_what_was_not_looked_for_is_hidden(dr
     assert driver.shows(f"/estimate/guess/{BOX}")
     np.testing.assert_allclose(guess(driver).batched_positions, [[0.1, -0.05, 0.1]], rtol=1e-6)
     cube, label = driver.node("/estimate/light"), driver.node("/estimate/light_name")
-    np.testing.assert_allclose(cube.position, LIGHT.position)
-    np.testing.assert_allclose(label.position, LIGHT.position)
+    np.testing.assert_allclose(cube.position, AT * LIGHT.position)
+    np.testing.assert_allclose(label.position, AT * LIGHT.position)
     assert label.text == "guessed light"
 
 
@@ -83,7 +84,7 @@ def test_lights_that_are_tried_are_drawn_while_there_are_any(drawing, driver):
     drawing.show(step(lights=lights))
     assert driver.shows("/estimate/tried_lights")
     places = driver.node("/estimate/tried_lights").batched_positions
-    assert {tuple(p) for p in places} == {tuple(p) for p in lights.astype(np.float32)}
+    assert {tuple(p) for p in places} == {tuple(p) for p in (AT * lights).astype(np.float32)}
     drawing.show(step())
     assert not driver.shows("/estimate/tried_lights")
 

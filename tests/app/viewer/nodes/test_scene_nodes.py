@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.viewer.nodes.light_marker import AT
 from app.viewer.nodes.scene_nodes import SceneNodes, light_toward
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import quaternion_multiply
@@ -85,20 +86,20 @@ def table(server, library):
 
 def test_the_lamp_can_be_hidden_or_named_and_still_follows(table, driver):
     table.show(record())
-    own = tuple(driver.node("/light").color)
+    own = tuple(driver.node("/light").colors)
     table.show_lamp(is_on=False)
     assert not any(driver.shows(path) for path in ("/light", "/light_ray", "/light_handle"))
     light = Light(np.array([0.0, -0.6, 0.8]))
     table.place(replace(record().state, light=light))
-    np.testing.assert_allclose(driver.node("/light").position, light.position)
+    np.testing.assert_allclose(driver.node("/light").position, AT * light.position)
     table.show_lamp(is_on=True, name="true light")
     assert driver.shows("/light")
     assert driver.shows("/light_ray")
-    assert tuple(driver.node("/light").color) != own
+    assert tuple(driver.node("/light").colors) != own
     assert driver.node("/light_name").text == "true light"
-    np.testing.assert_allclose(driver.node("/light_name").position, light.position)
+    np.testing.assert_allclose(driver.node("/light_name").position, AT * light.position)
     table.show_lamp(is_on=True)
-    assert tuple(driver.node("/light").color) == own
+    assert tuple(driver.node("/light").colors) == own
     assert not driver.shows("/light_name")
 
 

@@ -122,7 +122,7 @@ def test_the_true_light_is_told_on_demand_only_and_is_back_when_the_estimate_is_
     until(lambda: room.gui.shows("/light"))
     assert room.gui.shows("/light_name")
     assert room.gui.node("/light_name").text == "true light"
-    assert tuple(room.gui.node("/light").color) != tuple(room.gui.node("/estimate/light").color)
+    assert tuple(room.gui.node("/light").colors) != tuple(room.gui.node("/estimate/light").colors)
     room.panel.show(JobChanged(1, job("cancelled")))
     until(lambda: room.drawing.is_empty)
     until(lambda: not room.gui.shows("/light_name"))

@@ -135,7 +135,7 @@ def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, br
     assert [order.is_sharp for order in orders] == [False, True, True]
     assert {order.key for order in orders} == {"view-7"}
     until(lambda: len(browser.pictures) == 3)
-    assert browser.hides() == {"/table", "/pusher", f"/objects/{A}", f"/objects/{B}"}
+    assert browser.hides() == {"/table", "/pusher", "/shadows", f"/objects/{A}", f"/objects/{B}"}
     image, depth = browser.pictures[-1]
     assert image.shape == (480, 720, 3)
     assert (depth == 100).all()  # a picture of nothing hides nothing
@@ -177,7 +177,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
     order = room.renderer.answer(0)
     assert order.state.names == (B,)
     np.testing.assert_allclose(order.state.poses.position, [[0.1, 0, 0.1]])
-    until(lambda: browser.hides() == {"/table", "/pusher", f"/objects/{B}"})
+    until(lambda: browser.hides() == {"/table", "/pusher", "/shadows", f"/objects/{B}"})
     assert browser.note.visible
     assert browser.note.value == A
     assert A in browser.notifications[0].body

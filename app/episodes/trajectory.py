@@ -1,0 +1,242 @@
+"""The course of an episode, dense enough to be drawn again: what was looked at, believed, planned and done.
+
+A report says what each round came to; this says what was on view meanwhile. It is one compressed `.npz` of float32
+arrays, some ten kilobytes a round, written anew after each round so that an episode can be looked through as it runs.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from app.processes.plan_summary import PlanSketch
+from osfcore.errors import CorruptFile
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+from osfcore.io.files import write_atomically
+
+LookAt = Literal["first", "goal"]
+LOOKS: tuple[LookAt, ...] = ("first", "goal")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LookFrame:
+    """An estimator at work on the first frame or on the goal image, at one moment.
+
+    Attributes:
+        look: which of the two.
+        done: share of the work that was done, from 0 to 1.
+        loss: of the whole, in units of its stage; NaN where there is none.
+        state: the best scene so far.
+        candidates: poses that were tried for each object, a (C, N) batch; none is C = 0.
+    """
+
+    look: LookAt
+    done: float
+    loss: float
+    state: SceneState
+    candidates: Pose
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Round:
+    """A round of the loop, or how it was before the first.
+
+    Attributes:
+        action: executed before its end.
+        estimate: at its end.
+        plan: that its actions followed; None before the first round, and where nothing was planned.
+    """
+
+    action: int
+    estimate: EstimatedState
+    plan: PlanSketch | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trajectory:
+    """The course of an episode so far.
+
+    Attributes:
+        states: true ones, at the beginning and after each action of 0.2 s.
+        goal: poses where everything should be, in the order of the states' objects; None until they are known.
+        looks: at first frame and goal image, in the order in which they came.
+        rounds: in the order in which they came.
+    """
+
+    states: tuple[SceneState, ...]
+    goal: Pose | None
+    looks: tuple[LookFrame, ...]
+    rounds: tuple[Round, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the objects."""
+        return self.states[0].names
+
+
+# The file
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory; the file appears only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    data = io.BytesIO()
+    np.savez_compressed(data, **_arrays(trajectory))  # pyright: ignore[reportArgumentType]
+    write_atomically(path, data.getvalue())
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """The trajectory in a file.
+
+    Raises:
+        CorruptFile: if it cannot be read or holds something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return _trajectory(dict(arrays))
+    except OSError as error:
+        raise CorruptFile(path, error.strerror or str(error)) from error
+    except (ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
+        raise CorruptFile(path, "it does not hold the course of an episode") from error
+
+
+def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    states, looks, rounds = trajectory.states, trajectory.looks, trajectory.rounds
+    plans = [round_.plan for round_ in rounds if round_.plan is not None]
+    arrays = {
+        "names": np.array(trajectory.names),
+        **_states("states", states),
+        "looks/which": np.array([LOOKS.index(look.look) for look in looks], np.int8),
+        "looks/progress": np.array([(look.done, look.loss) for look in looks], np.float32).reshape(-1, 2),
+        **_states("looks", [look.state for look in looks]),
+        "looks/tried": np.array([len(look.candidates.position) for look in looks], np.int32),
+        "looks/candidates": _poses([look.candidates for look in looks], len(trajectory.names)),
+        "rounds/action": np.array([round_.action for round_ in rounds], np.int32),
+        **_states("rounds", [round_.estimate.state for round_ in rounds]),
+        "rounds/doubted": np.array([[bool(doubt) for doubt in round_.estimate.doubts] for round_ in rounds]),
+        "rounds/has_plan": np.array([round_.plan is not None for round_ in rounds], bool),
+        "plans/horizon": np.array([len(plan.best.pusher[0]) for plan in plans], np.int32),
+        "plans/ways": _stacked([plan.ways.reshape(-1, 2) for plan in plans], 2),
+        "plans/costs": np.concatenate([plan.costs for plan in plans] or [np.zeros(0)]).astype(np.float32),
+        "plans/count": np.array([len(plan.costs) for plan in plans], np.int32),
+        "plans/best": _poses(
+            [Pose(plan.best.positions[0], plan.best.quaternions[0]) for plan in plans], len(trajectory.names)
+        ),
+        "plans/pusher": _stacked([plan.best.pusher[0] for plan in plans], 3),
+    }
+    if trajectory.goal is not None:
+        arrays["goal"] = np.concatenate([trajectory.goal.position, trajectory.goal.quaternion], axis=1)
+    return {name: _small(name, array) for name, array in arrays.items()}
+
+
+def _trajectory(arrays: Mapping[str, np.ndarray]) -> Trajectory:
+    names = tuple(str(name) for name in arrays["names"])
+    states = _read_states(names, "states", arrays)
+    if not states:
+        raise ValueError("no states")
+    goal = arrays.get("goal")
+    return Trajectory(
+        tuple(states),
+        None if goal is None else Pose(goal[:, :3].astype(float), goal[:, 3:].astype(float)),
+        tuple(_read_looks(names, arrays)),
+        tuple(_read_rounds(names, arrays)),
+    )
+
+
+def _states(prefix: str, states: Sequence[SceneState]) -> dict[str, np.ndarray]:
+    count = len(states[0].names) if states else 0
+    poses = [np.concatenate([state.poses.position, state.poses.quaternion], axis=1) for state in states]
+    nowhere = np.full(3, np.nan)
+    return {
+        f"{prefix}/poses": np.array(poses).reshape(len(states), count, 7),
+        f"{prefix}/light": np.array([state.light.position for state in states]).reshape(-1, 3),
+        f"{prefix}/pusher": np.array([nowhere if s.pusher is None else s.pusher for s in states]).reshape(-1, 3),
+    }
+
+
+def _read_states(names: tuple[str, ...], prefix: str, arrays: Mapping[str, np.ndarray]) -> list[SceneState]:
+    rows = zip(arrays[f"{prefix}/poses"], arrays[f"{prefix}/light"], arrays[f"{prefix}/pusher"], strict=True)
+    return [
+        SceneState(
+            names,
+            Pose(poses[:, :3].astype(float), poses[:, 3:].astype(float)),
+            Light(light.astype(float)),
+            None if np.isnan(pusher).any() else pusher.astype(float),
+        )
+        for poses, light, pusher in rows
+    ]
+
+
+def _read_looks(names: tuple[str, ...], arrays: Mapping[str, np.ndarray]) -> list[LookFrame]:
+    tried = _split(arrays["looks/candidates"], arrays["looks/tried"])
+    states = _read_states(names, "looks", arrays)
+    rows = zip(arrays["looks/which"], arrays["looks/progress"], states, tried, strict=True)
+    return [
+        LookFrame(LOOKS[which], float(done), float(loss), state, Pose(poses[..., :3], poses[..., 3:]))
+        for which, (done, loss), state, poses in rows
+    ]
+
+
+def _read_rounds(names: tuple[str, ...], arrays: Mapping[str, np.ndarray]) -> list[Round]:
+    plans = iter(_read_plans(names, arrays))
+    states = _read_states(names, "rounds", arrays)
+    none = np.zeros(len(names))
+    rounds = []
+    for action, state, doubted, has_plan in zip(
+        arrays["rounds/action"], states, arrays["rounds/doubted"], arrays["rounds/has_plan"], strict=True
+    ):
+        doubts = tuple("doubtful" if is_doubted else "" for is_doubted in doubted)
+        estimate = EstimatedState(state, none, none, 0.0, doubts, "")
+        rounds.append(Round(int(action), estimate, next(plans) if has_plan else None))
+    return rounds
+
+
+def _read_plans(names: tuple[str, ...], arrays: Mapping[str, np.ndarray]) -> list[PlanSketch]:
+    horizons, counts = arrays["plans/horizon"], arrays["plans/count"]
+    best, pusher = _split(arrays["plans/best"], horizons), _split(arrays["plans/pusher"], horizons)
+    ways = _split(arrays["plans/ways"], horizons * counts)
+    costs = _split(arrays["plans/costs"], counts)
+    return [
+        PlanSketch(
+            0,
+            way.reshape(len(cost), -1, 2),
+            cost,
+            Rollouts(names, poses[None, ..., :3], poses[None, ..., 3:], hand[None]),
+        )
+        for way, cost, poses, hand in zip(ways, costs, best, pusher, strict=True)
+    ]
+
+
+def _poses(batches: Sequence[Pose], count: int) -> Float[np.ndarray, "R N 7"]:
+    return _stacked([np.concatenate([p.position, p.quaternion], axis=-1).reshape(-1, count * 7) for p in batches],
+                    count * 7).reshape(-1, count, 7)  # fmt: skip
+
+
+def _stacked(parts: Sequence[np.ndarray], width: int) -> Float[np.ndarray, "R width"]:
+    return np.concatenate([*parts, np.zeros((0, width))]).astype(np.float32)
+
+
+def _split(rows: np.ndarray, lengths: Int[np.ndarray, "P"]) -> list[np.ndarray]:
+    """Rows in pieces of the lengths that are given; refused unless they add up."""
+    if lengths.sum() != len(rows) or np.any(lengths < 0):
+        raise ValueError("lengths do not add up")
+    return np.split(rows, np.cumsum(lengths)[:-1]) if len(lengths) else []
+
+
+def _small(name: str, array: np.ndarray) -> np.ndarray:
+    """In single precision, but for lights: rounded, one that is as low as may be would be too low."""
+    return array.astype(np.float32) if array.dtype == np.float64 and not name.endswith("/light") else array

@@ -1,0 +1,118 @@
+"""Making the stories: each example is run as an episode, and what is worth shipping of it is kept, in small files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from app.episodes.file_names import FRAMES_FOLDER, PREPARED_FILE, REPORT_FILE, TRAJECTORY_FILE
+from app.episodes.frames import TILE_PX, Part, part_of, read_frames
+from app.episodes.headless import EpisodeStep, run_episode
+from app.episodes.replay_clock import LOOK_S, ReplayClock
+from app.episodes.request import EpisodeOrder
+from app.episodes.trajectory import read_trajectory
+from app.services.goals import GOAL_SIDE
+from app.services.presets import Preset
+from app.services.stories import STORY_FILE, as_mapping
+from osfcore.control.events import GoalFound, Observed, Stepped
+from osfcore.control.goal import GoalImage
+from osfcore.control.prepared_look import PreparedLook, PreparedLooks, prepared_to_json
+from osfcore.control.scene_models import load_scene_models
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import Observation
+from osfcore.io.files import read_json, write_atomically, write_json
+from osfcore.objects.asset_library import AssetLibrary
+
+_QUALITY = 82  # of WebP
+
+
+def record_story(preset: Preset, data_dir: Path, out: Path) -> Iterator[EpisodeStep]:
+    """Run an example and keep its story.
+
+    Args:
+        preset: the example.
+        data_dir: where fetched objects are.
+        out: folder of the story; the episode itself is left in `episode` beside it until the story is there.
+
+    Raises:
+        OsfError: if objects are missing, or the disk refuses.
+    """
+    folder = out / ".episode"
+    order = EpisodeOrder(
+        folder, data_dir, preset.objects, seed=preset.seed, moved=preset.moved, light=preset.light,
+        goal_seed=preset.goal_seed, goal_light=preset.goal_light, goal_side=GOAL_SIDE,
+    )  # fmt: skip
+    seen: Observation | None = None
+    goal: GoalFound | None = None
+    first: EstimatedState | None = None
+    report: dict[str, Any] = {}
+    for step in run_episode(order):
+        match step.event:
+            case Observed(0, observation):
+                seen = observation
+            case GoalFound():
+                goal = step.event
+            case Stepped(0, _, estimate):
+                first = estimate
+            case _:
+                pass
+        report = step.report or report
+        yield step
+    assert seen is not None and goal is not None and first is not None, "every episode begins so"  # noqa: PT018
+    prepared = _prepared(order, seen, first, goal)
+    write_json(out / PREPARED_FILE, prepared_to_json(prepared))
+    _write_pictures(folder, out)
+    shutil.copyfile(folder / TRAJECTORY_FILE, out / TRAJECTORY_FILE)
+    write_json(out / STORY_FILE, _told(preset, read_json(folder / REPORT_FILE, as_mapping), out / TRAJECTORY_FILE))
+    shutil.rmtree(folder)
+
+
+def _prepared(order: EpisodeOrder, seen: Observation, first: EstimatedState, goal: GoalFound) -> PreparedLooks:
+    assert goal.estimate is not None, "the goal of an example is an image"
+    fields, assets = FieldLibrary(order.data_dir), AssetLibrary(order.data_dir / "objects")
+    models = load_scene_models(seen.names, fields, assets, order.data_dir, order.device).appearance
+    image = GoalImage(goal.camera, goal.image).observed(seen.names)
+    return PreparedLooks(PreparedLook.of(models, seen, first), PreparedLook.of(models, image, goal.estimate))
+
+
+def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str, Any]:
+    """What the page tells; lengths in mm, angles in degrees, times in seconds of the replay."""
+    course, steps = read_trajectory(trajectory), report["steps"]
+    clock = ReplayClock(course)
+    estimated, true = course.rounds[0].estimate.state.light.position, course.states[0].light.position
+    light_deg = np.rad2deg(np.arccos(np.clip(estimated @ true, -1, 1)))
+    return {
+        "name": preset.id,
+        "title": preset.title,
+        "text": preset.text,
+        "objects": list(course.names),
+        "moved": report["moved"],
+        "goal_look_s": LOOK_S["first"],
+        "step_s": [round(at_s, 3) for at_s in clock.step_s],
+        "left_mm": [{name: step["truly_to_goal_mm"][name] for name in course.names} for step in steps],
+        "pushes": report["steps_done"],
+        "took_s": report["seconds"],
+        "light_off_deg": round(float(light_deg), 2),
+        "outcome": report["outcome"],
+    }
+
+
+def _write_pictures(folder: Path, out: Path) -> None:
+    """The goal, and what the goal camera saw after each round below each other."""
+    frames = list(read_frames(folder / FRAMES_FOLDER))
+    tiles: dict[str, list[UInt8[np.ndarray, "h w 3"]]] = {}
+    parts: tuple[Part, ...] = ("goal", "now")
+    for part in parts:
+        tiles[part] = [part_of(frame, part) for frame in (frames[:1] if part == "goal" else frames)]
+    for part, images in tiles.items():
+        strip = np.concatenate([image[:TILE_PX, :TILE_PX] for image in images])
+        path = out / f"{part}.webp"
+        Image.fromarray(strip).save(path, "WEBP", quality=_QUALITY, method=6)
+        write_atomically(path, path.read_bytes())

@@ -1,0 +1,160 @@
+"""What the 3D view shows in one page: the live table, or an episode in its place, as scrubbed and played there.
+
+A page calls itself something, opens the view under that name, and asks for what it wants to see; other pages are not
+concerned. What was asked for outlives a reload of the view, and a view that opens later than it was asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import viser
+
+from app.episodes.trajectory import read_trajectory
+from app.viewer.panels.panel import Panel
+from app.viewer.replay_nodes import ReplayNodes
+from osfcore.errors import OsfError
+from osfcore.objects.asset_library import AssetLibrary
+
+DRAW_INTERVAL_S = 0.04
+_MOST_PAGES = 200  # that are remembered; those that asked longest ago are forgotten
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """An episode on view in place of the live table.
+
+    Attributes:
+        trajectory: its file.
+        at_s: the moment to show [s].
+        plays: whether it goes on from there.
+        speed: of going on; 1 is real time.
+    """
+
+    trajectory: Path
+    at_s: float = 0.0
+    plays: bool = False
+    speed: float = 1.0
+
+
+@dataclass(slots=True)
+class _Page:
+    """A page's wish, and what its view shows of it.
+
+    Attributes:
+        wish: what it has asked for; None for the live table.
+        since: when it asked, by the monotonic clock [s].
+        client: the browser's view, once it is open.
+        nodes: that replay.
+        shown: the file that they replay, and when it was last written.
+        is_due: whether there is something to draw.
+    """
+
+    wish: Replay | None = None
+    since: float = 0.0
+    client: viser.ClientHandle | None = None
+    nodes: ReplayNodes | None = None
+    shown: tuple[Path, int] | None = None
+    is_due: bool = False
+
+
+class PageViews(Panel):
+    """The views of all pages, and the thread that draws in them.
+
+    Args:
+        library: meshes of the objects.
+        page_of: what the page calls itself in which a browser shows the view, by its number.
+    """
+
+    def __init__(self, library: AssetLibrary, page_of: Callable[[int], str | None]) -> None:
+        super().__init__("page-views", DRAW_INTERVAL_S)
+        self._library = library
+        self._page_of = page_of
+        self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, but for what is drawn
+
+    def ask(self, page: str, wish: Replay | None) -> bool:
+        """Show an episode in a page's view, or the live table; tells whether the view is open. Any thread may call.
+
+        Raises:
+            CorruptFile: if the trajectory cannot be read; then nothing changes.
+        """
+        if wish is not None:
+            read_trajectory(wish.trajectory)
+        with self._thread.changed:
+            known = self._pages.setdefault(page, _Page())
+            self._pages.move_to_end(page)
+            known.wish, known.since, known.is_due = wish, time.monotonic(), True
+            idle = [name for name, one in self._pages.items() if one.client is None]
+            for name in idle[: max(len(self._pages) - _MOST_PAGES, 0)]:
+                del self._pages[name]
+            self._thread.wake()
+            return known.client is not None
+
+    def add_client(self, client: viser.ClientHandle) -> None:
+        """A browser has opened the view of a page, perhaps once more."""
+        page = self._page_of(client.client_id)
+        if page is None:
+            return
+        with self._thread.changed:
+            known = self._pages.setdefault(page, _Page())
+            known.client, known.nodes, known.shown = client, None, None
+            known.is_due = known.wish is not None
+            self._thread.wake()
+
+    def remove_client(self, client: viser.ClientHandle) -> None:
+        """A browser has closed it."""
+        with self._thread.changed:
+            for known in self._pages.values():
+                if known.client is client:
+                    known.client = known.nodes = known.shown = None
+
+    def _store(self, event: object) -> bool:
+        return False  # wishes come by `ask`
+
+    def _draw(self) -> None:
+        with self._thread.changed:
+            due = [(name, page) for name, page in self._pages.items() if page.is_due and page.client is not None]
+            for _, page in due:
+                page.is_due = False
+        for name, page in due:
+            try:
+                self._draw_page(page)
+            except Exception as error:  # a browser that has just left, or a defect: the others get their pictures
+                (_log.info if isinstance(error, OsfError) else _log.exception)("the view of %s failed", name)
+
+    def _draw_page(self, page: _Page) -> None:
+        wish, client, now = page.wish, page.client, time.monotonic()
+        if client is None:
+            return
+        if wish is None:
+            if page.nodes is not None:
+                page.nodes.remove()
+            page.nodes = page.shown = None
+            return
+        nodes = self._opened(page, wish, client)
+        played_s = wish.speed * (now - page.since) if wish.plays else 0.0
+        with client.atomic():
+            nodes.at(wish.at_s + played_s)
+        client.flush()
+        if wish.plays and wish.at_s + played_s < nodes.clock.length_s:
+            with self._thread.changed:
+                page.is_due = True
+                self._thread.wake(DRAW_INTERVAL_S)
+
+    def _opened(self, page: _Page, wish: Replay, client: viser.ClientHandle) -> ReplayNodes:
+        """The nodes for a wish; an episode that goes on is read again once there is more of it."""
+        version = wish.trajectory, wish.trajectory.stat().st_mtime_ns
+        if page.nodes is None or page.shown is None or page.shown[0] != wish.trajectory:
+            if page.nodes is not None:
+                page.nodes.remove()
+            page.nodes = ReplayNodes(client, self._library, read_trajectory(wish.trajectory))
+        elif page.shown != version:
+            page.nodes.follow(read_trajectory(wish.trajectory))
+        page.shown = version
+        return page.nodes

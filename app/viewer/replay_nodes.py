@@ -1,0 +1,112 @@
+"""The nodes that replay an episode in the 3D view of one browser, in place of the live table."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+import viser
+
+from app.episodes.replay_clock import Moment, ReplayClock
+from app.episodes.trajectory import LookFrame, Round, Trajectory
+from app.viewer.nodes.episode_nodes import EpisodeNodes
+from app.viewer.nodes.ghosts import pose_at
+from app.viewer.nodes.scene_nodes import LIVE_NODES, SceneNodes
+from osfcore.control.events import Looking
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.planning.pose_cost import PoseGoal
+from osfcore.progress import Progress
+
+ROOT = "/replay"
+
+
+class ReplayNodes:
+    """What one browser sees of a trajectory; the others go on seeing the live table. One thread at a time.
+
+    Args:
+        client: the browser.
+        library: meshes of the objects.
+        trajectory: of the episode, perhaps of one that goes on.
+    """
+
+    def __init__(self, client: viser.ClientHandle, library: AssetLibrary, trajectory: Trajectory) -> None:
+        self._client = client
+        # Invisible nodes of a browser's own take the places of those that all browsers see, with all below them.
+        self._hidden = [client.scene.add_frame(path, show_axes=False, visible=False) for path in LIVE_NODES]
+        self._root = client.scene.add_frame(ROOT, show_axes=False)
+        self._table = SceneNodes(client, library, root=ROOT)
+        self._episode = EpisodeNodes(client, library, self._table.has, root=f"{ROOT}/episode")
+        self._table.begin(trajectory.states[0])
+        self.follow(trajectory)
+
+    @property
+    def clock(self) -> ReplayClock:
+        """When what is on view."""
+        return self._clock
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Replay a longer trajectory of the same episode from now on."""
+        self._trajectory, self._clock = trajectory, ReplayClock(trajectory)
+        self._shown = Moment(-1.0)
+
+    def at(self, at_s: float) -> None:
+        """Show a moment [s]."""
+        moment, before = self._clock.moment(at_s), self._shown
+        if moment.action != before.action:
+            self._table.place(self._state(moment.action))
+        if moment.look is not before.look:
+            self._show_look(moment.look)
+        if moment.estimate is not before.estimate:
+            self._show_estimate(moment.estimate)
+        if moment.plan is not before.plan:
+            self._episode.show_plan(None if moment.plan is None else moment.plan.plan)
+        if moment.plan is not None:
+            self._episode.play_to(moment.planned)
+        self._shown = moment
+
+    def remove(self) -> None:
+        """Back to the live table."""
+        self._root.remove()
+        for node in self._hidden:
+            node.remove()
+
+    def _state(self, action: float) -> SceneState:
+        """The true state after some actions; in between, on the way."""
+        states = self._trajectory.states
+        number = min(max(bisect_right(range(len(states)), action) - 1, 0), len(states) - 1)
+        first, then = states[number], states[min(number + 1, len(states) - 1)]
+        share = action - number
+        pairs = [
+            Pose(np.stack([a, b]), np.stack([p, q]))
+            for a, b, p, q in zip(
+                first.poses.position, then.poses.position, first.poses.quaternion, then.poses.quaternion, strict=True
+            )
+        ]
+        between = [pose_at(pair, share) for pair in pairs]
+        poses = Pose(np.array([p.position for p in between]), np.array([p.quaternion for p in between]))
+        pusher = first.pusher
+        if first.pusher is not None and then.pusher is not None:
+            pusher = first.pusher + share * (then.pusher - first.pusher)
+        return SceneState(first.names, poses, first.light, pusher)
+
+    def _show_look(self, look: LookFrame | None) -> None:
+        if look is None:
+            self._episode.show_goal(self._goal())
+            return
+        if look.look == "first":
+            self._episode.show_goal(None)
+        candidates = look.candidates if len(look.candidates.position) else None
+        step = EstimateStep(Progress(0, 1, ""), "done", look.state, candidates)
+        self._episode.show_look(Looking(0, look.look, step))
+
+    def _show_estimate(self, round_: Round | None) -> None:
+        self._episode.show_estimate(None if round_ is None else round_.estimate)
+        if round_ is not None:
+            self._episode.show_goal(self._goal())
+
+    def _goal(self) -> PoseGoal | None:
+        goal = self._trajectory.goal
+        return None if goal is None else PoseGoal(self._trajectory.names, goal)

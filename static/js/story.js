@@ -1,0 +1,168 @@
+// What this is, shown before anybody clicks: a recorded episode in the 3D view, its goal, its table, and how far it is.
+import { get, post } from "./api.js";
+import { svg } from "./curves.js";
+import { byId, whileDisabled } from "./dom.js";
+import { startEpisode } from "./episode.js";
+import { COLOURS } from "./curves.js";
+import { takeGoal } from "./goals.js";
+import { LIVE } from "./jobs.js";
+import { refreshScenes } from "./scenes.js";
+import { known, labelOf, set, watch } from "./state.js";
+import { showTab } from "./tabs.js";
+import { tellFailure } from "./toasts.js";
+import { isViewerShown, replayStory, showLive } from "./viewer.js";
+
+const TICK_MS = 80;
+const LENGTH_S = 11; // of a story; its replay is played as much faster as that takes
+const REST_S = 4; // at its end
+const ROUNDS = 2; // of all stories, then the last one rests: an open page at rest costs nothing
+const WAIT_MS = 300;
+const SEEN = "osf-story-seen";
+const [WIDTH, HEIGHT] = [300, 64];
+
+let stories = [];
+let number = 0; // of the one that plays, counted through all rounds
+let timer = 0;
+let since = 0;
+let isOn = false;
+
+const story = () => stories[number % stories.length];
+const speed = () => Math.max(story().step_s.at(-1) / LENGTH_S, 1);
+const farthest = (left) => Math.max(...Object.values(left));
+const distance = (mm) => (mm < 10 ? `${mm.toFixed(1)} mm` : `${(mm / 10).toFixed(1)} cm`);
+
+// Drawing
+
+function stageAt(at, step) {
+  const { goal_look_s: goalLook, step_s: times, left_mm: left, pushes, took_s: took, light_off_deg: off } = story();
+  if (at < goalLook) return "Four cameras look: which pose of each object, and which lamp, explain what they see?";
+  if (at < times[0]) return `Lamp found to ${off.toFixed(1)}°. Now the photo: where should everything be?`;
+  if (step < times.length - 1) return `Push ${step + 1} of ${pushes}: purple is the plan, golden is the goal, wires are what it believes`;
+  return `${distance(farthest(left[0]))} to ${distance(farthest(left.at(-1)))} in ${pushes} pushes; it took ${took.toFixed(0)} s on two CPU cores`;
+}
+
+function drawCurve(at) {
+  const { objects, step_s: times, left_mm: left } = story();
+  const end = times.at(-1);
+  const most = Math.max(...left.map(farthest), 1);
+  const shown = times.filter((time) => time <= at).length;
+  const lines = objects.map((name, i) => {
+    const points = left.slice(0, Math.max(shown, 1)).map((mm, k) => `${((WIDTH * times[k]) / end).toFixed(1)},${(HEIGHT - (HEIGHT - 4) * (mm[name] / most)).toFixed(1)}`);
+    const line = svg("path", { d: `M0,${points[0].split(",")[1]} L${points.join(" L")}` });
+    line.style.stroke = COLOURS[i % COLOURS.length];
+    return line;
+  });
+  byId("story-curve").replaceChildren(svg("path", { d: `M0,${HEIGHT} H${WIDTH}`, class: "axis" }), ...lines);
+}
+
+function draw(at) {
+  const { step_s: times } = story();
+  const step = Math.max(times.filter((time) => time <= at).length - 1, 0);
+  byId("story-now").style.transform = `translateY(${(-100 * step) / times.length}%)`;
+  byId("story-stage").textContent = stageAt(at, step);
+  drawCurve(at);
+}
+
+function begin() {
+  const { goal_image: goal, now_image: now, objects } = story();
+  byId("story-goal").src = goal;
+  byId("story-now").src = now;
+  byId("story-goal").alt = `The photo of how ${objects.map(labelOf).join(", ")} should lie`;
+  byId("story-again").hidden = true;
+  draw(0);
+}
+
+// Playing
+
+async function play() {
+  clearInterval(timer);
+  begin();
+  for (let isOpen = false; isOn && !isOpen; ) {
+    isOpen = isViewerShown() && (await replayStory({ story: story().name, at_s: 0, plays: false, speed: 1 }));
+    if (!isOpen) await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
+  }
+  if (!isOn) return;
+  await replayStory({ story: story().name, at_s: 0, plays: true, speed: speed() });
+  since = performance.now();
+  clearInterval(timer);
+  timer = setInterval(tick, TICK_MS);
+}
+
+function tick() {
+  const at = (speed() * (performance.now() - since)) / 1000;
+  const end = story().step_s.at(-1);
+  draw(Math.min(at, end));
+  if (at < end + REST_S * speed()) return;
+  clearInterval(timer);
+  if (number + 1 < ROUNDS * stories.length && !document.hidden) {
+    number += 1;
+    play();
+  } else byId("story-again").hidden = false;
+}
+
+function open() {
+  if (!stories.length || isOn) return;
+  isOn = true;
+  byId("story").hidden = false;
+  play();
+}
+
+/** Ends the story; the live table is on view again. */
+export function closeStory() {
+  if (!isOn) return;
+  isOn = false;
+  clearInterval(timer);
+  byId("story").hidden = true;
+  sessionStorage.setItem(SEEN, "1");
+  showLive();
+}
+
+// What to do next
+
+async function layTable() {
+  const { scene, goal } = await post(`presets/${encodeURIComponent(story().name)}`);
+  set("scene", { ...scene, is_current: true });
+  takeGoal(goal);
+  await refreshScenes();
+}
+
+async function runLive() {
+  await layTable();
+  closeStory();
+  await startEpisode();
+}
+
+function usePhoto() {
+  closeStory();
+  showTab("episode");
+  byId("goal-card").open = true;
+  byId("goal-drop").scrollIntoView({ block: "center" });
+  byId("goal-file").click();
+}
+
+function moveLamp() {
+  closeStory();
+  showTab("drive");
+  byId("azimuth").focus();
+}
+
+/** Whether somebody came for something else. */
+const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("opened")) || new URLSearchParams(location.search).has("episode");
+
+export async function setUpStory() {
+  const run = byId("story-run");
+  run.addEventListener("click", () => whileDisabled(run, () => tellFailure(runLive)));
+  byId("story-photo").addEventListener("click", usePhoto);
+  byId("story-lamp").addEventListener("click", moveLamp);
+  byId("story-close").addEventListener("click", closeStory);
+  byId("story-again").addEventListener("click", () => {
+    number += 1;
+    play();
+  });
+  byId("story-button").addEventListener("click", open);
+  watch("opened", (opened) => { if (opened) closeStory(); });
+  watch("episode", () => { if (hasOtherPlans()) closeStory(); });
+  ({ stories } = (await tellFailure(() => get("stories"))) ?? { stories: [] });
+  byId("story-button").hidden = !stories.length;
+  if (!hasOtherPlans() && !sessionStorage.getItem(SEEN)) open();
+}
