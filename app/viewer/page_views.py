@@ -9,19 +9,29 @@ from __future__ import annotations
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import viser
 
 from app.episodes.trajectory import read_trajectory
+from app.processes.process_client import ProcessClient
+from app.viewer.nodes.estimate_nodes import TRACKED
+from app.viewer.panels.neural_panel import NeuralPanel
 from app.viewer.panels.panel import Panel
-from app.viewer.replay_nodes import ReplayNodes
+from app.viewer.replay_nodes import ROOT, ReplayNodes
 from osfcore.errors import OsfError
+from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
 
 DRAW_INTERVAL_S = 0.04
+_TRACKED = f"/episode/estimate/{TRACKED}"
+_HIDDEN = {  # below the root of what is on view
+    "meshes": (_TRACKED,), "fields": (_TRACKED,), "beliefs": ("/objects", "/shadows", "/names"),
+}  # fmt: skip
+Shows = Literal["meshes", "fields", "beliefs"]
 _MOST_PAGES = 200  # that are remembered; those that asked longest ago are forgotten
 _log = logging.getLogger(__name__)
 
@@ -43,23 +53,38 @@ class Replay:
     speed: float = 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What a page wants to see.
+
+    Attributes:
+        replay: an episode; None for the live table.
+        shows: things as meshes, as their fields render them, or only what is believed of them.
+    """
+
+    replay: Replay | None = None
+    shows: Shows = "meshes"
+
+
 @dataclass(slots=True)
 class _Page:
     """A page's wish, and what its view shows of it.
 
     Attributes:
-        wish: what it has asked for; None for the live table.
+        wish: what it has asked for.
         since: when it asked, by the monotonic clock [s].
         client: the browser's view, once it is open.
         nodes: that replay.
+        hidden: invisible nodes of the browser's own, in the places of those that it shall not see.
         shown: the file that they replay, and when it was last written.
         is_due: whether there is something to draw.
     """
 
-    wish: Replay | None = None
+    wish: Wish = Wish()
     since: float = 0.0
     client: viser.ClientHandle | None = None
     nodes: ReplayNodes | None = None
+    hidden: dict[str, viser.SceneNodeHandle] = field(default_factory=dict)
     shown: tuple[Path, int] | None = None
     is_due: bool = False
 
@@ -70,22 +95,37 @@ class PageViews(Panel):
     Args:
         library: meshes of the objects.
         page_of: what the page calls itself in which a browser shows the view, by its number.
+        live: what is on the live table now.
+        link: to the renderer.
+        fields: names of the objects that have one.
+
+    Attributes:
+        neural: the neural pictures of what each browser shows.
     """
 
-    def __init__(self, library: AssetLibrary, page_of: Callable[[int], str | None]) -> None:
+    def __init__(
+        self,
+        library: AssetLibrary,
+        page_of: Callable[[int], str | None],
+        live: Callable[[], SceneState],
+        link: ProcessClient,
+        fields: Callable[[], Collection[str]],
+    ) -> None:
         super().__init__("page-views", DRAW_INTERVAL_S)
         self._library = library
         self._page_of = page_of
+        self._live = live
+        self.neural = NeuralPanel(link, self.seen, fields)
         self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, but for what is drawn
 
-    def ask(self, page: str, wish: Replay | None) -> bool:
+    def ask(self, page: str, wish: Wish) -> bool:
         """Show an episode in a page's view, or the live table; tells whether the view is open. Any thread may call.
 
         Raises:
             CorruptFile: if the trajectory cannot be read; then nothing changes.
         """
-        if wish is not None:
-            read_trajectory(wish.trajectory)
+        if wish.replay is not None:
+            read_trajectory(wish.replay.trajectory)
         with self._thread.changed:
             known = self._pages.setdefault(page, _Page())
             self._pages.move_to_end(page)
@@ -103,8 +143,7 @@ class PageViews(Panel):
             return
         with self._thread.changed:
             known = self._pages.setdefault(page, _Page())
-            known.client, known.nodes, known.shown = client, None, None
-            known.is_due = known.wish is not None
+            known.client, known.nodes, known.shown, known.hidden, known.is_due = client, None, None, {}, True
             self._thread.wake()
 
     def remove_client(self, client: viser.ClientHandle) -> None:
@@ -113,6 +152,15 @@ class PageViews(Panel):
             for known in self._pages.values():
                 if known.client is client:
                     known.client = known.nodes = known.shown = None
+                    known.hidden = {}
+
+    def seen(self, client: int) -> tuple[SceneState, str]:
+        """What a browser shows now, and the root of its nodes. Any thread may call."""
+        with self._thread.changed:
+            for page in self._pages.values():
+                if page.client is not None and page.client.client_id == client and page.nodes is not None:
+                    return page.nodes.state(), ROOT
+        return self._live(), ""
 
     def _store(self, event: object) -> bool:
         return False  # wishes come by `ask`
@@ -125,18 +173,27 @@ class PageViews(Panel):
         for name, page in due:
             try:
                 self._draw_page(page)
-            except Exception as error:  # a browser that has just left, or a defect: the others get their pictures
-                (_log.info if isinstance(error, OsfError) else _log.exception)("the view of %s failed", name)
+            except Exception as error:  # the views of others go on
+                if isinstance(error, OsfError):
+                    _log.warning("a replay cannot go on: %s", error)
+                elif page.client is not None:  # else it has left in between
+                    _log.exception("the view of page %s failed", name)
 
     def _draw_page(self, page: _Page) -> None:
         wish, client, now = page.wish, page.client, time.monotonic()
         if client is None:
             return
-        if wish is None:
-            if page.nodes is not None:
-                page.nodes.remove()
+        if wish.replay is not None:
+            self._draw_replay(page, wish.replay, client, now)
+        elif page.nodes is not None:
+            page.nodes.remove()
             page.nodes = page.shown = None
-            return
+        root = ROOT if wish.replay is not None else ""
+        self._hide(page, client, {f"{root}{path}" for path in _HIDDEN[wish.shows]})
+        self.neural.switch(client.client_id, is_on=wish.shows == "fields")
+        self.neural.view_moved(client.client_id)
+
+    def _draw_replay(self, page: _Page, wish: Replay, client: viser.ClientHandle, now: float) -> None:
         nodes = self._opened(page, wish, client)
         played_s = wish.speed * (now - page.since) if wish.plays else 0.0
         with client.atomic():
@@ -146,6 +203,13 @@ class PageViews(Panel):
             with self._thread.changed:
                 page.is_due = True
                 self._thread.wake(DRAW_INTERVAL_S)
+
+    @staticmethod
+    def _hide(page: _Page, client: viser.ClientHandle, paths: set[str]) -> None:
+        for path in set(page.hidden) - paths:
+            page.hidden.pop(path).remove()
+        for path in paths - set(page.hidden):
+            page.hidden[path] = client.scene.add_frame(path, show_axes=False, visible=False)
 
     def _opened(self, page: _Page, wish: Replay, client: viser.ClientHandle) -> ReplayNodes:
         """The nodes for a wish; an episode that goes on is read again once there is more of it."""

@@ -38,6 +38,7 @@ class ReplayNodes:
         self._hidden = [client.scene.add_frame(path, show_axes=False, visible=False) for path in LIVE_NODES]
         self._root = client.scene.add_frame(ROOT, show_axes=False)
         self._table = SceneNodes(client, library, root=ROOT)
+        self._table.show_names(is_on=False)
         self._episode = EpisodeNodes(client, library, self._table.has, root=f"{ROOT}/episode")
         self._table.begin(trajectory.states[0])
         self.follow(trajectory)
@@ -46,6 +47,10 @@ class ReplayNodes:
     def clock(self) -> ReplayClock:
         """When what is on view."""
         return self._clock
+
+    def state(self) -> SceneState:
+        """What is on view."""
+        return self._table.state()
 
     def follow(self, trajectory: Trajectory) -> None:
         """Replay a longer trajectory of the same episode from now on."""

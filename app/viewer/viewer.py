@@ -31,7 +31,6 @@ from app.viewer.page_views import PageViews
 from app.viewer.panels.episode_panel import EpisodePanel
 from app.viewer.panels.estimate_panel import EstimatePanel
 from app.viewer.panels.goal_panel import GoalPanel
-from app.viewer.panels.neural_panel import NeuralPanel
 from app.viewer.panels.panel import Panel
 from app.viewer.panels.push_panel import PushPanel
 from app.viewer.playback import Playback
@@ -102,7 +101,9 @@ class Viewer:
             self._server, self._runner.library, self._move_object, self._move_light, cameras=default_cameras()
         )
         self._playback = Playback(self._drawing)
-        self.pages = PageViews(self._runner.library, self._server.page_of)
+        self.pages = PageViews(
+            self._runner.library, self._server.page_of, self._drawing.state, self._neural, self._fields
+        )
         self._add_controls(self._server)
         self._panels = self._make_panels(self._server)
         self._server.on_client_connect(self._add_client)
@@ -131,8 +132,7 @@ class Viewer:
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
         """The panels, in the order of their folders."""
         library, table, jobs = self._runner.library, self._drawing, self._runner.jobs
-        neural = NeuralPanel(self._neural, table.state, self._fields)
-        table.watch(neural.scene_moved)
+        table.watch(self.pages.neural.scene_moved)
         estimate = EstimatePanel(
             server,
             (table, EstimateNodes(server, library, table.has)),
@@ -145,7 +145,7 @@ class Viewer:
         drawings = table, EpisodeNodes(server, library, table.has)
         episode = EpisodePanel(server, drawings, jobs, self._run_command, estimate.forget)
         push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
-        return self.pages, neural, estimate, self._goal_panel, episode, push
+        return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push
 
     def _add_client(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(1)
@@ -172,7 +172,7 @@ class Viewer:
         reset = gui.add_button("Reset", hint="Back to how the scene was created.")
         new = gui.add_button("New scene", hint="Other objects, other light.")
         self._wants_gizmos = gui.add_checkbox("Move objects", False, hint="Show handles to drag and turn the objects.")
-        cameras = gui.add_checkbox("Cameras", True)
+        cameras = gui.add_checkbox("Cameras", False)
         names = gui.add_checkbox("Names", True)
         gui.main_panel.minimize()
 

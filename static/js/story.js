@@ -1,9 +1,8 @@
 // What this is, shown before anybody clicks: a recorded episode in the 3D view, its goal, its table, and how far it is.
 import { get, post } from "./api.js";
-import { svg } from "./curves.js";
+import { COLOURS, svg } from "./curves.js";
 import { byId, whileDisabled } from "./dom.js";
 import { startEpisode } from "./episode.js";
-import { COLOURS } from "./curves.js";
 import { takeGoal } from "./goals.js";
 import { LIVE } from "./jobs.js";
 import { refreshScenes } from "./scenes.js";
@@ -100,10 +99,16 @@ function tick() {
   } else byId("story-again").hidden = false;
 }
 
+/** The story takes the place of the cameras, which show another table. */
+function show(on) {
+  byId("story").hidden = byId("story-foot").hidden = !on;
+  byId("cameras").hidden = on;
+}
+
 function open() {
   if (!stories.length || isOn) return;
   isOn = true;
-  byId("story").hidden = false;
+  show(true);
   play();
 }
 
@@ -112,7 +117,7 @@ export function closeStory() {
   if (!isOn) return;
   isOn = false;
   clearInterval(timer);
-  byId("story").hidden = true;
+  show(false);
   sessionStorage.setItem(SEEN, "1");
   showLive();
 }
@@ -162,7 +167,8 @@ export async function setUpStory() {
   byId("story-button").addEventListener("click", open);
   watch("opened", (opened) => { if (opened) closeStory(); });
   watch("episode", () => { if (hasOtherPlans()) closeStory(); });
-  ({ stories } = (await tellFailure(() => get("stories"))) ?? { stories: [] });
+  const answer = await tellFailure(() => get("stories"));
+  stories = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");
   byId("story-button").hidden = !stories.length;
   if (!hasOtherPlans() && !sessionStorage.getItem(SEEN)) open();
 }

@@ -5,23 +5,29 @@ import { VISITOR } from "./driver.js";
 import { Newest } from "./newest.js";
 import { tellFailure } from "./toasts.js";
 
-let text = ""; // of what is replayed; "" while the live table is on view
+let replayed = null; // what is replayed, as the service was told last
+let shows = "meshes";
 let onLive = () => {};
 
 /** Loads the frame, again after the service was lost; what this page replays there is shown again by itself. */
 export function showViewer() {
   // Of one look whatever the page's theme is: a table under a lamp is seen best before something dark.
   byId("viewer").src = `viewer/${VISITOR}/?hideViserLogo&darkMode`;
-  byId("viewer").hidden = false;
+  byId("viewer").hidden = byId("shows").hidden = false;
   byId("viewer-wait").hidden = true;
 }
 
 export const isViewerShown = () => !byId("viewer").hidden;
 
-const wish = new Newest((replay) => put(`views/${VISITOR}`, { replay }));
+const show = () => put(`views/${VISITOR}`, { replay: replayed, shows });
+const wish = new Newest(show);
+
+function ask(what) {
+  replayed = what;
+  wish.ask();
+}
 
 function draw(told) {
-  text = told;
   byId("replaying").hidden = !told;
   byId("replaying-text").textContent = told;
 }
@@ -29,27 +35,32 @@ function draw(told) {
 /** Shows a moment of an episode: {episode, at_s, plays, speed}. `told` says what it is. */
 export function replay(what, told) {
   draw(told);
-  wish.ask(what);
+  ask(what);
 }
 
 /** Likewise for a story, without a word over it; resolves to whether the view is open already. */
 export async function replayStory(what) {
   draw("");
-  const answer = await tellFailure(() => put(`views/${VISITOR}`, { replay: what }));
+  replayed = what;
+  const answer = await tellFailure(show);
   return answer?.is_open;
 }
 
 /** Back to the live table. */
 export function showLive() {
   draw("");
-  wish.ask(null);
+  ask(null);
 }
-
-export const isReplaying = () => Boolean(text);
 
 /** `listener` is told when somebody wants the live table back. */
 export function setUpViewer(listener) {
   onLive = listener;
+  for (const radio of document.getElementsByName("shows")) {
+    radio.addEventListener("change", () => {
+      shows = radio.value;
+      wish.ask();
+    });
+  }
   byId("back-to-live").addEventListener("click", () => {
     showLive();
     onLive();

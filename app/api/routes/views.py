@@ -12,7 +12,7 @@ from app.api.routes import problems
 from app.api.schemas.common import Input
 from app.api.schemas.limits import NAME, REPLAY_S, REPLAY_SPEED, VISITOR, sized, within
 from app.services.stories import Stories
-from app.viewer.page_views import Replay
+from app.viewer.page_views import Replay, Shows, Wish
 from osfcore.errors import InvalidInput
 
 router = APIRouter(prefix="/api/views", tags=["views"], responses=problems(), route_class=BoundedRoute)
@@ -43,6 +43,10 @@ class ViewIn(Input):
     """What a page wants to see."""
 
     replay: ReplayIn | None = Field(None, description="Null for the live table.")
+    shows: Shows = Field(
+        "meshes",
+        description='Things as scanned meshes, as their neural "fields" render them, or only the "beliefs" about them.',
+    )
 
 
 class ViewOut(BaseModel):
@@ -56,4 +60,4 @@ def show(services: ServicesDep, visitor: Visitor, body: ViewIn) -> ViewOut:
     """Show an episode in the 3D view of one page, at `viewer/{visitor}/`, or the live table again."""
     with named_in_path():
         replay = None if body.replay is None else body.replay.replay(services)
-    return ViewOut(is_open=services.viewer.pages.ask(visitor, replay))
+    return ViewOut(is_open=services.viewer.pages.ask(visitor, Wish(replay, body.shows)))

@@ -33,6 +33,7 @@ from osfcore.objects.asset_library import AssetLibrary
 
 GHOSTS = 24  # candidates of each object that are drawn
 GUESS = (20, 120, 200)
+TRACKED = "tracked"  # below which things on their way are drawn
 _TRIED, _SURE, _DOUBTED = (90, 205, 255), (10, 150, 110), (235, 115, 15)
 _TRIED_LIGHT_M = 0.018
 _SIGMAS = 2.0
@@ -79,12 +80,11 @@ class EstimateNodes:
         self._meshes: dict[str, Mesh] = {}
         self._tried: dict[str, viser.BatchedMeshHandle] = {}
         self._guesses: dict[str, viser.BatchedMeshHandle] = {}
+        self._tracked: dict[str, viser.BatchedMeshHandle] = {}
         self._verdicts: list[viser.SceneNodeHandle] = []
         self._has_candidates = True
         self._lamp: LightMarker | None = None
-        self._tried_lights = self._copies(
-            f"{root}/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, colour=LIGHT_COLOUR, opacity=0.5
-        )
+        self._tried_lights = self._copies(f"{root}/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, LIGHT_COLOUR, 0.5)
 
     @property
     def is_empty(self) -> bool:
@@ -98,7 +98,7 @@ class EstimateNodes:
                 self._begin(step.state.names)
             self._clear_verdicts()
             for n, name in enumerate(self._names):
-                self._show_guess(name, step.state.poses[n], _WIRES)
+                self._show_guess(name, step.state.poses[n], is_tracked=False)
                 self._show_tried(name, None if step.candidates is None else step.candidates[:, n])
             self._show_light(step.state.light, step.lights, "guessed light")
             if step.estimate is not None:
@@ -111,7 +111,7 @@ class EstimateNodes:
                 self._begin(estimate.state.names)
             self._clear_verdicts()
             for n, name in enumerate(self._names):
-                self._show_guess(name, estimate.state.poses[n], _FAINT_WIRES)
+                self._show_guess(name, estimate.state.poses[n], is_tracked=True)
                 self._show_tried(name, None)
                 self._mark(name, estimate.doubts[n])
             self._show_light(estimate.state.light, None, "estimated light")
@@ -133,17 +133,18 @@ class EstimateNodes:
             self._lamp, self._tried_lights.visible = None, False
 
     def _begin(self, names: tuple[str, ...]) -> None:
-        for node in (*self._tried.values(), *self._guesses.values()):
+        for node in (*self._tried.values(), *self._guesses.values(), *self._tracked.values()):
             node.remove()
         self._names = names
         self._meshes = {name: mesh_of(self._library, name) for name in names}
         self._tried = {name: self._copies(f"{self._root}/tried/{name}", self._meshes[name], GHOSTS) for name in names}
-        self._guesses = {
-            name: self._copies(
-                f"{self._root}/guess/{name}", self._meshes[name], 1, colour=self._colour, opacity=_WIRES, is_wire=True
-            )
-            for name in names
-        }
+        self._guesses, self._tracked = (
+            {
+                name: self._copies(f"{self._root}/{part}/{name}", self._meshes[name], 1, self._colour, opacity)
+                for name in names
+            }
+            for part, opacity in (("guess", _WIRES), (TRACKED, _FAINT_WIRES))
+        )
 
     def _label(self, name: str) -> str:
         try:
@@ -152,8 +153,9 @@ class EstimateNodes:
             return name
 
     def _copies(
-        self, path: str, mesh: Mesh, count: int, *, colour: Colour = _TRIED, opacity: float = 0.2, is_wire: bool = False
+        self, path: str, mesh: Mesh, count: int, colour: Colour = _TRIED, opacity: float = 0.2
     ) -> viser.BatchedMeshHandle:
+        is_wire = count == 1
         return add_ghosts(
             self._scene,
             path,
@@ -167,10 +169,11 @@ class EstimateNodes:
             visible=False,
         )
 
-    def _show_guess(self, name: str, pose: Pose, opacity: float) -> None:
-        self._guesses[name].opacity = opacity
-        move_ghosts(self._guesses[name], Pose(pose.position[None], pose.quaternion[None]))
-        self._guesses[name].visible = bool(pose.position[2] > _AWAY_M)
+    def _show_guess(self, name: str, pose: Pose, *, is_tracked: bool) -> None:
+        shown, hidden = (self._tracked, self._guesses) if is_tracked else (self._guesses, self._tracked)
+        hidden[name].visible = False
+        move_ghosts(shown[name], Pose(pose.position[None], pose.quaternion[None]))
+        shown[name].visible = bool(pose.position[2] > _AWAY_M)
 
     def _show_tried(self, name: str, candidates: Pose | None) -> None:
         node = self._tried[name]
@@ -200,7 +203,9 @@ class EstimateNodes:
         self._show_light(estimate.state.light, None, f"estimated light {within}")
 
     def _mark(self, name: str, doubt: str) -> None:
-        self._guesses[name].batched_colors = np.array(_DOUBTED if doubt else _SURE, np.uint8)
+        self._guesses[name].batched_colors = self._tracked[name].batched_colors = np.array(
+            _DOUBTED if doubt else _SURE, np.uint8
+        )
 
     def _add_verdict(self, name: str, pose: Pose, position_std: float, rotation_std: float, doubt: str) -> None:
         """A ball of two standard deviations on the object's top, a sector of two around its heading, and words."""
@@ -243,7 +248,7 @@ class EstimateNodes:
         for node in self._verdicts:
             node.remove()
         self._verdicts = []
-        for guess in self._guesses.values():
+        for guess in (*self._guesses.values(), *self._tracked.values()):
             guess.batched_colors = np.array(self._colour, np.uint8)
 
 

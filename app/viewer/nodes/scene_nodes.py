@@ -242,6 +242,7 @@ class SceneNodes:
             position=pose.position,
             cast_shadow=False,
             receive_shadow=False,
+            visible=False,  # one stands between most views and the table
         )
 
     def _add_object(self, name: str) -> None:

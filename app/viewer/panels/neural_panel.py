@@ -26,6 +26,7 @@ _NOTHING_M = 100.0  # depth where a ray meets nothing
 _BEHIND_M = 0.003  # pictures lie that much farther away, so that what stands on the table is not half in it
 _JPEG_QUALITY = {False: 75, True: 92}  # by whether a picture is sharp
 _log = logging.getLogger(__name__)
+Seen = Callable[[int], tuple[SceneState, str]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -35,11 +36,13 @@ class _Answer:
     Attributes:
         ticket: of the request.
         names: of the objects that are rendered.
+        root: of the nodes that they stand for.
         future: the answer itself.
     """
 
     ticket: RenderTicket
     names: tuple[str, ...]
+    root: str
     future: Future[NeuralAnswer]
 
 
@@ -66,6 +69,11 @@ class ClientView:
         """Whether neural pictures are switched on."""
         return bool(self._switch.value)
 
+    def switch(self, *, is_on: bool) -> None:
+        """Switch neural pictures on or off, as a hand would."""
+        if self.is_on != is_on:
+            self._switch.value = is_on
+
     def due_at(self) -> float | None:
         """When there is something to do; None if there is nothing."""
         if not self.is_on:
@@ -83,14 +91,22 @@ class ClientView:
             return None
         return view_camera(view.position, view.wxyz, view.fov, view.aspect, min(rows, view.image_height))
 
-    def show(self, picture: DrawnView, names: tuple[str, ...]) -> None:
-        """Put a picture behind everything, in place of the meshes of some objects, of the table and of the pusher."""
+    def show(self, picture: DrawnView, names: tuple[str, ...], root: str) -> None:
+        """Put a picture behind everything, in place of the meshes of some objects, of the table and of the pusher.
+
+        Args:
+            picture: of the fields.
+            names: of the objects in it.
+            root: of the nodes that it stands for.
+        """
         depth, is_sharp = picture.depth, picture.depth is not None
         if depth is not None:
             depth = np.where(depth > 0, depth + np.float32(_BEHIND_M), np.float32(_NOTHING_M))
         quality = _JPEG_QUALITY[is_sharp]
         self.client.scene.set_background_image(picture.image, "jpeg", jpeg_quality=quality, depth=depth)
-        self._hide({"/table", "/pusher", "/shadows", *(f"/objects/{name}" for name in names)})
+        # Of a replay, which stands in place of the live table, the same nodes lie below its own.
+        parts = ("/pusher", "/shadows", *(f"/objects/{name}" for name in names))
+        self._hide({"/table", *(f"{root}{part}" for part in parts)})
         self._stop_waiting()
         self._is_clear = False
 
@@ -142,16 +158,14 @@ class NeuralPanel(Panel):
 
     Args:
         link: to the renderer.
-        state: what is drawn now.
+        seen: what a browser, named by its number, shows now, and the root of its nodes.
         fields: names of the objects that have one.
     """
 
-    def __init__(
-        self, link: ProcessClient, state: Callable[[], SceneState], fields: Callable[[], Collection[str]]
-    ) -> None:
+    def __init__(self, link: ProcessClient, seen: Seen, fields: Callable[[], Collection[str]]) -> None:
         super().__init__("neural-panel")
         self._link = link
-        self._state = state
+        self._seen = seen
         self._fields = fields
         self._views: dict[int, ClientView] = {}  # guarded by `_thread.changed`, with what belongs to them
 
@@ -166,6 +180,19 @@ class NeuralPanel(Panel):
         """Forget a browser that has left."""
         with self._thread.changed:
             self._views.pop(client.client_id, None)
+
+    def switch(self, client: int, *, is_on: bool) -> None:
+        """Switch neural pictures on or off in one browser. Any thread may call."""
+        with self._thread.changed:
+            view = self._views.get(client)
+        if view is not None:
+            view.switch(is_on=is_on)
+
+    def view_moved(self, client: int) -> None:
+        """What one browser shows has changed. Any thread may call."""
+        with self._thread.changed:
+            view = self._views.get(client)
+            self._moved(*([] if view is None else [view]))
 
     def scene_moved(self) -> None:
         """What is drawn has changed. Any thread may call; it never waits for a picture."""
@@ -213,7 +240,8 @@ class NeuralPanel(Panel):
 
     def _order(self, view: ClientView, ticket: RenderTicket, now: float) -> None:
         step = STEPS[ticket.step]
-        camera, (state, others) = view.camera(step.rows), self._split(self._state())
+        seen, root = self._seen(view.client.client_id)
+        camera, (state, others) = view.camera(step.rows), self._split(seen)
         if camera is None:
             with self._thread.changed:
                 view.refinement.give_up(ticket)
@@ -223,7 +251,7 @@ class NeuralPanel(Panel):
             view.waiting_since = now
         order = DrawView(f"view-{view.client.client_id}", state, camera, step.is_sharp)
         future = self._link.submit(order)
-        future.add_done_callback(lambda done: self._receive(view, _Answer(ticket, state.names, done)))
+        future.add_done_callback(lambda done: self._receive(view, _Answer(ticket, state.names, root, done)))
 
     def _split(self, state: SceneState) -> tuple[SceneState, tuple[str, ...]]:
         """What can be rendered, and the names of the other objects."""
@@ -250,4 +278,4 @@ class NeuralPanel(Panel):
         elif error is not None:
             raise error
         elif is_current and isinstance(picture, DrawnView):
-            view.show(picture, answer.names)
+            view.show(picture, answer.names, answer.root)

@@ -11,6 +11,7 @@ from app.processes.messages.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
 from app.viewer.nodes.episode_nodes import PARTS, EpisodeNodes
+from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.episode_panel import DRAW_INTERVAL_S, EpisodePanel
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Stepped
@@ -76,7 +77,8 @@ class Room:
 
     def estimate(self, name=BOX):
         """Where an object is believed to be; None where nothing is believed."""
-        node = self.gui.node(f"/episode/estimate/guess/{name}")
+        paths = [f"/episode/estimate/{part}/{name}" for part in ("guess", TRACKED)]
+        node = next((self.gui.node(path) for path in paths if self.gui.shows(path)), None)
         return None if node is None else node.batched_positions
 
     def goal(self):

@@ -103,7 +103,7 @@ class Room:
         self.fields = {A, B}
         self.light = Light(np.array([0, 0, 1.0]))
         self.renderer = Renderer()
-        self.panel = NeuralPanel(self.renderer, self.state, lambda: self.fields)
+        self.panel = NeuralPanel(self.renderer, lambda _: (self.state(), ""), lambda: self.fields)
 
     def state(self):
         poses = Pose(np.array([[0, 0, 0.1], [0.1, 0, 0.1]]), np.array([[1.0, 0, 0, 0]] * 2))
