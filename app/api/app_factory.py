@@ -42,7 +42,7 @@ from app.api.routes import (
     stories,
     views,
 )
-from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent, Problem
+from app.api.schemas.common import ForgottenEvent, FrameEvent, LookEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
 from app.processes.predict_process import predictor_main
@@ -53,6 +53,7 @@ from app.services.episodes import Episodes
 from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
+from app.services.look_outlines import Outliner
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
@@ -153,6 +154,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             goal_service,
             episode_service,
             driver_seat,
+            Outliner(runner.library),
         )
         app.state.services = services
         app.state.metrics.watch(runner)
@@ -181,7 +183,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-        for model in (Problem, ForgottenEvent, FrameEvent, NoticeEvent, EstimateIn, GoalIn):
+        for model in (Problem, ForgottenEvent, FrameEvent, LookEvent, NoticeEvent, EstimateIn, GoalIn):
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
             schemas[model.__name__] = own

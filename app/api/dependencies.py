@@ -20,6 +20,7 @@ from app.services.episodes import Episodes
 from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
+from app.services.look_outlines import Outliner
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
@@ -81,6 +82,7 @@ class Services:
     goals: Goals
     episodes: Episodes
     driver: Driver
+    outliner: Outliner
     event_texts: EventTexts = field(default_factory=EventTexts)
     lanes: Lanes = field(default_factory=Lanes)
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set

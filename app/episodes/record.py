@@ -149,6 +149,7 @@ class EpisodeRecord:
             "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m),
             "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)),
             "estimate_off_mm": _by_name(truth.names, 1000 * off),
+            "light_off_deg": round(float(np.rad2deg(estimate.state.light.angle_to(truth.light))), 3),
             "estimate": estimated_to_json(estimate),
             "truth": state_to_json(truth),
         }

@@ -86,8 +86,6 @@ def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str,
     """What the page tells; lengths in mm, angles in degrees, times in seconds of the replay."""
     course, steps = read_trajectory(trajectory), report["steps"]
     clock = ReplayClock(course)
-    estimated, true = course.rounds[0].estimate.state.light.position, course.states[0].light.position
-    light_deg = np.rad2deg(np.arccos(np.clip(estimated @ true, -1, 1)))
     return {
         "name": preset.id,
         "title": preset.title,
@@ -99,7 +97,7 @@ def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str,
         "left_mm": [{name: step["truly_to_goal_mm"][name] for name in course.names} for step in steps],
         "pushes": report["steps_done"],
         "took_s": report["seconds"],
-        "light_off_deg": round(float(light_deg), 2),
+        "light_off_deg": steps[0]["light_off_deg"],
         "outcome": report["outcome"],
     }
 

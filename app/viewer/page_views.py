@@ -186,8 +186,7 @@ class PageViews(Panel):
         if wish.replay is not None:
             self._draw_replay(page, wish.replay, client, now)
         elif page.nodes is not None:
-            page.nodes.remove()
-            page.nodes = page.shown = None
+            self._close(page)
         root = ROOT if wish.replay is not None else ""
         self._hide(page, client, {f"{root}{path}" for path in _HIDDEN[wish.shows]})
         self.neural.switch(client.client_id, is_on=wish.shows == "fields")
@@ -205,6 +204,14 @@ class PageViews(Panel):
                 self._thread.wake(DRAW_INTERVAL_S)
 
     @staticmethod
+    def _close(page: _Page) -> None:
+        """Back to the live table; what was hidden below the replay goes with it."""
+        if page.nodes is not None:
+            page.nodes.remove()
+            page.hidden = {path: node for path, node in page.hidden.items() if not path.startswith(ROOT)}
+        page.nodes = page.shown = None
+
+    @staticmethod
     def _hide(page: _Page, client: viser.ClientHandle, paths: set[str]) -> None:
         for path in set(page.hidden) - paths:
             page.hidden.pop(path).remove()
@@ -215,8 +222,7 @@ class PageViews(Panel):
         """The nodes for a wish; an episode that goes on is read again once there is more of it."""
         version = wish.trajectory, wish.trajectory.stat().st_mtime_ns
         if page.nodes is None or page.shown is None or page.shown[0] != wish.trajectory:
-            if page.nodes is not None:
-                page.nodes.remove()
+            self._close(page)
             page.nodes = ReplayNodes(client, self._library, read_trajectory(wish.trajectory))
         elif page.shown != version:
             page.nodes.follow(read_trajectory(wish.trajectory))

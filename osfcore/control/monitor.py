@@ -45,7 +45,7 @@ class ProgressMonitor:
 
 def lamp_moved(before: Light, now: Light) -> float | None:
     """By which angle the lamp was moved [rad]; None if it was not."""
-    angle = float(np.arccos(np.clip(before.direction @ now.direction, -1, 1)))
+    angle = before.angle_to(now)
     return angle if angle > _LAMP_RAD else None
 
 

@@ -52,3 +52,7 @@ class Light:
     def direction(self) -> Float[np.ndarray, "3"]:
         """Unit vector from the table's centre toward the light."""
         return self.position
+
+    def angle_to(self, other: Light) -> float:
+        """The angle between the directions of two lights [rad]."""
+        return float(np.arccos(np.clip(self.direction @ other.direction, -1, 1)))

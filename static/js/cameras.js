@@ -1,7 +1,7 @@
 // The camera strip: live images from the event stream, masks and the goal view by request, a large view on click.
 import { byId, el } from "./dom.js";
 import { enlargeComparison, isComparing } from "./neural.js";
-import { current, watch } from "./state.js";
+import { current, known, watch } from "./state.js";
 
 const NAMES = ["0", "1", "2", "3", "goal"];
 const tiles = new Map();
@@ -39,12 +39,18 @@ export class LatestImage {
   }
 }
 
+/** The goal camera's tile shows the goal, if one was chosen: what the table looks like from there is beside it all the time. */
+const showsGoal = (camera) => camera === "goal" && !showsMasks && Boolean(known("goal"));
+const labelOfTile = (name) => (name !== "goal" ? `Camera ${name}` : showsGoal(name) ? "Goal" : "Goal camera, now");
+
 function url(scene, camera, size, { pusher = true } = {}) {
+  if (showsGoal(camera)) return `api/goals/${encodeURIComponent(known("goal").id)}/image.png`;
   const query = new URLSearchParams({ size, masks: showsMasks, pusher, v: scene.revision });
   return `api/scenes/${scene.id}/images/${camera}.png?${query}`;
 }
 
 function refresh(scene) {
+  byId("camera-strip").querySelector(".of-goal").textContent = labelOfTile("goal");
   for (const [name, tile] of tiles) {
     if (!scene) tile.image.removeAttribute("src");
     else if (name === "goal" || showsMasks) tile.latest.show(url(scene, name, 128, { pusher: name !== "goal" }));
@@ -62,7 +68,7 @@ function enlarge(name) {
     return;
   }
   largeCamera = name;
-  byId("camera-dialog-title").textContent = name === "goal" ? "Goal camera, without the pusher" : `Camera ${name}`;
+  byId("camera-dialog-title").textContent = labelOfTile(name);
   byId("camera-large").alt = byId("camera-dialog-title").textContent;
   byId("camera-large").removeAttribute("src");
   refresh(scene);
@@ -90,7 +96,8 @@ export function setUpCameras() {
     const label = name === "goal" ? "Goal view" : `Camera ${name}`;
     const image = el("img", { alt: label, width: 128, height: 128 });
     image.dataset.camera = name;
-    const button = el("button", { type: "button", title: `Enlarge: ${label.toLowerCase()}` }, image, el("span", { textContent: label }));
+    const caption = el("span", { textContent: labelOfTile(name), className: name === "goal" ? "of-goal" : "" });
+    const button = el("button", { type: "button", title: `Enlarge: ${label.toLowerCase()}` }, image, caption);
     button.addEventListener("click", () => enlarge(name));
     byId("camera-strip").append(button);
     tiles.set(name, { image, latest: new LatestImage(image) });
@@ -98,6 +105,7 @@ export function setUpCameras() {
   byId("camera-dialog").addEventListener("close", () => { largeCamera = null; });
   byId("masks").addEventListener("change", (event) => toggleMasks(event.target.checked));
   let shown = null;
+  watch("goal", () => refresh(current()));
   watch("scene", (scene) => {
     refresh(scene);
     if (scene && scene.id !== shown && !showsMasks) {

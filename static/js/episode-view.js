@@ -2,6 +2,7 @@
 import { get } from "./api.js";
 import { byId, el } from "./dom.js";
 import { LIVE } from "./jobs.js";
+import { drawEnding } from "./ending.js";
 import { preload, setUpPictures, showFrame, standIn } from "./pictures.js";
 import { drawProgress, setUpProgress } from "./progress-charts.js";
 import { drawResults } from "./results.js";
@@ -72,6 +73,7 @@ export function showEpisode(episode, step) {
   if (Number.isFinite(step) && last >= 0 && step > last) toast(`This episode has steps 0 to ${last}; showing the last one.`, "warning");
   const at = Number.isFinite(step) ? Math.min(step, last) : wasAtEnd ? last : timeline.step;
   timeline.set(last, at, episode.step_s);
+  drawEnding(episode);
   drawResults(episode, isOther);
   if (isOther) show3D(LIVE.has(episode.status) && !Number.isFinite(step) ? null : { at_s: timeline.at(at), plays: false, speed: 1 });
   if (!isOther) return;

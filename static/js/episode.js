@@ -38,11 +38,12 @@ function reason() {
   return "";
 }
 
-export function startEpisode() {
+/** Starts an episode as the page's settings say, or with some of them changed. */
+export function startEpisode(changes = {}) {
   if (live() || byId("run-idle").hidden) return undefined;
   const why = reason();
   if (why) return toast(why, "warning");
-  const body = { scene: current().id, goal: known("goal").id, seed: 0, settings: chosenSettings() };
+  const body = { scene: current().id, goal: known("goal").id, seed: 0, settings: { ...chosenSettings(), ...changes } };
   return whileDisabled(byId("start-episode"), () => tellFailure(async () =>
     set("opened", { id: (await post("episodes", body)).id }))).then(drawStart);
 }
@@ -130,7 +131,7 @@ function draw() {
 
 export function setUpEpisode() {
   byId("run-loop").append(...LOOP.map(([name]) => el("li", { textContent: name })));
-  byId("start-episode").addEventListener("click", startEpisode);
+  byId("start-episode").addEventListener("click", () => startEpisode());
   byId("run-pause").addEventListener("click", togglePause);
   byId("run-step").addEventListener("click", stepOnce);
   byId("run-cancel").addEventListener("click", cancelEpisode);

@@ -5,6 +5,7 @@ import { setUpCompose } from "./compose.js";
 import { byId } from "./dom.js";
 import { VISITOR, setUpDriver } from "./driver.js";
 import { setUpDrop } from "./drop.js";
+import { setUpEnding } from "./ending.js";
 import { setUpEpisode } from "./episode.js";
 import { refreshSettings, setUpEpisodeSettings } from "./episode-settings.js";
 import { followLive, refreshShown, setUpEpisodeView, shownStep } from "./episode-view.js";
@@ -16,6 +17,7 @@ import { refreshGoals, setUpGoals } from "./goals.js";
 import { dropJob, refreshJobs, setUpJobs, showJob } from "./jobs.js";
 import { setUpKeyboard } from "./keyboard.js";
 import { setUpLight } from "./light.js";
+import { setUpLooks, showLook } from "./looks.js";
 import { setUpNeural } from "./neural.js";
 import { setUpNumbers } from "./numbers.js";
 import { refreshObjects, setUpObjects } from "./objects.js";
@@ -72,6 +74,7 @@ setUpViewer(followLive);
 setUpDriver();
 setUpCameras();
 setUpNeural();
+setUpLooks();
 setUpPush();
 setUpLight();
 setUpNumbers();
@@ -86,6 +89,7 @@ setUpCompose();
 setUpDrop();
 setUpEpisodeView();
 setUpResults(shownStep);
+setUpEnding();
 setUpEpisodeSettings();
 setUpEpisode();
 setUpEpisodes();
@@ -116,6 +120,7 @@ listen(VISITOR, {
   scene: (scene) => set("scene", scene),
   frame: showFrames,
   job: (job) => showJob(job),
+  look: showLook,
   forgotten({ job }) {
     dropJob(job);
     dropEpisode(job);

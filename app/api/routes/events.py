@@ -18,21 +18,23 @@ from starlette.concurrency import run_in_threadpool
 from app.api.dependencies import Services, ServicesDep
 from app.api.routes import problems
 from app.api.routes.driver import DriverOut
-from app.api.schemas.common import ForgottenEvent, FrameEvent, NoticeEvent
+from app.api.schemas.common import ForgottenEvent, FrameEvent, LookEvent, NoticeEvent
 from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
 from app.api.schemas.limits import NAME, VISITOR, sized
-from app.jobs.job import Job, JobChanged, JobForgotten, job_from_fields
+from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
 from app.storage.paths import without_places
+from osfcore.control.events import Looking
 from osfcore.errors import OsfError, UnknownName
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
 FRAME_INTERVAL_S = 0.2
+LOOK_INTERVAL_S = 0.3
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
@@ -57,6 +59,7 @@ class Mailbox:
         self.draft: DraftChanged | None = None
         self.is_scene_new = True
         self.frames: FramesTaken | None = None
+        self.look: Looking | None = None
         self.arrived = asyncio.Event()
 
     def put(self, event: object) -> None:
@@ -86,6 +89,8 @@ class Mailbox:
                 self.is_scene_new, self.frames = True, None
             case SceneChanged(record):
                 self.is_scene_new = self.is_scene_new or record.id == self._current
+            case JobView(_, Looking() as look):
+                self.look = look
             case FramesTaken():
                 self.frames = event if event.scene == self._current else self.frames
         self.arrived.set()
@@ -101,7 +106,7 @@ async def stream(
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: "job", "forgotten", "scene", "frame", "goals", "draft", "driver" and "notice" events."""
+    """Follow what happens: "job", "look", "forgotten", "scene", "frame", "goals", "draft", "driver", "notice"."""
     del counted
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
@@ -139,7 +144,7 @@ async def stream(
 async def _follow(
     services: Services, mailbox: Mailbox, last: int, *, wants_frames: bool
 ) -> AsyncIterator[ServerSentEvent]:
-    scene_at = frame_at = 0.0
+    scene_at = frame_at = look_at = 0.0
     while not services.closing.is_set():
         while mailbox.letters:
             letter = mailbox.letters.popleft()
@@ -166,8 +171,13 @@ async def _follow(
             if wants_frames:
                 text = services.event_texts.of(taken, partial(_frame, taken))
                 yield ServerSentEvent(event="frame", raw_data=text)
+        if mailbox.look is not None and (now >= look_at or mailbox.look.step.estimate is not None):
+            look, mailbox.look, look_at = mailbox.look, None, now + LOOK_INTERVAL_S
+            text = services.event_texts.of(look, partial(_look, services, look))
+            yield ServerSentEvent(event="look", raw_data=text)
         mailbox.arrived.clear()
         due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)
+        due += [look_at] * (mailbox.look is not None)
         timeout = min([_LOOK_INTERVAL_S, *(max(at - time.monotonic(), 0.001) for at in due)])
         if due:
             await asyncio.sleep(timeout)
@@ -246,6 +256,10 @@ def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
     if changed.draft is None:
         return ServerSentEvent(event="draft", raw_data="null")
     return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.objects.labels()))
+
+
+def _look(services: Services, look: Looking) -> LookEvent:
+    return LookEvent.model_validate(services.outliner.outlines(look), from_attributes=True)
 
 
 def _frame(taken: FramesTaken) -> FrameEvent:

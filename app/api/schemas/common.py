@@ -246,6 +246,29 @@ class FrameEvent(BaseModel):
     cameras: dict[str, str] = Field(description="Camera name to JPEG data URL.")
 
 
+Points = list[tuple[float, float]]
+
+
+class ObjectOutlinesOut(BaseModel):
+    """An object in one picture; coordinates are shares of its width and height."""
+
+    name: str
+    best: Points = Field(description="Outline of where it is taken to be; empty for what was not looked at yet.")
+    tried: list[Points] = Field(description="The same of some candidates.")
+
+
+class LookEvent(BaseModel):
+    """An estimator at work, the data of a "look" event."""
+
+    look: Literal["first", "goal", "next", "search"] = Field(description="At what: first frame, goal image, ...")
+    share: float = Field(description="Of the work that is done.")
+    loss: float | None = Field(description="Of the whole, in units of its stage.")
+    stage: str = Field(description="Of the method; losses of one stage can be compared.")
+    is_over: bool = Field(description="Whether this is the result.")
+    light_deg: tuple[float, float] = Field(description="Azimuth and elevation of the light so far.")
+    cameras: dict[str, list[ObjectOutlinesOut]] = Field(description='By camera; "goal" is the goal image.')
+
+
 class ForgottenEvent(BaseModel):
     """A job was removed for good, the data of a "forgotten" event."""
 

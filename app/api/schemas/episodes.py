@@ -127,6 +127,9 @@ class EpisodeStepOut(BaseModel):
     to_goal_mm: dict[str, float] = Field(description="Of each object, as estimated [mm].")
     to_goal_deg: dict[str, float] = Field(description="Likewise [deg].")
     estimate_off_mm: dict[str, float] = Field(description="Simulation only: errors of the estimate [mm].")
+    light_off_deg: float | None = Field(
+        None, description="Simulation only: error of the estimated light [deg]; null in episodes of earlier versions."
+    )
     truly_to_goal_mm: dict[str, float] | None = Field(
         None, description="Simulation only: true distances [mm]; null where nobody knows the truth of the goal."
     )

@@ -1,0 +1,81 @@
+// How an episode ended: before and after, what it came to in one line, what is missing, and what to do about it.
+import { byId } from "./dom.js";
+import { startEpisode } from "./episode.js";
+import { LIVE } from "./jobs.js";
+import { current, known, labelOf, set } from "./state.js";
+import { showTab } from "./tabs.js";
+import { toast } from "./toasts.js";
+
+const NEAR_MM = 10; // further away than this, or turned by more, is what is told as missing
+const TURNED_DEG = 8.6;
+const MORE = 20;
+let shown = null;
+
+const length = (mm) => (mm < 10 ? `${mm.toFixed(1)} mm` : `${(mm / 10).toFixed(1)} cm`);
+const offsets = (step) => step.truly_to_goal_mm ?? step.to_goal_mm;
+const farthest = (step) => Math.max(...Object.values(offsets(step)));
+
+/** "9.3 cm to 2 mm, 18 pushes, 95 s, light found to 0.2°". */
+export function summary({ steps, done, started_at: started, finished_at: finished }) {
+  const [first, last] = [steps[0], steps.at(-1)];
+  const seconds = started && finished ? `${((new Date(finished) - new Date(started)) / 1000).toFixed(0)} s` : "";
+  const light = first.light_off_deg === null || first.light_off_deg === undefined ? "" : `light found to ${first.light_off_deg.toFixed(1)}°`;
+  return [`${length(farthest(first))} to ${length(farthest(last))}`, `${done} ${done === 1 ? "push" : "pushes"}`, seconds, light].filter(Boolean).join(", ");
+}
+
+/** What is not as it should be, for each object. */
+function missing({ objects, steps }) {
+  const last = steps.at(-1);
+  return objects.flatMap((name) => {
+    const far = offsets(last)[name];
+    const turned = last.to_goal_deg[name];
+    if (far <= NEAR_MM && turned <= TURNED_DEG) return [];
+    const parts = [far > NEAR_MM && `${length(far)} away`, turned > TURNED_DEG && `turned by ${turned.toFixed(0)}°`].filter(Boolean);
+    return [`${labelOf(name)} is still ${parts.join(" and ")}`];
+  });
+}
+
+function why(episode) {
+  if (episode.outcome === "refused") return "Nothing was moved, since the goal image is doubtful.";
+  const left = missing(episode);
+  if (!left.length) return "";
+  return `${left.join("; ")}.`;
+}
+
+/** Whether it can go on from where it ended. */
+const canGoOn = ({ scene, outcome }) => scene === current()?.id && outcome !== "reached";
+
+export function drawEnding(episode) {
+  shown = episode;
+  const isOver = !LIVE.has(episode.status) && episode.steps.length > 0;
+  byId("ending").hidden = !isOver;
+  if (!isOver) return;
+  const frame = (step) => `api/episodes/${encodeURIComponent(episode.id)}/frames/${step}.png?part=now`;
+  const [before, after] = [frame(0), frame(episode.steps.length - 1)];
+  if (byId("ending-before").getAttribute("src") !== before) byId("ending-before").src = before;
+  if (byId("ending-after").getAttribute("src") !== after) byId("ending-after").src = after;
+  byId("ending-sum").textContent = summary(episode);
+  byId("ending-why").textContent = why(episode);
+  byId("ending-why").hidden = !byId("ending-why").textContent;
+  byId("ending-next").hidden = !canGoOn(episode);
+}
+
+function goOn() {
+  const goal = known("goals").find(({ id }) => id === shown.goal);
+  if (!goal) return toast("The goal of this episode has been deleted; choose another one.", "warning");
+  set("goal", goal);
+  return startEpisode({ steps: MORE });
+}
+
+export function setUpEnding() {
+  const after = byId("ending-pair").querySelector(".over");
+  const wipe = () => { after.style.clipPath = `inset(0 0 0 ${100 - byId("ending-at").value}%)`; };
+  byId("ending-at").addEventListener("input", wipe);
+  wipe();
+  byId("more-pushes").addEventListener("click", goOn);
+  byId("another-photo").addEventListener("click", () => {
+    showTab("episode");
+    byId("goal-card").open = true;
+    byId("goal-file").click();
+  });
+}
