@@ -106,7 +106,7 @@ def read_trajectory(path: Path) -> Trajectory:
         CorruptFile: if it cannot be read or holds something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             return _trajectory(dict(arrays))
     except OSError as error:
         raise CorruptFile(path, error.strerror or str(error)) from error

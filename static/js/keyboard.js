@@ -15,7 +15,7 @@ const isDialogOpen = () => document.querySelector("dialog[open]") !== null;
 const isPressed = (target) => Boolean(target.closest?.("button, a, summary, input, [tabindex]"));
 
 const COMMANDS = {
-  s: startEpisode,
+  s: () => startEpisode(),
   " ": togglePause,
   ".": stepOnce,
   x: cancelEpisode,

@@ -1,5 +1,6 @@
 import os
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,13 @@ def watch_errors(page):
     page.on("pageerror", lambda error: page.problems.append(str(error)) if "unsafe-eval" not in str(error) else None)
 
 
+def page_of_someone_who_knows(new_page, **options):
+    """A page on which the story is not played, as on any but the first visit."""
+    page = new_page(**options)
+    page.add_init_script("try { sessionStorage.setItem('osf-story-seen', '1') } catch {}")
+    return page
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
     """Keep a picture of the page where a test fails."""
@@ -44,5 +52,6 @@ def browser():
     sync_api = pytest.importorskip("playwright.sync_api")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        browser.new_page = partial(page_of_someone_who_knows, browser.new_page)
         yield browser
         browser.close()

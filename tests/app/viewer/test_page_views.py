@@ -1,0 +1,130 @@
+"""Views of single pages, with browsers that speak viser's protocol through the relay."""
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+from websockets.sync.client import connect
+
+from app.episodes.replay_clock import ReplayClock
+from app.episodes.trajectory import read_trajectory
+from app.services.stories import Stories
+from tests.app.conftest import until
+
+STORY = "first"
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [1.0, 1.0, 1.0], "fov": 0.8, "near": 0.01,
+    "far": 10.0, "image_height": 100, "image_width": 100, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def course():
+    return read_trajectory(Stories().trajectory(STORY))
+
+
+class Page:
+    """A page whose view is open."""
+
+    def __init__(self, live, name):
+        self._clients, before = live.services.viewer.server.get_clients, set(live.services.viewer.server.get_clients())
+        self._address, self._socket = f"ws://127.0.0.1:{live.port}/viewer/{name}", None
+        self._socket = connect(
+            self._address, subprotocols=[f"viser-v{viser.__version__}"], compression=None, max_size=None, proxy=None
+        )
+        self._socket.send(msgspec.msgpack.encode(CAMERA))
+        until(lambda: set(self._clients()) - before)
+        (self._number,) = set(self._clients()) - before
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._socket.close()
+        until(lambda: self._number not in self._clients())
+
+    def own(self, path):
+        """A node that this browser alone sees; None if there is none."""
+        return self._clients()[self._number].scene.get_handle_by_name(path)
+
+    def hides(self, path):
+        node = self.own(path)
+        return node is not None and not node.visible
+
+
+def ask(live, page, replay=None, **more):
+    status, answer = live.request("PUT", f"/api/views/{page}", {"replay": replay, **more})
+    assert status == 200, answer
+    return answer["is_open"]
+
+
+def test_a_page_sees_an_episode_in_place_of_the_live_table_and_other_pages_do_not(live, shown, course):
+    with Page(live, "one") as one, Page(live, "two") as two:
+        assert ask(live, "one", {"story": STORY, "at_s": 0.0})
+        until(lambda: one.own(f"/replay/objects/{course.names[0]}"))
+        assert one.hides("/objects")
+        assert one.hides("/lamp")
+        assert two.own("/replay") is two.own("/objects") is None
+        ask(live, "one")
+        until(lambda: one.own("/replay") is None)
+        assert one.own("/objects") is None
+
+
+@pytest.mark.parametrize("step", [0, 3, -1])
+def test_everything_is_where_it_was_after_a_step(live, course, step):
+    at_s, action = ReplayClock(course).step_s[step], course.rounds[step].action
+    with Page(live, "page") as page:
+        ask(live, "page", {"story": STORY, "at_s": at_s})
+        body = until(lambda: page.own(f"/replay/objects/{course.names[0]}"))
+        until(lambda: np.allclose(body.position, course.states[action].poses.position[0], atol=1e-5))
+        until(lambda: np.allclose(page.own("/replay/pusher").position, course.states[action].pusher, atol=1e-5))
+        until(lambda: page.own(f"/replay/episode/goal/where/{course.names[0]}"))
+        ask(live, "page")
+
+
+def test_it_plays_to_the_end_by_itself_faster_if_wanted(live, course):
+    end_s = ReplayClock(course).length_s
+    with Page(live, "page") as page:
+        ask(live, "page", {"story": STORY, "at_s": end_s - 4.0, "plays": True, "speed": 16.0})
+        pusher = until(lambda: page.own("/replay/pusher"))
+        until(lambda: np.allclose(pusher.position, course.states[-1].pusher, atol=1e-5))
+        ask(live, "page")
+
+
+def test_what_was_asked_for_is_shown_once_the_view_opens_and_again_after_a_reload(live, course):
+    assert not ask(live, "late", {"story": STORY, "at_s": 0.0})
+    for _ in range(2):
+        with Page(live, "late") as page:
+            until(lambda page=page: page.own(f"/replay/objects/{course.names[0]}"))
+    ask(live, "late")
+
+
+def test_a_page_chooses_between_meshes_and_beliefs(live, shown):
+    with Page(live, "page") as page:
+        until(lambda: page.hides("/episode/estimate/tracked"))
+        ask(live, "page", shows="beliefs")
+        until(lambda: page.hides("/objects") and page.hides("/shadows"))
+        assert page.own("/episode/estimate/tracked") is None
+        ask(live, "page", shows="meshes")
+        until(lambda: page.own("/objects") is None)
+
+
+@pytest.mark.parametrize(
+    ("replay", "status", "words"),
+    [
+        ({"at_s": 0.0}, 422, "an episode or a story"),
+        ({"episode": "a", "story": "b"}, 422, "an episode or a story"),
+        ({"story": "../presets"}, 404, "story"),
+        ({"episode": "nobody"}, 404, "nobody"),
+        ({"story": STORY, "at_s": -1.0}, 422, "greater than or equal to 0"),
+        ({"story": STORY, "speed": 0.0}, 422, "greater than or equal to 0.1"),
+    ],
+)
+def test_what_cannot_be_shown_is_told(live, replay, status, words):
+    answer = live.request("PUT", "/api/views/page", {"replay": replay})
+    assert answer[0] == status
+    assert words in str(answer[1])
+
+
+def test_a_view_is_of_a_page_with_a_plain_name(live):
+    assert live.request("PUT", "/api/views/a%20b", {"replay": None})[0] == 422
