@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
@@ -48,6 +49,7 @@ from app.api.schemas.goals import GoalIn
 from app.processes.predict_process import predictor_main
 from app.processes.process_client import ProcessClient
 from app.processes.render_process import renderer_main
+from app.services.disturber import Disturber
 from app.services.driver import Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
@@ -155,6 +157,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             episode_service,
             driver_seat,
             Outliner(runner.library),
+            Disturber(runner, np.random.default_rng()),
         )
         app.state.services = services
         app.state.metrics.watch(runner)

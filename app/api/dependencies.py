@@ -15,6 +15,7 @@ from app.api.lanes import Lanes
 from app.api.schemas.common import SceneOut
 from app.processes.messages.scene_messages import SceneRecord
 from app.processes.process_client import ProcessClient
+from app.services.disturber import Disturber
 from app.services.driver import Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
@@ -83,6 +84,7 @@ class Services:
     episodes: Episodes
     driver: Driver
     outliner: Outliner
+    disturber: Disturber
     event_texts: EventTexts = field(default_factory=EventTexts)
     lanes: Lanes = field(default_factory=Lanes)
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set

@@ -32,6 +32,7 @@ STATUS_OF_KIND = {
     "NoScene": 409,
     "NoTable": 409,
     "NoTrajectory": 409,
+    "NoRoomToNudge": 409,
     "NoDraft": 404,
     "DraftUnsound": 409,
     "TooManyGoals": 409,

@@ -27,6 +27,11 @@ def image_png(world: Tabletop, command: TakeImage) -> bytes:
     return encode_png(pixels if observation.masks is None else tint_masks(pixels, observation.masks[0]))
 
 
+def view_png(world: Tabletop, camera: Camera, *, with_pusher: bool) -> bytes:
+    """What any camera would see."""
+    return encode_png(to_uint8(world.render((camera,), with_pusher=with_pusher).images[0]))
+
+
 def mask_png(world: Tabletop, command: TakeMask) -> bytes:
     """The visible pixels of one object, 0 and 255.
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.processes.child_process import import_quietly
+from app.processes.disturbances import Disturbances
 from app.processes.messages.scene_messages import (
     Act,
     AdoptScene,
@@ -25,6 +26,7 @@ from app.processes.messages.scene_messages import (
     ComposedGoal,
     ComposeGoal,
     CreateScene,
+    Disturb,
     DropScene,
     EditScene,
     FramesTaken,
@@ -39,7 +41,7 @@ from app.processes.messages.scene_messages import (
     WatchFrames,
 )
 from app.processes.process_server import IsOvertaken, ProcessServer
-from app.processes.scene_pictures import image_png, mask_png
+from app.processes.scene_pictures import image_png, mask_png, view_png
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
 from osfcore.geometry.light import Light
@@ -59,13 +61,7 @@ _log = logging.getLogger(__name__)
 
 
 def simulation_main(server: ProcessServer, objects_root: Path, max_live_worlds: int) -> None:
-    """Carry out commands until the service has gone.
-
-    Args:
-        server: the pipe to the service.
-        objects_root: folder of the asset library.
-        max_live_worlds: scenes whose simulation stays in memory.
-    """
+    """Carry out commands until the service has gone; `server` is the pipe to it, the others as in `Simulation`."""
     import_quietly("osfcore.world.tabletop")  # slow, so before the simulation calls itself ready
     with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
         simulation = Simulation(server.send, AssetLibrary(objects_root), executor, max_live_worlds)
@@ -95,6 +91,7 @@ class Simulation:
         self._records: dict[str, SceneRecord] = {}
         self._worlds: OrderedDict[str, Tabletop] = OrderedDict()
         self._time_offsets: dict[str, float] = {}
+        self._disturbances = Disturbances()
         self._shown: str | None = None
         self._frames_wanted = False
         self._frames_due = False
@@ -144,19 +141,23 @@ class Simulation:
                 return record
             case DropScene(scene):
                 self._records.pop(scene, None)
+                self._disturbances.forget(scene)
                 self._forget_world(scene)
             case ResetScene(scene):
                 record = self._record(scene)
+                self._disturbances.forget(scene)
                 return self._put(record, record.initial, time_s=0.0)
             case EditScene():
                 return self._edit(command)
             case Act(scene, actions):
                 return self._act(scene, tuple(check_action(a) for a in actions))
+            case Disturb(scene, disturbance):
+                self._disturbances.take(scene, disturbance)
+                return self._report(self._record(scene))
             case TakeImage():
                 return image_png(self._world(command.id), command)
             case TakeView(scene, camera, pusher):
-                image = self._world(scene).render((camera,), with_pusher=pusher).images[0]
-                return encode_png(to_uint8(image))
+                return view_png(self._world(scene), camera, with_pusher=pusher)
             case TakeMask():
                 return mask_png(self._world(command.id), command)
             case ObserveScene():
@@ -300,6 +301,8 @@ class Simulation:
         record, world = self._record(command.id), self._world(command.id)
         cameras = (goal_camera(record.image_size),) if command.goal else default_cameras(record.image_size)
         observation = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
+        if not command.goal:
+            observation = self._disturbances.apply(command.id, observation)
         write_observation(command.folder, observation)
         return replace(record, state=world.truth())
 
@@ -330,7 +333,8 @@ class Simulation:
         self._frames_due = False
         record = self._records[self._shown]
         try:
-            observation = self._world(record.id).render(default_cameras(min(record.image_size, MAX_FRAME_SIDE)))
+            cameras = default_cameras(min(record.image_size, MAX_FRAME_SIDE))
+            observation = self._disturbances.apply(record.id, self._world(record.id).render(cameras))
         except OsfError as error:
             _log.warning("no live images of scene %s: %s", record.id, error)
             return

@@ -13,7 +13,7 @@ from app.jobs.job_process import JobProcess
 from app.jobs.registry import Jobs
 from app.jobs.standby import Standby
 from app.jobs.stored import check_stored
-from app.processes.messages.scene_messages import Act, Command
+from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene, SceneRecord
 from app.services.event_hub import Notice
 from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes
@@ -152,6 +152,15 @@ class Runner(Scenes):
                 if job.params.get("scene") == scene:
                     raise SceneNeeded(scene, job)
             super().delete_scene(scene)
+
+    def disturb(self, command: Disturb | EditScene) -> SceneRecord:
+        """Do something to a scene or its pictures, even while a job drives it.
+
+        Raises:
+            UnknownName: if there is no such scene or object.
+            OsfError: if something would overlap; then nothing moves.
+        """
+        return self._change(command)
 
     def leftovers(self) -> tuple[Leftover, ...]:
         """What trainings have left that did not finish, or have made so far, sorted by name."""

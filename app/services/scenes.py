@@ -17,6 +17,7 @@ from app.processes.messages.scene_messages import (
     ComposedGoal,
     ComposeGoal,
     CreateScene,
+    Disturb,
     DropScene,
     EditScene,
     FramesTaken,
@@ -282,7 +283,7 @@ class Scenes:
 
     # Inside
 
-    def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
+    def _change(self, command: ResetScene | EditScene | Act | Disturb) -> SceneRecord:
         self.scene(command.id)
         record: SceneRecord = self._simulation.call(command)
         with self._lock:

@@ -36,6 +36,7 @@ from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, 
 from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels
+from osfcore.control.sight import Sight
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
 from osfcore.estimation.first_frame import estimate_first
@@ -93,7 +94,7 @@ class Episode:
         self._planner = MPPIPlanner(models.dynamics.rollout, PushProposals(models.shapes), settings.plan)
         self._start, self._prepared = start, prepared
         self._number = 0
-        self._progress = ProgressMonitor()
+        self._progress, self._sight = ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
         self._searches = 0
         self._seconds: dict[str, float] = {}
@@ -132,19 +133,26 @@ class Episode:
     # Looking
 
     def _begin(self) -> Iterator[Event]:
-        observation = self._world.observe(masks=self._start is None)
+        observation = yield from self._observe(masks=self._start is None)
         self._check_objects(observation.names)
-        yield Observed(0, observation)
         if self._start is None:
             steps = estimate_first(self._models.appearance, observation, self._rng)
             self._estimate = yield from self._look("first", observation, steps)
         else:
             self._estimate = self._start
-        self._estimate = _with_pusher(self._estimate, observation.pusher)
+        self._estimate = self._estimate.with_pusher(observation.pusher)
         self._usual = expected_residuals(self._models.appearance, observation, self._estimate.state)
-        self._weak = frozenset(_doubted(self._estimate))
+        self._weak = frozenset(self._estimate.doubted)
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
+
+    def _observe(self, *, masks: bool = False) -> Iterator[Event]:  # returns the Observation
+        raw = self._world.observe(masks=masks)
+        yield Observed(self._number, raw)
+        observation, changes = self._sight.take(raw)
+        for change in changes:
+            yield self._noticed(change.matter, change.text)
+        return observation
 
     def _look(
         self, look: Look, observation: Observation, steps: Iterator[EstimateStep]
@@ -172,13 +180,12 @@ class Episode:
         return estimate
 
     def _look_again(self) -> Iterator[Event]:
-        observation = self._world.observe()
-        yield Observed(self._number, observation)
+        observation = yield from self._observe()
         before = self._estimate
         expected = before.state if self._expected is None else self._expected
         models = self._models.appearance
         steps = estimate_next(models, observation, expected, self._rng, usual=self._usual)
-        self._estimate = _with_pusher((yield from self._run_estimator("next", steps)), observation.pusher)
+        self._estimate = (yield from self._run_estimator("next", steps)).with_pusher(observation.pusher)
         yield from self._noticed_changes(before, expected)
         yield from self._find_lost()
         self._expected = None
@@ -196,7 +203,7 @@ class Episode:
 
     def _find_lost(self) -> Iterator[Event]:
         """Look anew for what has been doubted for some time, once the pusher has made room."""
-        doubted = (name for name in _doubted(self._estimate) if name not in self._weak)
+        doubted = (name for name in self._estimate.doubted if name not in self._weak)
         self._doubted = {name: self._doubted.get(name, 0) + 1 for name in doubted}
         lost = tuple(name for name, looks in self._doubted.items() if looks >= _LOST_AFTER)
         if not lost or self._searches >= _SEARCHES:
@@ -206,10 +213,9 @@ class Episode:
         yield self._noticed("lost", f"Lost sight of {', '.join(lost)}; looking for it everywhere.", lost)
         if self.settings.acting:
             yield from self._retreat()
-        observation = self._world.observe()
-        yield Observed(self._number, observation)
+        observation = yield from self._observe()
         steps = relocalize(self._models.appearance, observation, self._estimate, self._rng)
-        self._estimate = _with_pusher((yield from self._run_estimator("search", steps)), observation.pusher)
+        self._estimate = (yield from self._run_estimator("search", steps)).with_pusher(observation.pusher)
         self._planner.reset()
         self._before = None
         if self._estimate.trusted:
@@ -329,15 +335,6 @@ class Episode:
 
     def _finished(self, outcome: Outcome, text: str) -> Finished:
         return Finished(self._number, outcome, text, self._estimate.state)
-
-
-def _doubted(estimate: EstimatedState) -> list[str]:
-    return [name for name, doubt in zip(estimate.state.names, estimate.doubts, strict=True) if doubt]
-
-
-def _with_pusher(estimate: EstimatedState, pusher: Float[np.ndarray, "3"] | None) -> EstimatedState:
-    """The robot knows its hand."""
-    return replace(estimate, state=replace(estimate.state, pusher=pusher))
 
 
 def _in_order(goal: PoseGoal, names: tuple[str, ...]) -> Pose:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -47,3 +47,12 @@ class EstimatedState:
     def trusted(self) -> bool:
         """Whether to act on it."""
         return not self.reason
+
+    @property
+    def doubted(self) -> tuple[str, ...]:
+        """Objects that should not be trusted."""
+        return tuple(name for name, doubt in zip(self.state.names, self.doubts, strict=True) if doubt)
+
+    def with_pusher(self, pusher: Float[np.ndarray, "3"] | None) -> EstimatedState:
+        """The same with the pusher where the robot says it is: it knows its hand [m]."""
+        return replace(self, state=replace(self.state, pusher=pusher))

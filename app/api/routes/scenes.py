@@ -3,15 +3,17 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response, status
+from pydantic import BaseModel, Field
 
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow
 from app.api.problems import NotFound, named_in_path
 from app.api.routes import PNG, problems
-from app.api.schemas.common import ActionsIn, ImageSize, SceneIn, SceneList, SceneOut, ScenePatch
+from app.api.schemas.common import ActionsIn, ImageSize, Input, SceneIn, SceneList, SceneOut, ScenePatch
 from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
+from app.services.disturber import Kind
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS
 
@@ -89,6 +91,28 @@ def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
         poses=tuple(pose.named_pose() for pose in body.objects or ()),
     )
     return services.scene_out(record)
+
+
+class DisturbanceIn(Input):
+    """What to do to a scene behind the program's back."""
+
+    kind: Kind = Field(description="Dimming and covering are undone by asking once more.")
+
+
+class DisturbanceOut(BaseModel):
+    """What was done."""
+
+    text: str
+    scene: SceneOut
+
+
+@router.post("/{scene}/disturbances", responses=problems(404, 409, 503))
+@slow
+def disturb(services: ServicesDep, scene: SceneId, body: DisturbanceIn) -> DisturbanceOut:
+    """Try to fool an episode while it runs: turn the lamp, dim the light, nudge an object, cover a camera."""
+    record_of(services, scene)
+    record, text = services.disturber.disturb(scene, body.kind)
+    return DisturbanceOut(text=text, scene=services.scene_out(record))
 
 
 @router.post("/{scene}/actions", responses=problems(404, 409))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from app.processes.disturbances import Disturbance
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -88,6 +89,14 @@ class EditScene:
     light: Light | None = None
     poses: tuple[tuple[str, Pose], ...] = ()
     settle: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Disturb:
+    """Do something to a scene's pictures. Answered by a SceneRecord."""
+
+    id: str
+    disturbance: Disturbance
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -202,6 +211,7 @@ Command = (
     | ResetScene
     | EditScene
     | Act
+    | Disturb
     | TakeImage
     | TakeView
     | TakeMask

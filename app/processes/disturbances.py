@@ -1,0 +1,51 @@
+"""What people do to the pictures of a scene to see whether the program notices: dim the light, cover a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from osfcore.geometry.states import Observation
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """What is done to a scene's pictures; it lasts until the scene is put back or the simulation starts again.
+
+    Attributes:
+        brightness: factor of all radiance, ambient light included, as a dimmed lamp in a dark room has it.
+        covered: names of cameras that see black.
+    """
+
+    brightness: float = 1.0
+    covered: frozenset[str] = frozenset()
+
+    def apply(self, observation: Observation) -> Observation:
+        """The observation as it is with this."""
+        if self == Disturbance():
+            return observation
+        images = observation.images * np.float32(self.brightness)
+        for view, camera in enumerate(observation.cameras):
+            if camera.name in self.covered:
+                images[view] = 0
+        return replace(observation, images=images)
+
+
+class Disturbances:
+    """What is done to each scene now."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, Disturbance] = {}
+
+    def take(self, scene: str, disturbance: Disturbance) -> None:
+        """From now on, a scene's cameras see it with this."""
+        self._of[scene] = disturbance
+
+    def forget(self, scene: str) -> None:
+        """Back to what is there."""
+        self._of.pop(scene, None)
+
+    def apply(self, scene: str, observation: Observation) -> Observation:
+        """An observation of a scene as its cameras see it."""
+        return self._of.get(scene, Disturbance()).apply(observation)
