@@ -8,6 +8,8 @@ import numpy as np
 
 from osfcore.geometry.states import Observation
 
+DIMMED = 0.45
+
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
@@ -38,9 +40,15 @@ class Disturbances:
     def __init__(self) -> None:
         self._of: dict[str, Disturbance] = {}
 
-    def take(self, scene: str, disturbance: Disturbance) -> None:
-        """From now on, a scene's cameras see it with this."""
-        self._of[scene] = disturbance
+    def toggle(self, scene: str, camera: str | None) -> Disturbance:
+        """Cover a camera, or dim the light for None; undo it where that, or any camera, is so already."""
+        now = self._of.get(scene, Disturbance())
+        if camera is None:
+            then = replace(now, brightness=DIMMED if now.brightness == 1.0 else 1.0)
+        else:
+            then = replace(now, covered=frozenset() if now.covered else frozenset({camera}))
+        self._of[scene] = then
+        return then
 
     def forget(self, scene: str) -> None:
         """Back to what is there."""

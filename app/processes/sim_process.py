@@ -151,9 +151,9 @@ class Simulation:
                 return self._edit(command)
             case Act(scene, actions):
                 return self._act(scene, tuple(check_action(a) for a in actions))
-            case Disturb(scene, disturbance):
-                self._disturbances.take(scene, disturbance)
-                return self._report(self._record(scene))
+            case Disturb(scene, camera):
+                self._report(self._record(scene))  # new pictures are due
+                return self._disturbances.toggle(scene, camera)
             case TakeImage():
                 return image_png(self._world(command.id), command)
             case TakeView(scene, camera, pusher):

@@ -20,7 +20,6 @@ from osfcore.geometry.workspace import WORKSPACE_HALF_M
 Kind = Literal["turn lamp", "dim light", "nudge object", "cover camera"]
 _TURN_RAD = np.deg2rad((60.0, 150.0))
 _ELEVATION_RAD = np.deg2rad((25.0, 60.0))
-_DIMMED = 0.45
 _NUDGE_M = (0.04, 0.07)
 _PLACES = 16  # that a nudged object tries
 
@@ -43,7 +42,6 @@ class Disturber:
     def __init__(self, runner: Runner, rng: np.random.Generator) -> None:
         self._runner, self._rng = runner, rng
         self._lock = threading.Lock()
-        self._now: dict[str, Disturbance] = {}
 
     def disturb(self, scene: str, kind: Kind) -> tuple[SceneRecord, str]:
         """Do it; dimming and covering are undone by the second time.
@@ -94,19 +92,14 @@ class Disturber:
         raise NoRoomToNudge
 
     def _dim(self, record: SceneRecord) -> tuple[SceneRecord, str]:
-        now = self._now.get(record.id, Disturbance())
-        brightness = _DIMMED if now.brightness == 1.0 else 1.0
-        text = f"The light was dimmed to {100 * _DIMMED:.0f} %." if brightness != 1.0 else "The light is as it was."
-        return self._set(record, Disturbance(brightness, now.covered)), text
+        brightness = self._toggle(record.id, None).brightness
+        text = f"The light was dimmed to {100 * brightness:.0f} %." if brightness != 1.0 else "The light is as it was."
+        return self._runner.scene(record.id), text
 
     def _cover(self, record: SceneRecord) -> tuple[SceneRecord, str]:
-        now = self._now.get(record.id, Disturbance())
-        if now.covered:
-            return self._set(record, Disturbance(now.brightness)), "No camera is covered now."
-        name = str(self._rng.choice([camera.name for camera in default_cameras()]))
-        return self._set(record, Disturbance(now.brightness, frozenset({name}))), f"Camera {name} is covered."
+        covered = self._toggle(record.id, str(self._rng.choice([camera.name for camera in default_cameras()]))).covered
+        text = "".join(f"Camera {name} is covered." for name in covered) or "No camera is covered now."
+        return self._runner.scene(record.id), text
 
-    def _set(self, record: SceneRecord, disturbance: Disturbance) -> SceneRecord:
-        done = self._runner.disturb(Disturb(record.id, disturbance))
-        self._now[record.id] = disturbance
-        return done
+    def _toggle(self, scene: str, camera: str | None) -> Disturbance:
+        return self._runner.disturb(Disturb(scene, camera))

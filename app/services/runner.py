@@ -13,7 +13,7 @@ from app.jobs.job_process import JobProcess
 from app.jobs.registry import Jobs
 from app.jobs.standby import Standby
 from app.jobs.stored import check_stored
-from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene, SceneRecord
+from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene
 from app.services.event_hub import Notice
 from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes
@@ -153,14 +153,17 @@ class Runner(Scenes):
                     raise SceneNeeded(scene, job)
             super().delete_scene(scene)
 
-    def disturb(self, command: Disturb | EditScene) -> SceneRecord:
+    def disturb(self, command: Disturb | EditScene) -> Any:  # noqa: ANN401  each command says what answers it
         """Do something to a scene or its pictures, even while a job drives it.
 
         Raises:
             UnknownName: if there is no such scene or object.
             OsfError: if something would overlap; then nothing moves.
         """
-        return self._change(command)
+        if isinstance(command, EditScene):
+            return self._change(command)
+        self.scene(command.id)
+        return self._simulation.call(command)
 
     def leftovers(self) -> tuple[Leftover, ...]:
         """What trainings have left that did not finish, or have made so far, sorted by name."""

@@ -17,7 +17,6 @@ from app.processes.messages.scene_messages import (
     ComposedGoal,
     ComposeGoal,
     CreateScene,
-    Disturb,
     DropScene,
     EditScene,
     FramesTaken,
@@ -283,7 +282,7 @@ class Scenes:
 
     # Inside
 
-    def _change(self, command: ResetScene | EditScene | Act | Disturb) -> SceneRecord:
+    def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
         self.scene(command.id)
         record: SceneRecord = self._simulation.call(command)
         with self._lock:

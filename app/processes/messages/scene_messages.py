@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from app.processes.disturbances import Disturbance
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -93,10 +92,10 @@ class EditScene:
 
 @dataclass(frozen=True, slots=True)
 class Disturb:
-    """Do something to a scene's pictures. Answered by a SceneRecord."""
+    """Dim the light, or cover a camera; undo it where that is so already. Answered by a `Disturbance`."""
 
     id: str
-    disturbance: Disturbance
+    camera: str | None  # None for the light
 
 
 @dataclass(frozen=True, eq=False, slots=True)
