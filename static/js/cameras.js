@@ -50,7 +50,7 @@ function url(scene, camera, size, { pusher = true } = {}) {
 }
 
 function refresh(scene) {
-  byId("camera-strip").querySelector(".of-goal").textContent = labelOfTile("goal");
+  byId("camera-strip").querySelector(".of-goal").firstChild.nodeValue = labelOfTile("goal");
   for (const [name, tile] of tiles) {
     if (!scene) tile.image.removeAttribute("src");
     else if (name === "goal" || showsMasks) tile.latest.show(url(scene, name, 128, { pusher: name !== "goal" }));

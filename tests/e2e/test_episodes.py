@@ -112,7 +112,7 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     assert "× real time" in page.inner_text("#first-seconds")
     page.select_option("#timeline-speed", "4")
     page.click("#timeline-play")
-    until(lambda: page.get_attribute("#timeline-play", "aria-label") == "Play the pictures")
+    until(lambda: page.get_attribute("#timeline-play", "aria-label") == "Play the episode")
     assert page.input_value("#timeline") == "3"
     page.click("#watch-video")
     until(lambda: page.eval_on_selector("#shown-video", "video => video.readyState >= 2 && video.videoWidth === 768"))
