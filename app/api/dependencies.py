@@ -22,9 +22,11 @@ from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
 from app.services.look_outlines import Outliner
+from app.services.own_objects import OwnObjects
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
+from app.services.thumbnails import Thumbnails
 from app.storage.database import Store
 from app.viewer import Viewer
 from osfcore.errors import OsfError
@@ -53,6 +55,12 @@ class ObjectCatalogue:
                     if name not in self._labels:
                         self._labels[name] = _label(self._library, name)
             return self._names
+
+    def outdate(self) -> None:
+        """Look anew when next asked."""
+        with self._lock:
+            self._seen_at = -_FRESH_S
+            self._labels = {name: info.label for name, info in CATALOGUE.items()}
 
     def labels(self) -> dict[str, str]:
         """Names for people, by name."""
@@ -83,6 +91,8 @@ class Services:
     goals: Goals
     episodes: Episodes
     driver: Driver
+    own_objects: OwnObjects
+    thumbnails: Thumbnails
     outliner: Outliner
     disturber: Disturber
     event_texts: EventTexts = field(default_factory=EventTexts)
