@@ -100,6 +100,15 @@ class UnpackedFiles(Resolver):
         self.missing.append(shown(wanted))
         raise FileNotFoundError(wanted)
 
+    def write(self, name: str, data: object) -> None:
+        """Nothing is written beside a stranger's mesh.
+
+        Raises:
+            PermissionError: always.
+        """
+        del data
+        raise PermissionError(name)
+
     def keys(self) -> list[str]:
         """The names of all files."""
         return sorted(str(path.relative_to(self._root)) for path in self._root.rglob("*") if path.is_file())
