@@ -83,13 +83,13 @@ class UnpackedFiles(Resolver):
         self._root, self._folder = root.resolve(), mesh.resolve().parent
         self.missing: list[str] = []
 
-    def get(self, name: str) -> bytes:
+    def get(self, key: str) -> bytes:
         """The contents of a file.
 
         Raises:
             FileNotFoundError: if it is not among the unpacked; it is then in `missing`, too.
         """
-        plain = name.strip().replace("\\", "/")
+        plain = key.strip().replace("\\", "/")
         direct = (self._folder / plain).resolve()
         if direct.is_relative_to(self._root) and direct.is_file():
             return direct.read_bytes()

@@ -24,5 +24,6 @@ export async function glbSize(file) {
     }
   }
   const size = high.map((most, i) => most - low[i]);
-  return size.every(Number.isFinite) ? size : null;
+  const [x, y, z] = size; // y is up in a GLB, z on the table
+  return size.every(Number.isFinite) ? [x, z, y] : null;
 }

@@ -5,14 +5,15 @@ import { doubted } from "./doubt.js";
 import { prepareTraining } from "./fields.js";
 import { showJob } from "./jobs.js";
 import { makeScene } from "./scenes.js";
+import { closeStory } from "./story.js";
 import { current, known, objects, set, watch } from "./state.js";
-import { showTab } from "./tabs.js";
+import { scrollTo, showTab } from "./tabs.js";
 import { tellFailure, toast } from "./toasts.js";
 
 const MOST_ON_TABLE = 8;
 const SIDE = 96; // of one view in a thumbnail [px]
 const VIEWS = 24;
-const SYMMETRY = { none: "no symmetry", discrete: "discrete symmetry", continuous: "turns freely" };
+const SYMMETRY = { none: "", discrete: "discrete symmetry", continuous: "turns freely" };
 
 /** The sides of a box in metres, in words. */
 export const sizeText = (metres) => `${metres.map((side) => (100 * side).toFixed(1)).join(" × ")} cm`;
@@ -30,7 +31,7 @@ function facts(object) {
   const symmetry = el("span", { textContent: SYMMETRY[object.symmetry.kind], title: object.symmetry.reason });
   const weight = `${Number((1000 * object.mass_kg).toPrecision(3))} g`;
   return el("span", { className: "hint" }, object.size_m ? `${sizeText(object.size_m)}, ` : "", weight,
-    object.own ? "" : ", ", object.own ? "" : symmetry, object.available ? "" : ", not on this machine");
+    symmetry.textContent ? ", " : "", symmetry, object.available ? "" : ", not on this machine");
 }
 
 async function putOnTable(object) {
@@ -38,6 +39,7 @@ async function putOnTable(object) {
   if (there.includes(object.name)) throw new Error(`${object.label} is on the table already.`);
   if (there.length >= MOST_ON_TABLE) throw new Error(`${MOST_ON_TABLE} objects are on the table, which is the most.`);
   const light = current() ? { light: { position: current().light.position } } : {};
+  closeStory();
   await makeScene({ objects: [...there, object.name], seed: Math.floor(Math.random() * 2 ** 31), ...light });
   toast(`${object.label} is on the table, in a scene of its own; the one before is kept under Scenes.`);
 }
@@ -103,6 +105,7 @@ function draw() {
 export function setUpObjects() {
   const all = byId("fetch-objects");
   all.addEventListener("click", () => fetchObjects(all));
+  byId("add-own").addEventListener("click", () => scrollTo(byId("new-object").closest(".card")));
   watch("objects", draw);
   watch("fields", draw);
 }
