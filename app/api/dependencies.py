@@ -22,11 +22,11 @@ from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
 from app.services.look_outlines import Outliner
-from app.services.own_objects import OwnObjects
+from app.services.objects.own_objects import OwnObjects
+from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
-from app.services.thumbnails import Thumbnails
 from app.storage.database import Store
 from app.viewer import Viewer
 from osfcore.errors import OsfError
