@@ -67,12 +67,15 @@ def get(services: ServicesDep, name: Name) -> ObjectOut:
         return _object(services, name)
 
 
-@router.delete("/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507))
-def delete(services: ServicesDep, name: Name) -> None:
+@router.delete(
+    "/{name}", response_class=Response, status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507)
+)
+def delete(services: ServicesDep, name: Name) -> Response:
     """Delete an object that was added here; its field stays, and counts again for a new object of that name."""
     with named_in_path():
         services.own_objects.delete(name)
     services.objects.outdate()
+    return Response(status_code=status.HTTP_204_NO_CONTENT)
 
 
 @router.get("/{name}/thumbnail.png", response_class=Response, responses={**problems(404, 409, 503), **PNG})
