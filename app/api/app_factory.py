@@ -56,6 +56,8 @@ from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
 from app.services.look_outlines import Outliner
+from app.services.objects.own_objects import OwnObjects
+from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
@@ -76,7 +78,7 @@ _ROUTES = (
     status, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs,
     driver, views, stories, storage, events,
 )  # fmt: skip
-_UPLOAD_PATHS = (fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
+_UPLOAD_PATHS = (objects.UPLOAD_PATH, fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
 
 
@@ -142,6 +144,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
+        thumbnails = Thumbnails(runner.library, settings.data_dir / "thumbnails")
+        stack.push_async_callback(run_in_threadpool, thumbnails.stop)
         driver_seat = Driver(runner.hub.publish)
         services = Services(
             settings,
@@ -156,6 +160,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             goal_service,
             episode_service,
             driver_seat,
+            OwnObjects(runner),
+            thumbnails,
             Outliner(runner.library),
             Disturber(runner, np.random.default_rng()),
         )

@@ -22,6 +22,8 @@ from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
 from app.services.look_outlines import Outliner
+from app.services.objects.own_objects import OwnObjects
+from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
@@ -54,6 +56,12 @@ class ObjectCatalogue:
                         self._labels[name] = _label(self._library, name)
             return self._names
 
+    def outdate(self) -> None:
+        """Look anew when next asked."""
+        with self._lock:
+            self._seen_at = -_FRESH_S
+            self._labels = {name: info.label for name, info in CATALOGUE.items()}
+
     def labels(self) -> dict[str, str]:
         """Names for people, by name."""
         self.names()
@@ -83,6 +91,8 @@ class Services:
     goals: Goals
     episodes: Episodes
     driver: Driver
+    own_objects: OwnObjects
+    thumbnails: Thumbnails
     outliner: Outliner
     disturber: Disturber
     event_texts: EventTexts = field(default_factory=EventTexts)

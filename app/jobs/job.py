@@ -11,7 +11,14 @@ from osfcore.errors import InvalidInput, OsfError, UnknownName, shown
 from osfcore.io.json_codec import decode
 
 Kind = Literal[
-    "collect_pushes", "collect_object", "collect_table", "fetch_assets", "train_field", "estimate", "episode"
+    "collect_pushes",
+    "collect_object",
+    "collect_table",
+    "fetch_assets",
+    "add_object",
+    "train_field",
+    "estimate",
+    "episode",
 ]
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files

@@ -22,6 +22,11 @@ class _Training(_Named):
     source: _Source
 
 
+class _Adding(_Named):
+    object: dict[str, Any]
+    file_name: Text
+
+
 class _Of(Entry):
     scene: Text | None
 
@@ -45,7 +50,13 @@ class _Episode(Entry):
     goal: _Goal
 
 
-_PARAMS = {"collect_object": _Named, "train_field": _Training, "estimate": _Estimate, "episode": _Episode}
+_PARAMS = {
+    "collect_object": _Named,
+    "add_object": _Adding,
+    "train_field": _Training,
+    "estimate": _Estimate,
+    "episode": _Episode,
+}
 
 
 def check_stored(job: Job) -> None:

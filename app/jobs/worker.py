@@ -48,6 +48,12 @@ def _fetch_assets(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
     yield from fetch(tuple(params["names"]), source, place.library)
 
 
+def _add_object(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.objects import add_object_job
+
+    yield from add_object_job(params, place)
+
+
 def _train_field(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
     from app.jobs.kinds.fields import train_field_job
 
@@ -71,11 +77,12 @@ KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "collect_object": _collect_object,
     "collect_table": _collect_table,
     "fetch_assets": _fetch_assets,
+    "add_object": _add_object,
     "train_field": _train_field,
     "estimate": _estimate,
     "episode": _episode,
 }
-_WITHOUT_PHYSICS = ("fetch_assets", "train_field", "estimate")
+_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate")
 _NOT_EXTRA = ("done", "total", "note", "view")
 
 

@@ -237,5 +237,9 @@ class Runner(Scenes):
 
     def _on_job(self, event: JobEvent) -> None:
         self.hub.publish(event)
-        if isinstance(event, JobChanged) and event.job.kind == "fetch_assets" and event.job.state == "done":
+        if (
+            isinstance(event, JobChanged)
+            and event.job.kind in ("fetch_assets", "add_object")
+            and event.job.state == "done"
+        ):
             self.ensure_demo_scene()

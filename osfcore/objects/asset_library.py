@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, MissingAssets, UnknownName
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, TexturedMesh
@@ -171,6 +171,24 @@ class AssetLibrary:
                 for path in (*folder.iterdir(), folder):
                     _sync(path)
                 self._put(folder, self.root / asset.info.name)
+
+    def remove(self, name: str) -> None:
+        """Delete an object that a user added.
+
+        Raises:
+            UnknownName: if there is no such object.
+            InvalidInput: if it is the catalogue's.
+            CannotWrite: if that is not allowed.
+        """
+        self._known_facts(name)
+        if name in CATALOGUE:
+            raise InvalidInput("object to delete", name, "one that was added here; the catalogue's stay")
+        try:
+            with self._temporary(name) as trash:
+                os.rename(self.root / name, trash / "old")
+            _sync(self.root)
+        except OSError as error:
+            raise CannotWrite(self.root, error.strerror or str(error)) from error
 
     def _facts(self, name: str) -> dict[str, Any]:
         path = self.root / name / _FACTS

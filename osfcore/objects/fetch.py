@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -139,27 +140,56 @@ def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
     return ObjectAsset(info, mesh, parts, resting_poses(parts))
 
 
-def add_object(
-    mesh_path: Path,
-    name: str,
-    mass_kg: float,
-    library: AssetLibrary,
-    *,
-    label: str = "",
-    scale: float = 1.0,
-    licence: str = "unknown",
-    force: bool = False,
-) -> ObjectAsset:
+@dataclass(frozen=True, slots=True)
+class NewObject:
+    """What a user says of an object to add.
+
+    Attributes:
+        name: what scenes call it; not one of the catalogue's.
+        mass_kg: in (0, 20] [kg].
+        label: name for a person; from `name` if empty.
+        scale: metres for one unit of the file.
+        licence: of the mesh.
+    """
+
+    name: str
+    mass_kg: float
+    label: str = ""
+    scale: float = 1.0
+    licence: str = "unknown"
+
+    @property
+    def info(self) -> ObjectInfo:
+        """As the library keeps it."""
+        text = self.label or self.name.replace("_", " ").replace("-", " ").capitalize()
+        symmetry = Symmetry("none", reason="not examined")
+        return ObjectInfo(self.name, text, float(self.mass_kg), symmetry, self.licence, "added by the user")
+
+    def check(self) -> None:
+        """Refuse what no object may be.
+
+        Raises:
+            InvalidInput: if the name is malformed or the catalogue's, or a value is out of range.
+        """
+        check_name(self.name)
+        if self.name in CATALOGUE:
+            raise InvalidInput("object name", repr(self.name), "different from the names of the catalogue")
+        if not (math.isfinite(self.mass_kg) and 0 < self.mass_kg <= MAX_MASS_KG):
+            raise InvalidInput("mass [kg]", self.mass_kg, f"above 0 and at most {MAX_MASS_KG:g}")
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise InvalidInput("scale", self.scale, "above 0")
+        for what, text in (("label", self.label), ("licence", self.licence)):
+            if not text.isprintable() or len(text) > MAX_TEXT:  # unprintable: surrogates of broken encodings too
+                raise InvalidInput(what, ascii(text)[:40], f"printable text of at most {MAX_TEXT} characters")
+
+
+def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force: bool = False) -> ObjectAsset:
     """Put a user's own textured mesh into the library.
 
     Args:
         mesh_path: OBJ, GLB or another format of `read_mesh`.
-        name: what scenes call it; not one of the catalogue's.
-        mass_kg: in (0, 20] [kg].
+        new: what is said of it.
         library: where it goes.
-        label: name for a person; from `name` if empty.
-        scale: metres for one unit of the file.
-        licence: of the mesh.
         force: replace an object of that name.
 
     Raises:
@@ -167,26 +197,14 @@ def add_object(
         CorruptFile: if the mesh is unusable.
         FetchFailed: if the disk is full.
     """
-    check_name(name)
-    if name in CATALOGUE:
-        raise InvalidInput("object name", repr(name), "different from the names of the catalogue")
-    if not force and (library.root / name).exists():
+    new.check()
+    if not force and (library.root / new.name).exists():
         raise InvalidInput(
-            "object name", repr(name), "one that is not taken yet (or use --force to replace that object)"
+            "object name", repr(new.name), "one that is not taken yet (or use --force to replace that object)"
         )
-    if not (math.isfinite(mass_kg) and 0 < mass_kg <= MAX_MASS_KG):
-        raise InvalidInput("mass [kg]", mass_kg, f"above 0 and at most {MAX_MASS_KG:g}")
-    if not (math.isfinite(scale) and scale > 0):
-        raise InvalidInput("scale", scale, "above 0")
-    for what, text in (("label", label), ("licence", licence)):
-        if not text.isprintable() or len(text) > MAX_TEXT:  # unprintable: surrogates of broken encodings too
-            raise InvalidInput(what, ascii(text)[:40], f"printable text of at most {MAX_TEXT} characters")
     from osfcore.objects.mesh import read_mesh
 
-    mesh = read_mesh(Path(mesh_path), scale)
-    text = label or name.replace("_", " ").replace("-", " ").capitalize()
-    symmetry = Symmetry("none", reason="not examined")
-    asset = make_asset(mesh, ObjectInfo(name, text, float(mass_kg), symmetry, licence, "added by the user"))
+    asset = make_asset(read_mesh(Path(mesh_path), new.scale), new.info)
     library.write(asset, str(mesh_path))
     return asset
 

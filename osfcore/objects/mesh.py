@@ -24,16 +24,33 @@ _CREASE_RAD = np.deg2rad(50.0)  # edges sharper than this stay sharp: a box must
 _MIN_THICKNESS = 1e-3  # of the longest side; thinner is a sheet, which no solver can rest on a table
 
 
-def read_mesh(path: Path, scale: float = 1.0) -> TexturedMesh:
+class WrongMeshSize(InvalidInput):
+    """A mesh that is too small or too large for a tabletop object, most often because it is in another unit.
+
+    Args:
+        extents_m: of its bounding box [m].
+        source: what the message calls it.
+    """
+
+    def __init__(self, extents_m: Float[np.ndarray, "3"], source: Path | str) -> None:
+        self.longest_m = float(extents_m.max())
+        hint = "is it in millimetres" if self.longest_m > MAX_LENGTH_M else "is it in another unit"
+        size = " x ".join(f"{e:.4g}" for e in extents_m)
+        allowed = f"in metres ({hint}?), with the longest side between {MIN_LENGTH_M} and {MAX_LENGTH_M:g}"
+        super().__init__(f"size [m] of {source}", size, allowed)
+
+
+def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> TexturedMesh:
     """Read a mesh file with whatever texture or colours it has.
 
     Args:
         path: OBJ, GLB or another format that trimesh reads; its images lie beside it or inside.
         scale: metres for one unit of the file. GLB is turned from y up to z up; other formats count as z up.
+        unpacked: for what a stranger sent, the folder that holds all that the mesh may name; it must be complete.
 
     Raises:
         InvalidInput: if there is no such file, its kind is unknown or its size is not that of a tabletop object.
-        CorruptFile: if it holds no usable triangles.
+        CorruptFile: if it holds no usable triangles, or names what is not among the unpacked.
     """
     import trimesh
 
@@ -41,13 +58,24 @@ def read_mesh(path: Path, scale: float = 1.0) -> TexturedMesh:
         raise InvalidInput("mesh file", path.name, f"one of {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
         raise InvalidInput("mesh file", path, "a file that exists")
+    files = None
+    if unpacked is not None:
+        from osfcore.objects.mesh_upload import UnpackedFiles
+
+        files = UnpackedFiles(unpacked, path)
     try:
-        scene = trimesh.load_scene(path, process=False)
+        scene = trimesh.load_scene(path, process=False, resolver=files)
         pieces = [piece_of(g) for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
     except OsfError:
         raise
+    except MemoryError as error:
+        raise CorruptFile(path, "it needs too much memory to be read; simplify the mesh or its texture") from error
     except Exception as error:  # a reader of ten formats raises anything on damaged input
+        if files is not None:
+            files.check(path)
         raise CorruptFile(path, f"it cannot be read as a mesh ({type(error).__name__})") from error
+    if files is not None:
+        files.check(path)
     if not pieces:
         raise CorruptFile(path, "it holds no triangles")
     whole = joined(pieces)
@@ -121,10 +149,7 @@ def _check_triangles(
 def _check_size(extents: Float[np.ndarray, "3"], source: Path | str) -> None:
     longest = float(extents.max())
     if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
-        hint = "is it in millimetres" if longest > MAX_LENGTH_M else "is it in another unit"
-        size = " x ".join(f"{e:.4g}" for e in extents)
-        allowed = f"in metres ({hint}?), with the longest side between {MIN_LENGTH_M} and {MAX_LENGTH_M:g}"
-        raise InvalidInput(f"size [m] of {source}", size, allowed)
+        raise WrongMeshSize(extents, source)
     if extents.min() < _MIN_THICKNESS * longest:
         raise CorruptFile(source, "it is flat and encloses no volume")
 

@@ -1,6 +1,7 @@
-// A goal image may be dropped anywhere on the page: over the 3D view, too, whose frame would swallow it.
+// A goal image or a mesh may be dropped anywhere on the page: over the 3D view, too, whose frame would swallow it.
 import { byId } from "./dom.js";
 import { uploadGoal } from "./goals.js";
+import { isMesh, takeMesh } from "./own-object.js";
 import { showTab } from "./tabs.js";
 
 const AWAY_MS = 150; // a drag that is over the page tells so more often than this
@@ -27,6 +28,10 @@ function drop(event) {
   show(false);
   const [file] = event.dataTransfer.files;
   if (!file) return;
+  if (isMesh(file)) {
+    takeMesh(file);
+    return;
+  }
   showTab("episode");
   uploadGoal(file);
 }

@@ -4,8 +4,11 @@ import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
 import { objects, set, watch } from "./state.js";
+import { scrollTo, showTab } from "./tabs.js";
 import { tellFailure, toast } from "./toasts.js";
 
+const S_PER_IMAGE = 0.03; // as the service reckons
+const PREPARING_MIN = 0.6; // loading, and measuring at the end
 let sets = [];
 let shown = { id: "", state: "", controls: "", preview: "" };
 
@@ -128,6 +131,23 @@ async function train() {
   showJob(await post("jobs", { kind: "train_field", params }));
 }
 
+/** Leads on to the training of an object's field, with everything filled in. */
+export function prepareTraining(name) {
+  form().elements.from.value = "mesh";
+  drawSource();
+  form().elements.mesh.value = name;
+  showTab("fields");
+  scrollTo(form().closest(".card"));
+  form().querySelector("[type=submit]").focus({ preventScroll: true });
+}
+
+function drawTime() {
+  const { minutes, images } = form().elements;
+  const collecting = source() === "mesh" ? Number(images.value) * S_PER_IMAGE / 60 : 0;
+  const whole = Number(minutes.value) + collecting + PREPARING_MIN;
+  byId("training-time").textContent = Number.isFinite(whole) ? `Takes about ${Math.max(Math.round(whole), 1)} min on an idle machine.` : "";
+}
+
 function drawTraining(job) {
   byId("training").hidden = !job;
   if (!job) return;
@@ -172,6 +192,7 @@ function drawSource() {
   byId("from-mesh").hidden = source() !== "mesh";
   byId("from-set").hidden = source() !== "set";
   form().elements.images.disabled = source() !== "mesh"; // what is hidden must not hold the form up
+  drawTime();
 }
 
 export function setUpFields() {
@@ -182,6 +203,8 @@ export function setUpFields() {
     whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(train));
   });
   form().addEventListener("change", drawSource);
+  form().addEventListener("input", drawTime);
+  drawTime();
   form().elements.set.addEventListener("change", drawSet);
   button.addEventListener("click", () => file.click());
   file.addEventListener("change", () => {

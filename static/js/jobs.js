@@ -2,13 +2,13 @@
 import { get, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
-import { refreshObjects } from "./objects.js";
 import { labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { tellFailure } from "./toasts.js";
 
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
+  add_object: "New object",
   train_field: "Field", estimate: "Estimate", episode: "Episode",
 };
 export const LIVE = new Set(["queued", "running", "paused"]);
@@ -33,7 +33,7 @@ const FIELDS = {
     number("seed", "Seed", 0, 0, 2147483647),
   ],
 };
-const LATEST = { train_field: "training", estimate: "estimate", episode: "episode" }; // what the page knows of a kind
+const LATEST = { train_field: "training", estimate: "estimate", episode: "episode", fetch_assets: "objectWork", add_object: "objectWork" }; // what the page knows of a kind
 const jobs = new Map();
 const nodes = new Map();
 let older = null; // where the jobs that are not shown yet begin
@@ -92,6 +92,7 @@ function outcome({ result }) {
 function orderText({ kind, params: p }) {
   if (kind === "collect_pushes") return `${p.episodes} × ${p.steps} steps, ${p.objects} objects, ${p.policy} policy, seed ${p.seed}`;
   if (kind === "fetch_assets") return p.names?.length ? p.names.join(", ") : "all from the package index";
+  if (kind === "add_object") return `from ${p.file_name}`;
   if (kind === "train_field") return `${p.minutes} min from ${p.source.mesh ? `${p.images} images of its mesh` : "an uploaded set"}, seed ${p.seed}`;
   if (kind === "estimate") return `${p.mode} frame of ${p.of.file_name ?? "a scene"}, ${p.names.length} objects, seed ${p.seed}`;
   if (kind === "episode") return `${p.names.map(labelOf).join(", ")}; ${p.settings.cost} cost, at most ${p.settings.steps} steps`;
@@ -99,7 +100,7 @@ function orderText({ kind, params: p }) {
 }
 
 export function titleText({ kind, params }) {
-  const label = objects().find((object) => object.name === params.name)?.label ?? params.name;
+  const label = params.object?.label || (objects().find((object) => object.name === params.name)?.label ?? params.name);
   return label ? `${KINDS[kind]}: ${label}` : KINDS[kind];
 }
 
@@ -115,7 +116,7 @@ export function controls(job) {
   if (job.state === "running") buttons.push(command("Pause", "plain", () => post(`jobs/${job.id}/pause`)));
   if (job.state === "paused") buttons.push(command("Resume", "plain", () => post(`jobs/${job.id}/resume`)));
   if (LIVE.has(job.state)) buttons.push(command("Cancel", "plain danger", () => remove(`jobs/${job.id}`)));
-  if (job.kind === "train_field" && job.state === "failed") {
+  if (["train_field", "fetch_assets"].includes(job.kind) && job.state === "failed") {
     buttons.push(command("Start again", "plain", () => post("jobs", { kind: job.kind, params: job.params })));
   }
   for (const name of job.files) {
@@ -187,11 +188,9 @@ function tell({ kind }) {
 }
 
 export function showJob(job, { isOlder = false } = {}) {
-  const before = jobs.get(job.id);
   jobs.set(job.id, job);
   draw(job, isOlder);
   tell(job);
-  if (job.kind === "fetch_assets" && job.state === "done" && before && before.state !== "done") refreshObjects();
 }
 
 /** Forgets a job that was removed for good. */

@@ -1,28 +1,80 @@
-// The catalogue: what there is, how big and heavy, and what is still to be fetched.
-import { get, post } from "./api.js";
+// The catalogue: what there is, how it looks from all around, how big and heavy, and what is still to be fetched.
+import { get, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
-import { objects, set, watch } from "./state.js";
-import { showTab } from "./tabs.js";
-import { tellFailure } from "./toasts.js";
+import { doubted } from "./doubt.js";
+import { prepareTraining } from "./fields.js";
+import { showJob } from "./jobs.js";
+import { makeScene } from "./scenes.js";
+import { closeStory } from "./story.js";
+import { current, known, objects, set, watch } from "./state.js";
+import { scrollTo, showTab } from "./tabs.js";
+import { tellFailure, toast } from "./toasts.js";
 
-const FETCHABLE = 10; // as many as the package index has; more come from folders
-const SYMMETRY = { none: "no symmetry", discrete: "discrete symmetry", continuous: "turns freely" };
+const MOST_ON_TABLE = 8;
+const SIDE = 96; // of one view in a thumbnail [px]
+const VIEWS = 24;
+const SYMMETRY = { none: "", discrete: "discrete symmetry", continuous: "turns freely" };
+
+/** The sides of a box in metres, in words. */
+export const sizeText = (metres) => `${metres.map((side) => (100 * side).toFixed(1)).join(" × ")} cm`;
+
+/** All views side by side, of which the style sheet shows one after the other. */
+function thumbnail(object) {
+  if (!object.available) return el("span", { className: "turntable empty", attributes: { "aria-hidden": "true" } });
+  const src = `api/objects/${encodeURIComponent(object.name)}/thumbnail.png?v=${object.version}`;
+  const image = el("img", { loading: "lazy", alt: "", width: SIDE * VIEWS, height: SIDE, src });
+  image.addEventListener("error", () => image.parentElement?.classList.add("empty"));
+  return el("span", { className: "turntable", attributes: { "aria-hidden": "true" } }, image);
+}
+
+function facts(object) {
+  const symmetry = el("span", { textContent: SYMMETRY[object.symmetry.kind], title: object.symmetry.reason });
+  const weight = `${Number((1000 * object.mass_kg).toPrecision(3))} g`;
+  return el("span", { className: "hint" }, object.size_m ? `${sizeText(object.size_m)}, ` : "", weight,
+    symmetry.textContent ? ", " : "", symmetry, object.available ? "" : ", not on this machine");
+}
+
+async function putOnTable(object) {
+  const there = current()?.objects.map(({ name }) => name) ?? [];
+  if (there.includes(object.name)) throw new Error(`${object.label} is on the table already.`);
+  if (there.length >= MOST_ON_TABLE) throw new Error(`${MOST_ON_TABLE} objects are on the table, which is the most.`);
+  const light = current() ? { light: { position: current().light.position } } : {};
+  closeStory();
+  await makeScene({ objects: [...there, object.name], seed: Math.floor(Math.random() * 2 ** 31), ...light });
+  toast(`${object.label} is on the table, in a scene of its own; the one before is kept under Scenes.`);
+}
+
+async function deleteObject(object) {
+  await remove(`objects/${encodeURIComponent(object.name)}`);
+  await refreshObjects();
+}
+
+function button(text, label, action) {
+  const made = el("button", { type: "button", className: "plain", textContent: text, attributes: { "aria-label": `${text}: ${label}` } });
+  made.addEventListener("click", () => whileDisabled(made, () => tellFailure(action)));
+  return made;
+}
+
+function actions(object) {
+  const { label } = object;
+  if (!object.available) return object.fetchable ? [button("Fetch", label, () => fetchNow([object.name]))] : [];
+  const buttons = [button("Put on the table", label, () => putOnTable(object))];
+  if (!(known("fields") ?? []).some((field) => field.name === object.name)) {
+    buttons.push(button("Train its field", label, () => prepareTraining(object.name)));
+  }
+  if (object.own) {
+    const drop = el("button", { type: "button", className: "plain danger", textContent: "Delete", attributes: { "aria-label": `Delete: ${label}` } });
+    buttons.push(doubted(drop, "Really delete", () => deleteObject(object)));
+  }
+  return buttons;
+}
 
 function entry(object) {
-  const size = object.size_m ? `${object.size_m.map((s) => (100 * s).toFixed(1)).join(" × ")} cm, ` : "";
-  const facts = `${size}${(1000 * object.mass_kg).toFixed(0)} g, `;
-  return el(
-    "li",
-    { className: object.available ? "" : "absent" },
-    el("span", { className: "title", textContent: object.label, title: `${object.name}, ${object.licence}, ${object.attribution}` }),
-    el(
-      "span",
-      { className: "hint" },
-      facts,
-      el("span", { textContent: SYMMETRY[object.symmetry.kind], title: object.symmetry.reason }),
-      object.available ? "" : ", not fetched",
-    ),
-  );
+  const title = el("span", { className: "title", textContent: object.label, title: `${object.name}, ${object.licence}, ${object.attribution}` });
+  const item = el("li", { className: object.available ? "object" : "object absent" }, thumbnail(object),
+    el("div", { className: "object-facts" }, title, facts(object), el("div", { className: "actions" }, ...actions(object))));
+  item.dataset.object = object.name;
+  return item;
 }
 
 export async function refreshObjects() {
@@ -30,21 +82,30 @@ export async function refreshObjects() {
   if (answer) set("objects", answer.objects);
 }
 
-/** Starts the job that fetches objects and shows it. */
-export function fetchObjects(button) {
-  return whileDisabled(button, () => tellFailure(async () => {
-    await post("jobs", { kind: "fetch_assets", params: {} });
-    showTab("jobs");
+async function fetchNow(names) {
+  showJob(await post("jobs", { kind: "fetch_assets", params: { names } }));
+}
+
+/** Starts the job that fetches all objects and shows it. */
+export function fetchObjects(pressed) {
+  return whileDisabled(pressed, () => tellFailure(async () => {
+    await fetchNow([]);
+    showTab("objects");
   }));
 }
 
+function draw() {
+  const there = objects().filter((object) => object.available).length;
+  const missing = objects().some((object) => object.fetchable && !object.available);
+  byId("object-list").replaceChildren(...objects().map(entry));
+  byId("objects-hint").textContent = objects().length ? `${there} of ${objects().length} are on this machine.` : "";
+  byId("fetch-objects").hidden = !missing;
+}
+
 export function setUpObjects() {
-  const button = byId("fetch-objects");
-  button.addEventListener("click", () => fetchObjects(button));
-  watch("objects", () => {
-    const there = objects().filter((object) => object.available).length;
-    byId("object-list").replaceChildren(...objects().map(entry));
-    byId("objects-hint").textContent = objects().length ? `${there} of ${objects().length} are on this machine.` : "";
-    button.hidden = !objects().length || there >= FETCHABLE;
-  });
+  const all = byId("fetch-objects");
+  all.addEventListener("click", () => fetchObjects(all));
+  byId("add-own").addEventListener("click", () => scrollTo(byId("new-object").closest(".card")));
+  watch("objects", draw);
+  watch("fields", draw);
 }

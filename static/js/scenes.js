@@ -12,7 +12,8 @@ function chosenObjects() {
   return [...byId("chips").querySelectorAll("input:checked")].map((box) => box.value);
 }
 
-async function make(body) {
+/** A scene as asked for, shown at once. */
+export async function makeScene(body) {
   const scene = await post("scenes", body);
   set("scene", { ...scene, is_current: true });
   await refreshScenes();
@@ -29,14 +30,14 @@ async function submit(event) {
     body.count = Number(fields.count.value);
   }
   if (fields["own-light"].checked && current()) body.light = { position: current().light.position };
-  return whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(() => make(body)));
+  return whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(() => makeScene(body)));
 }
 
 /** Another random scene, with as many objects as this one if nothing else is said. */
 export function anotherScene(count = current()?.objects.length ?? Number(form().elements.count.value)) {
   const seed = randomSeed();
   form().elements.seed.value = seed;
-  return tellFailure(() => make({ seed, count }));
+  return tellFailure(() => makeScene({ seed, count }));
 }
 
 export function resetScene() {

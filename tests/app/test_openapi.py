@@ -37,7 +37,7 @@ STREAMS = r"/events$"  # they do not end
 EXAMPLES = 12
 LOCAL = {"Host": "localhost"}
 PHOTOS = [photo(64, 64), photo(64, 64, "JPEG"), photo(64, 48), photo(8, 8), photo(64, 64)[:90], b""]
-for kind in ("application/zip", "image/png", "image/jpeg"):
+for kind in ("application/zip", "model/gltf-binary", "image/png", "image/jpeg"):
     schemathesis.serializer.alias(kind, "application/octet-stream")
 for kind in ("image/png", "image/jpeg"):
     schemathesis.openapi.media_type(kind, st.sampled_from(PHOTOS))

@@ -96,10 +96,23 @@ class ObjectOut(BaseModel):
     licence: str
     attribution: str
     available: bool = Field(description="Whether it is on this machine and can be used in scenes.")
+    own: bool = Field(description="Whether it was added here, and can be deleted.")
+    fetchable: bool = Field(description="Whether a job of the kind fetch_assets can bring it here.")
+    version: str | None = Field(description="Changes with its looks and facts; null until it is on this machine.")
 
     @staticmethod
-    def of(info: ObjectInfo, size_m: np.ndarray | None) -> ObjectOut:
-        """From catalogue facts."""
+    def of(
+        info: ObjectInfo, size_m: np.ndarray | None, version: str | None, *, is_own: bool, is_fetchable: bool
+    ) -> ObjectOut:
+        """From catalogue facts.
+
+        Args:
+            info: the facts.
+            size_m: extents of the bounding box [m]; None if it is not on this machine.
+            version: what changes with it.
+            is_own: whether a user added it.
+            is_fetchable: whether the package index has it.
+        """
         return ObjectOut(
             name=info.name,
             label=info.label,
@@ -109,6 +122,9 @@ class ObjectOut(BaseModel):
             licence=info.licence,
             attribution=info.attribution,
             available=size_m is not None,
+            own=is_own,
+            fetchable=is_fetchable,
+            version=version,
         )
 
 

@@ -10,6 +10,7 @@ from osfcore.control.episode_settings import MAX_STEPS
 from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.objects.fetch import MAX_MASS_KG, MAX_TEXT
 
 Bounds = tuple[float, float]
 
@@ -36,6 +37,12 @@ GOAL_NAME = (1, 100)
 FILE_NAME = (0, 200)
 CAMERA_JSON = (0, 4000)
 CURSOR_TEXT = (0, 200)
+
+LABEL = (0, MAX_TEXT)  # names of objects for people, licences
+
+# Objects
+MASS_KG = (0.0001, MAX_MASS_KG)
+SCALE = (1e-6, 1e6)  # metres for one unit of a file
 
 # Episodes
 STEPS = (1, MAX_STEPS)

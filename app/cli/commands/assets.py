@@ -101,19 +101,11 @@ class AssetsAdd:
 
     def run(self) -> dict[str, Any]:
         """Convert and store the mesh; return its facts."""
-        from osfcore.objects.fetch import add_object
+        from osfcore.objects.fetch import NewObject, add_object
 
         library = _library(self.data_dir)
-        asset = add_object(
-            self.mesh,
-            self.name,
-            self.mass,
-            library,
-            label=self.label,
-            scale=self.scale,
-            licence=self.licence,
-            force=self.force,
-        )
+        new = NewObject(self.name, self.mass, self.label, self.scale, self.licence)
+        asset = add_object(self.mesh, new, library, force=self.force)
         row = {**_row(library, self.name), "collision_parts": len(asset.parts)}
         if not self.json:
             size = _size_text(row["size_m"])

@@ -186,6 +186,7 @@ def test_every_kind_that_rest_tells_of_exists():
         "collect_object",
         "collect_table",
         "fetch_assets",
+        "add_object",
         "train_field",
         "estimate",
         "episode",

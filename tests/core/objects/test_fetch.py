@@ -8,7 +8,7 @@ from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.objects.fetch import add_object, convert, fetch
+from osfcore.objects.fetch import NewObject, add_object, convert, fetch
 from osfcore.objects.sources import FolderSource, MeshFiles
 
 NAMES = ("003_cracker_box", "006_mustard_bottle", "009_gelatin_box")
@@ -141,7 +141,7 @@ def glb(tmp_path):
 
 
 def test_a_user_adds_an_object(glb, shelf):
-    added = add_object(glb, "my-ball", 0.3, shelf, licence="CC0-1.0")
+    added = add_object(glb, NewObject("my-ball", 0.3, licence="CC0-1.0"), shelf)
     asset = shelf.load("my-ball")
     assert asset.info == added.info
     assert asset.info.label == "My ball"
@@ -154,30 +154,30 @@ def test_a_user_adds_an_object(glb, shelf):
 @pytest.mark.parametrize("mass", [0.0, -1.0, 20.1, float("nan"), float("inf")])
 def test_absurd_masses_are_refused(glb, shelf, mass):
     with pytest.raises(InvalidInput, match="mass"):
-        add_object(glb, "ball", mass, shelf)
+        add_object(glb, NewObject("ball", mass), shelf)
 
 
 @pytest.mark.parametrize("text", ["\udcff", "two\nlines", "x" * 300])
 def test_labels_that_cannot_be_shown_are_refused(glb, shelf, text):
     with pytest.raises(InvalidInput, match="label"):
-        add_object(glb, "mine", 0.2, shelf, label=text)
+        add_object(glb, NewObject("mine", 0.2, label=text), shelf)
     with pytest.raises(InvalidInput, match="licence"):
-        add_object(glb, "mine", 0.2, shelf, licence=text)
+        add_object(glb, NewObject("mine", 0.2, licence=text), shelf)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), 1e9])
 def test_absurd_scales_are_refused(glb, shelf, scale):
     with pytest.raises(InvalidInput, match=r"scale|size"):
-        add_object(glb, "ball", 1.0, shelf, scale=scale)
+        add_object(glb, NewObject("ball", 1.0, scale=scale), shelf)
 
 
 def test_names_that_are_taken_or_malformed_are_refused(glb, shelf):
     with pytest.raises(InvalidInput, match="catalogue"):
-        add_object(glb, "006_mustard_bottle", 1.0, shelf)
+        add_object(glb, NewObject("006_mustard_bottle", 1.0), shelf)
     with pytest.raises(InvalidInput, match="object name"):
-        add_object(glb, "../x", 1.0, shelf)
-    add_object(glb, "ball", 1.0, shelf)
+        add_object(glb, NewObject("../x", 1.0), shelf)
+    add_object(glb, NewObject("ball", 1.0), shelf)
     with pytest.raises(InvalidInput, match="not taken"):
-        add_object(glb, "ball", 2.0, shelf)
-    add_object(glb, "ball", 2.0, shelf, force=True)
+        add_object(glb, NewObject("ball", 2.0), shelf)
+    add_object(glb, NewObject("ball", 2.0), shelf, force=True)
     assert shelf.info("ball").mass_kg == 2.0

@@ -28,6 +28,7 @@ NUMBERS = {
     "objects": ["CollectPushesParams.objects"],
     "size": ["CollectObjectParams.size", "CollectTableParams.size"],
 }  # fmt: skip
+QUERIES = {"grams": ("/api/objects", "mass_kg", 1000), "label": ("/api/objects", "label", 1)}
 TEXTS = {"draft-name": "DraftKeep.name", "name": "TrainFieldParams.name"}
 
 
@@ -74,11 +75,16 @@ def entered():
 
 def test_every_number_that_can_be_entered_has_the_bounds_that_rest_states():
     numbers = list(entered())
-    assert {name for name, _, _ in numbers} == set(NUMBERS)
+    assert {name for name, _, _ in numbers} == {*NUMBERS, "grams"}
     assert len(numbers) == len(Inputs().of_type("number")) + len(
         re.findall(r"^    number\(", source("js/jobs.js"), re.M)
     )
     for name, *bounds in numbers:
+        if name in QUERIES:
+            path, parameter, factor = QUERIES[name]
+            stated = query_of("post", path, parameter)
+            assert bounds == pytest.approx([factor * stated["minimum"], factor * stated["maximum"]])
+            continue
         for place in NUMBERS[name]:
             stated = property_of(place)
             assert bounds == [stated["minimum"], stated["maximum"]], (name, place)
@@ -86,8 +92,12 @@ def test_every_number_that_can_be_entered_has_the_bounds_that_rest_states():
 
 def test_every_text_that_can_be_entered_is_as_long_as_rest_allows():
     texts = Inputs().of_type("text")
-    assert {entry.get("name") or entry["id"] for entry in texts} == set(TEXTS)
+    assert {entry.get("name") or entry["id"] for entry in texts} == {*TEXTS, "label"}
     for entry in texts:
+        if entry.get("name") in QUERIES:
+            path, parameter, _ = QUERIES[entry["name"]]
+            assert int(entry["maxlength"]) == query_of("post", path, parameter)["maxLength"]
+            continue
         place = TEXTS[entry.get("name") or entry["id"]]
         assert int(entry["maxlength"]) == property_of(place)["maxLength"], place
 

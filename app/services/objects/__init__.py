@@ -1,0 +1,1 @@
+"""Objects as the service keeps them: adding and deleting one's own, and thumbnails."""
