@@ -27,7 +27,6 @@ from app.api.guards.token_gate import TokenMiddleware
 from app.api.http_metrics import Metrics, MetricsMiddleware
 from app.api.routes import comparisons as neural
 from app.api.routes import (
-    driver,
     episodes,
     estimates,
     events,
@@ -36,13 +35,11 @@ from app.api.routes import (
     jobs,
     objects,
     predictions,
-    presets,
     scenes,
     status,
     storage,
-    stories,
-    views,
 )
+from app.api.routes.pages import driver, presets, stories, views
 from app.api.schemas.common import ForgottenEvent, FrameEvent, LookEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn
@@ -50,17 +47,17 @@ from app.processes.predict_process import predictor_main
 from app.processes.process_client import ProcessClient
 from app.processes.render_process import renderer_main
 from app.services.disturber import Disturber
-from app.services.driver import Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
-from app.services.look_outlines import Outliner
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
+from app.services.visitors.driver import Driver
+from app.services.visitors.look_outlines import Outliner
 from app.storage.database import Store
 from app.storage.paths import static_folder
 from app.storage.photos import PhotoReader
@@ -146,7 +143,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(viewer.start)
         thumbnails = Thumbnails(runner.library, settings.data_dir / "thumbnails")
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
-        driver_seat = Driver(runner.hub.publish)
         services = Services(
             settings,
             store,
@@ -159,7 +155,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             prediction_service,
             goal_service,
             episode_service,
-            driver_seat,
+            Driver(runner.hub.publish),
             OwnObjects(runner),
             thumbnails,
             Outliner(runner.library),

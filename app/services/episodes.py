@@ -22,10 +22,10 @@ from app.episodes.file_names import (
 from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
 from app.jobs.job import Job, JobPage
 from app.jobs.kinds.episodes import settings_of
+from app.services.examples.stories import Stories
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals import Goals, NoTable
 from app.services.runner import Runner
-from app.services.stories import Stories
 from app.storage.database import CannotStore
 from app.storage.goal_store import Poses, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings

@@ -17,16 +17,16 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api.dependencies import Services, ServicesDep
 from app.api.routes import problems
-from app.api.routes.driver import DriverOut
+from app.api.routes.pages.driver import DriverOut
 from app.api.schemas.common import ForgottenEvent, FrameEvent, LookEvent, NoticeEvent
 from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
 from app.api.schemas.limits import NAME, VISITOR, sized
 from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
-from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import DraftChanged, GoalsChanged
+from app.services.visitors.driver import DriverChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError, UnknownName

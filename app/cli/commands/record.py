@@ -28,8 +28,8 @@ class Record:
 
     def run(self) -> dict[str, Any]:
         """Make them one after the other; tells how each episode ended."""
-        from app.services.presets import PRESETS, preset
-        from app.services.story_recording import record_story
+        from app.services.examples.presets import PRESETS, preset
+        from app.services.examples.story_recording import record_story
 
         outcomes = {}
         for name in self.names or [one.id for one in PRESETS]:

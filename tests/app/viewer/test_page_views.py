@@ -8,7 +8,7 @@ from websockets.sync.client import connect
 
 from app.episodes.replay_clock import ReplayClock
 from app.episodes.trajectory import read_trajectory
-from app.services.stories import Stories
+from app.services.examples.stories import Stories
 from tests.app.conftest import until
 
 STORY = "first"

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.services.driver import Driver, DriverChanged
+from app.services.visitors.driver import Driver, DriverChanged
 
 
 def test_the_first_page_drives_and_all_are_told():

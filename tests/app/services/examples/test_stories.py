@@ -4,8 +4,8 @@ import pytest
 
 from app.episodes.replay_clock import ReplayClock
 from app.episodes.trajectory import read_trajectory
-from app.services.presets import PRESETS
-from app.services.stories import Stories
+from app.services.examples.presets import PRESETS
+from app.services.examples.stories import Stories
 from osfcore.control.prepared_look import prepared_from_json
 from osfcore.errors import CorruptFile, UnknownName
 

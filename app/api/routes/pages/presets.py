@@ -10,7 +10,7 @@ from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.schemas.common import SceneOut
 from app.api.schemas.goals import GoalOut
-from app.services.presets import PRESETS, preset, set_up
+from app.services.examples.presets import PRESETS, preset, set_up
 from app.storage.paths import static_folder
 
 router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems(), route_class=BoundedRoute)

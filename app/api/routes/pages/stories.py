@@ -6,7 +6,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.routes import problems
-from app.services.stories import Stories
+from app.services.examples.stories import Stories
 
 _ORDER = ("three", "other-light", "low-sun", "four", "pair", "first")
 router = APIRouter(prefix="/api/stories", tags=["stories"], responses=problems())

@@ -11,7 +11,7 @@ from app.api.problems import named_in_path
 from app.api.routes import problems
 from app.api.schemas.common import Input
 from app.api.schemas.limits import NAME, REPLAY_S, REPLAY_SPEED, VISITOR, sized, within
-from app.services.stories import Stories
+from app.services.examples.stories import Stories
 from app.viewer.page_views import Replay, Shows, Wish
 from osfcore.errors import InvalidInput
 

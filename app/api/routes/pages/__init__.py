@@ -1,0 +1,1 @@
+"""Routes that pages need, more than programs do."""

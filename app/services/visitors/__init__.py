@@ -1,0 +1,1 @@
+"""What concerns the people who watch: who of them drives, and what their pages draw."""
