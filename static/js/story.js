@@ -5,10 +5,11 @@ import { byId, whileDisabled } from "./dom.js";
 import { startEpisode } from "./episode.js";
 import { takeGoal } from "./goals.js";
 import { LIVE } from "./jobs.js";
+import { refreshObjects } from "./objects.js";
 import { refreshScenes } from "./scenes.js";
-import { known, labelOf, set, watch } from "./state.js";
+import { known, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
-import { tellFailure } from "./toasts.js";
+import { tellFailure, toast } from "./toasts.js";
 import { isViewerShown, replayStory, showLive } from "./viewer.js";
 
 const TICK_MS = 80;
@@ -124,6 +125,8 @@ export function closeStory() {
 
 // What to do next
 
+const isHere = (name) => objects().some((object) => object.name === name && object.available);
+
 async function layTable() {
   const { scene, goal } = await post(`presets/${encodeURIComponent(story().name)}`);
   set("scene", { ...scene, is_current: true });
@@ -132,9 +135,15 @@ async function layTable() {
 }
 
 async function runLive() {
+  const missing = story().objects.filter((name) => !isHere(name));
+  if (missing.length) {
+    closeStory();
+    showTab("objects");
+    return toast(`${missing.map(labelOf).join(", ")} must be fetched first.`, "warning");
+  }
   await layTable();
   closeStory();
-  await startEpisode();
+  return startEpisode();
 }
 
 function usePhoto() {
@@ -167,8 +176,11 @@ export async function setUpStory() {
   byId("story-button").addEventListener("click", open);
   watch("opened", (opened) => { if (opened) closeStory(); });
   watch("episode", () => { if (hasOtherPlans()) closeStory(); });
-  const answer = await tellFailure(() => get("stories"));
-  stories = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");
+  const [answer] = await Promise.all([tellFailure(() => get("stories")), refreshObjects()]);
+  // Those that can be run live come first.
+  const answers = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");
+  const canRun = (one) => one.objects.every(isHere);
+  stories = [...answers.filter(canRun), ...answers.filter((one) => !canRun(one))];
   byId("story-button").hidden = !stories.length;
   if (!hasOtherPlans() && !sessionStorage.getItem(SEEN)) open();
 }

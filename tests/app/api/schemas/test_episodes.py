@@ -71,7 +71,8 @@ def test_a_running_one_tells_stage_steps_and_notices():
     out = told(job, REPORT, ("report.json",))
     assert (out.stage, out.done, out.total, out.note, out.files) == ("act", 2, 5, "Pushing", ["report.json"])
     assert out.steps[0].model_dump() == {key: STEP[key] for key in STEP if key not in ("truth", "estimate")} | {
-        "truly_to_goal_mm": None
+        "truly_to_goal_mm": None,
+        "light_off_deg": None,
     }
     assert out.notices[0].text == "It is odd."
 

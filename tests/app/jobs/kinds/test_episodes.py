@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 import osfcore.control.closed_loop as core
-from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, RECORDING_FILE, REPORT_FILE, VIDEO_FILE
+from app.episodes.file_names import (
+    CSV_FILE,
+    FRAMES_FOLDER,
+    GOAL_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    TRAJECTORY_FILE,
+    VIDEO_FILE,
+)
 from app.jobs.context import JobContext, JobControl
 from app.jobs.job import INPUTS
 from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
@@ -89,7 +97,7 @@ def test_an_episode_pushes_what_is_on_the_scene_and_leaves_its_files(place, stag
     assert not np.array_equal(stage.world.truth().pusher, before.pusher)
     assert report_of(place)["steps_done"] == 3
     files = {path.name for path in place.folder.iterdir()}
-    assert files == {REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, RECORDING_FILE, FRAMES_FOLDER}
+    assert files == {REPORT_FILE, CSV_FILE, GOAL_FILE, TRAJECTORY_FILE, VIDEO_FILE, RECORDING_FILE, FRAMES_FOLDER}
     assert (last.outcome, last.text) == ("out of steps", report_of(place)["text"])
     assert last.note == last.text
 
@@ -192,7 +200,13 @@ def test_whoever_stops_it_leaves_its_steps_and_nothing_half_written(place, stage
         for step in steps:
             if step.steps == 2:
                 break
-    assert {path.name for path in place.folder.iterdir()} == {REPORT_FILE, CSV_FILE, GOAL_FILE, FRAMES_FOLDER}
+    assert {path.name for path in place.folder.iterdir()} == {
+        REPORT_FILE,
+        CSV_FILE,
+        GOAL_FILE,
+        TRAJECTORY_FILE,
+        FRAMES_FOLDER,
+    }
     assert len(report_of(place)["steps"]) == 2
 
 
