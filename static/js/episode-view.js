@@ -1,4 +1,5 @@
 // One episode on view, running or over: its pictures and numbers at a step, its charts, and what was noticed.
+import { asked, note, onTravel } from "./address.js";
 import { get } from "./api.js";
 import { byId, el } from "./dom.js";
 import { LIVE } from "./jobs.js";
@@ -66,6 +67,7 @@ export function showEpisode(episode, step) {
   byId("shown").dataset.episode = episode.id;
   if (isOther) {
     timeline.pause();
+    note({ episode: episode.id, step: step ?? null });
     drawStandIn();
   }
   drawHead(episode);
@@ -112,6 +114,7 @@ function drawHead(episode) {
 
 /** Shows a moment of the episode in the 3D view, or the live table for null. */
 function show3D(moment) {
+  if (moment && !moment.plays) note({ step: timeline.step < timeline.last ? timeline.step : null });
   const isAtEnd = !moment || (!moment.plays && moment.at_s >= timeline.at(timeline.last));
   isLive = !moment || (isAtEnd && LIVE.has(shown.status));
   if (isLive) showLive();
@@ -144,14 +147,14 @@ function drawStep(at) {
   if (timeline.timer && at < timeline.last) preload(frameUrl(at + 1));
 }
 
-/** Whether the page's address asks for an episode; then one that runs already does not push in front of it. */
-const isLinked = () => new URLSearchParams(location.search).has("episode");
+// Whether somebody came to see a certain episode; then one that runs already does not push in front of it.
+const isLinked = Boolean(asked().episode);
 
 /** A new episode comes on view by itself; one that is on view is fetched again when it got further. */
 function follow(job) {
   if (!job) return;
   if (LIVE.has(job.state) && followed !== job.id) {
-    if (followed || !isLinked()) wanted = { id: job.id };
+    if (followed || !isLinked) wanted = { id: job.id };
     followed = job.id;
   }
   const far = `${job.id} ${job.state} ${job.result?.stage} ${job.result?.steps}`;
@@ -163,6 +166,7 @@ function follow(job) {
 function close() {
   timeline.pause();
   shown = null;
+  note({ episode: null, step: null });
   byId("shown").hidden = true;
   showLive();
   const job = known("episode");
@@ -182,7 +186,16 @@ export function refreshShown() {
   if (shown) openEpisode(shown.id);
 }
 
+/** Back or forward: the episode and step of the address, or none. */
+function travel({ episode, step }) {
+  const at = step === undefined ? undefined : Number(step);
+  if (!episode && shown && !LIVE.has(shown.status)) close();
+  else if (episode && shown?.id !== episode) openEpisode(episode, at);
+  else if (episode && Number.isInteger(at)) timeline.go(Math.min(at, timeline.last));
+}
+
 export function setUpEpisodeView() {
+  onTravel(travel);
   setUpPictures();
   timeline = new Timeline(drawStep, show3D);
   setUpProgress(() => timeline.last, (step) => timeline.go(step));

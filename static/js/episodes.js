@@ -1,4 +1,5 @@
 // All episodes, newest first, and links to a moment of one: ?episode=ID&step=N.
+import { asked } from "./address.js";
 import { get, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
@@ -82,10 +83,9 @@ async function showOlder() {
 
 /** Opens what the page's address asks for. */
 async function openLink() {
-  const query = new URLSearchParams(location.search);
-  const id = query.get("episode");
+  const { episode: id, step: text } = asked();
   if (!id) return;
-  const step = query.get("step") === null ? undefined : Number(query.get("step"));
+  const step = text === undefined ? undefined : Number(text);
   try {
     showEpisode(await get(`episodes/${encodeURIComponent(id)}`), Number.isInteger(step) && step >= 0 ? step : undefined);
   } catch (error) {

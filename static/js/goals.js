@@ -8,7 +8,9 @@ import { tellFailure, tellMissingScene, toast } from "./toasts.js";
 
 const DRAWN_SEEDS = 1_000_000; // short to read, and far fewer than may be asked for
 const NAME_MAX = 100;
-let pickedFor = null; // the scene for which a goal of another table was chosen by hand
+const CHOSEN = "osf-goal"; // what this page has chosen outlives a reload of it
+const remembered = JSON.parse(sessionStorage.getItem(CHOSEN) ?? "{}");
+let pickedFor = remembered.scene ?? null; // the scene for which a goal of another table was chosen by hand
 
 const fits = (goal, scene) => goal.source === "upload" || !goal.scene || goal.scene === scene?.id || pickedFor === scene?.id;
 
@@ -29,7 +31,7 @@ function settle() {
   const scene = current();
   if (scene === undefined) return;
   const goals = known("goals");
-  const chosen = goals.find((goal) => goal.id === known("goal")?.id);
+  const chosen = goals.find((goal) => goal.id === (known("goal")?.id ?? remembered.goal));
   const next = chosen && fits(chosen, scene) ? chosen : goals.find((goal) => scene && goal.scene === scene.id) ?? null;
   if (next?.id !== known("goal")?.id) set("goal", next);
 }
@@ -69,6 +71,7 @@ function originText(goal, scene) {
 }
 
 function draw(goal) {
+  if (goal) sessionStorage.setItem(CHOSEN, JSON.stringify({ goal: goal.id, scene: pickedFor }));
   const image = byId("goal-image");
   image.hidden = !goal;
   if (goal) image.src = `api/goals/${encodeURIComponent(goal.id)}/image.png`;

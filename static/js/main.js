@@ -1,4 +1,5 @@
 // Puts the page together: sets the pieces up, follows the event stream, keeps the status line honest.
+import { setUpAddress } from "./address.js";
 import { get } from "./api.js";
 import { setUpCameras, showFrames } from "./cameras.js";
 import { setUpCompose } from "./compose.js";
@@ -71,6 +72,7 @@ async function followHealth(again) {
   }
 }
 
+setUpAddress();
 setUpTheme();
 setUpTabs();
 setUpViewer(followLive);

@@ -1,4 +1,5 @@
 // What this is, shown before anybody clicks: a recorded episode in the 3D view, its goal, its table, and how far it is.
+import { asked } from "./address.js";
 import { get, post } from "./api.js";
 import { COLOURS, svg } from "./curves.js";
 import { byId, whileDisabled } from "./dom.js";
@@ -19,6 +20,8 @@ const ROUNDS = 2; // of all stories, then the last one rests: an open page at re
 const WAIT_MS = 300;
 const SEEN = "osf-story-seen";
 const [WIDTH, HEIGHT] = [300, 64];
+
+const isLinked = Boolean(asked().episode);
 
 let stories = [];
 let number = 0; // of the one that plays, counted through all rounds
@@ -161,7 +164,7 @@ function moveLamp() {
 }
 
 /** Whether somebody came for something else. */
-const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("opened")) || new URLSearchParams(location.search).has("episode");
+const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("opened")) || isLinked;
 
 export async function setUpStory() {
   const run = byId("story-run");

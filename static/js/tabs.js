@@ -1,9 +1,15 @@
 // The panel's tabs, with arrow keys as the ARIA pattern wants them.
+import { asked, note, onTravel } from "./address.js";
 import { byId } from "./dom.js";
 
 const tabs = () => [...document.querySelectorAll('[role="tab"]')];
 
 export function showTab(name) {
+  note({ tab: name });
+  draw(name);
+}
+
+function draw(name) {
   for (const tab of tabs()) {
     const chosen = tab.id === `tab-${name}`;
     tab.setAttribute("aria-selected", String(chosen));
@@ -12,7 +18,14 @@ export function showTab(name) {
   }
 }
 
+/** The tab of the address; another name than that of a tab is none. */
+function follow({ tab }) {
+  if (tabs().some(({ id }) => id === `tab-${tab}`)) draw(tab);
+}
+
 export function setUpTabs() {
+  follow(asked());
+  onTravel(follow);
   for (const tab of tabs()) {
     tab.addEventListener("click", () => showTab(tab.id.slice(4)));
     tab.addEventListener("keydown", (event) => {

@@ -119,6 +119,19 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     page.goto(f"{service.url}/?episode={episode['id']}&step=1")
     page.wait_for_selector("#shown:not([hidden])", timeout=WAIT_MS)
     until(lambda: page.input_value("#timeline") == "1")
+    page.click("#tab-drive")
+    assert "tab=drive" in page.url
+    page.go_back()
+    until(lambda: page.get_attribute("#tab-episode", "aria-selected") == "true")
+    page.fill("#timeline", "2")
+    until(lambda: "step=2" in page.url)
+    page.reload()
+    until(lambda: page.input_value("#timeline") == "2")
+    page.wait_for_selector('#goal-image[alt^="Goal: how it should look"]', state="attached", timeout=WAIT_MS)
+    page.click("#close-shown")
+    assert "episode=" not in page.url
+    page.go_back()
+    until(lambda: page.is_visible("#shown"))
 
 
 def test_a_goal_is_composed_on_the_map_and_kept(page, service):
