@@ -62,7 +62,7 @@ export function setUpViewer(listener) {
     });
   }
   byId("back-to-live").addEventListener("click", () => {
+    onLive(); // first: what plays is stopped, and shown where it stopped
     showLive();
-    onLive();
   });
 }
