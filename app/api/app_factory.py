@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fastapi import FastAPI, Request
+from fastapi import Depends, FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import HTMLResponse
@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api import problems, relay
 from app.api.bodies import SMALL_BODY_BYTES
-from app.api.dependencies import ObjectCatalogue, Services
+from app.api.dependencies import ObjectCatalogue, Services, only_the_driver
 from app.api.guards.connection_timeouts import BodyTimeoutMiddleware
 from app.api.guards.security import BodyLimitMiddleware, SecurityMiddleware
 from app.api.guards.token_gate import TokenMiddleware
@@ -107,7 +107,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.install(app)
     for module in _ROUTES:
-        app.include_router(module.router)
+        watching = module in (driver, views)  # what concerns one page alone
+        app.include_router(module.router, dependencies=[] if watching else [Depends(only_the_driver)])
     app.include_router(relay.router)
     _add_docs(app)
     app.openapi = lambda: _openapi(app)  # pyright: ignore[reportAttributeAccessIssue]

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from fastapi import Depends
+from fastapi import Depends, Request
 from starlette.requests import HTTPConnection
 
 from app.api.event_texts import EventTexts
@@ -33,6 +33,8 @@ from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
 
+VISITOR_HEADER = "X-OSF-Visitor"
+_READING = ("GET", "HEAD", "OPTIONS")
 _FRESH_S = 1.0
 
 
@@ -107,6 +109,12 @@ class Services:
 async def get_services(connection: HTTPConnection) -> Services:
     """The services of the app that handles a request or websocket."""
     return connection.app.state.services
+
+
+async def only_the_driver(request: Request) -> None:
+    """Let no page change anything but the one that drives; requests of programs do not say that they are of a page."""
+    if request.method not in _READING:
+        request.app.state.services.driver.check(request.headers.get(VISITOR_HEADER))
 
 
 ServicesDep = Annotated[Services, Depends(get_services)]

@@ -35,6 +35,7 @@ STATUS_OF_KIND = {
     "NoScene": 409,
     "NoTable": 409,
     "NoTrajectory": 409,
+    "NotDriving": 409,
     "NoRoomToNudge": 409,
     "NoDraft": 404,
     "DraftUnsound": 409,

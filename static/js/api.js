@@ -1,5 +1,10 @@
 // REST calls. Every failure is an ApiError whose message is a sentence for a person.
 
+// What this page calls itself; the service takes no changes from one that only watches.
+// Not crypto.randomUUID: browsers keep that for secure pages, and this one may come from another machine.
+export const VISITOR = [...crypto.getRandomValues(new Uint8Array(12))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+const SIGNED = { "X-OSF-Visitor": VISITOR };
+
 export class ApiError extends Error {
   constructor(message, status) {
     super(message);
@@ -21,7 +26,7 @@ export async function problemOf(answer) {
 async function call(method, path, body) {
   let answer;
   try {
-    const headers = body === undefined ? {} : { "Content-Type": "application/json" };
+    const headers = body === undefined ? SIGNED : { ...SIGNED, "Content-Type": "application/json" };
     answer = await fetch(`api/${path}`, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
   } catch {
     throw new ApiError("The service cannot be reached.", 0);
@@ -36,6 +41,7 @@ export function upload(path, file, onProgress = () => {}, type = "application/zi
     const request = new XMLHttpRequest(); // fetch tells no progress of what it sends
     request.open("POST", `api/${path}`);
     request.setRequestHeader("Content-Type", type);
+    for (const [name, value] of Object.entries(SIGNED)) request.setRequestHeader(name, value);
     request.upload.addEventListener("progress", (event) => event.lengthComputable && onProgress(event.loaded / event.total));
     request.addEventListener("error", () => reject(new ApiError("The service cannot be reached, or refused a file of this size.", 0)));
     request.addEventListener("load", async () => {

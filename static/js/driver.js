@@ -1,11 +1,8 @@
 // Who drives: of several visitors one page changes things; the others watch until they take over.
-import { post } from "./api.js";
+import { VISITOR, post } from "./api.js";
 import { byId, whileDisabled } from "./dom.js";
 import { known, set, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
-
-// Not crypto.randomUUID: browsers keep that for secure pages, and this one may come from another machine.
-export const VISITOR = [...crypto.getRandomValues(new Uint8Array(12))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 
 export function isDriving() {
   const driver = known("driver")?.driver;

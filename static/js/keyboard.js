@@ -1,4 +1,4 @@
-// Keys of the whole page; none of them while typing or while a dialog is open.
+// Keys of the whole page, in the 3D view too; none of them while typing or while a dialog is open, or where they are off.
 import { toggleMasks } from "./cameras.js";
 import { compose } from "./compose.js";
 import { byId } from "./dom.js";
@@ -7,6 +7,8 @@ import { randomGoal } from "./goals.js";
 import { pushKey } from "./push.js";
 import { anotherScene } from "./scenes.js";
 
+const OFF = "osf-keys-off";
+
 // Radio buttons and sliders need the arrows themselves; a checkbox needs no key of ours.
 const isTyping = (target) => Boolean(target.closest?.("input:not([type=checkbox]), select, textarea, video, [role=tab]"));
 const isDialogOpen = () => document.querySelector("dialog[open]") !== null;
@@ -14,30 +16,51 @@ const isDialogOpen = () => document.querySelector("dialog[open]") !== null;
 // Space presses what has the focus.
 const isPressed = (target) => Boolean(target.closest?.("button, a, summary, input, [tabindex]"));
 
+// What ends or replaces something wants Shift as well, so that no single letter does it by accident.
 const COMMANDS = {
   s: () => startEpisode(),
   " ": togglePause,
   ".": stepOnce,
-  x: cancelEpisode,
-  r: resetTable,
+  X: cancelEpisode,
+  R: resetTable,
   g: randomGoal,
   c: compose,
-  n: () => anotherScene(),
+  N: () => anotherScene(),
   m: () => toggleMasks(),
   "?": () => byId("help-dialog").showModal(),
 };
+const OF_VIEW = ["w", "a", "s", "d", "q", "e"]; // move the camera where the 3D view has the focus, as the arrows do
+
+const isOff = () => localStorage.getItem(OFF) === "1";
+
+function take(event) {
+  if (!(event.key in COMMANDS) || event.repeat) return;
+  event.preventDefault();
+  COMMANDS[event.key]();
+}
+
+const isPlain = (event) => !(event.ctrlKey || event.metaKey || event.altKey || isOff() || isDialogOpen());
+
+function down(event) {
+  if (!isPlain(event) || isTyping(event.target) || (event.key === " " && isPressed(event.target))) return;
+  if (pushKey(event.key, true)) event.preventDefault();
+  else take(event);
+}
+
+/** The frame of the 3D view has events of its own, and is loaded again now and then. */
+function listenInView() {
+  const view = byId("viewer");
+  view.addEventListener("load", () => view.contentWindow.addEventListener("keydown", (event) => {
+    if (isPlain(event) && !isTyping(event.target) && !OF_VIEW.includes(event.key)) take(event);
+  }));
+}
 
 export function setUpKeyboard() {
-  window.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || isDialogOpen() || isTyping(event.target)) return;
-    if (event.key === " " && isPressed(event.target)) return;
-    if (pushKey(event.key, true)) {
-      event.preventDefault();
-    } else if (event.key in COMMANDS && !event.repeat) {
-      event.preventDefault();
-      COMMANDS[event.key]();
-    }
-  });
+  window.addEventListener("keydown", down);
   window.addEventListener("keyup", (event) => pushKey(event.key, false));
+  listenInView();
   byId("help-button").addEventListener("click", () => byId("help-dialog").showModal());
+  const box = byId("keys-on");
+  box.checked = !isOff();
+  box.addEventListener("change", () => (box.checked ? localStorage.removeItem(OFF) : localStorage.setItem(OFF, "1")));
 }

@@ -1,10 +1,10 @@
 // Puts the page together: sets the pieces up, follows the event stream, keeps the status line honest.
 import { setUpAddress } from "./address.js";
-import { get } from "./api.js";
+import { VISITOR, get } from "./api.js";
 import { setUpCameras, showFrames } from "./cameras.js";
 import { setUpCompose } from "./compose.js";
 import { byId } from "./dom.js";
-import { VISITOR, setUpDriver } from "./driver.js";
+import { setUpDriver } from "./driver.js";
 import { setUpDrop } from "./drop.js";
 import { setUpEnding } from "./ending.js";
 import { setUpEpisode } from "./episode.js";

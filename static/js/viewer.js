@@ -1,7 +1,6 @@
 // The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
-import { put } from "./api.js";
+import { VISITOR, put } from "./api.js";
 import { byId } from "./dom.js";
-import { VISITOR } from "./driver.js";
 import { Newest } from "./newest.js";
 import { tellFailure } from "./toasts.js";
 

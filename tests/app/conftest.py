@@ -115,11 +115,12 @@ class Live:
         self._thread.join()
         self._listener.close()
 
-    def request(self, method, path, body=None):
+    def request(self, method, path, body=None, headers=()):
         """Status and JSON of one request."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
         data = None if body is None else json.dumps(body)
-        connection.request(method, path, data, {"Content-Type": "application/json"} if data else {})
+        kind = {"Content-Type": "application/json"} if data else {}
+        connection.request(method, path, data, {**kind, **dict(headers)})
         with connection.getresponse() as response:
             text = response.read()
             connection.close()

@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from osfcore.errors import OsfError
+
 
 @dataclass(frozen=True, slots=True)
 class DriverChanged:
@@ -22,6 +24,13 @@ class DriverChanged:
 
     driver: str | None
     visitors: int
+
+
+class NotDriving(OsfError):
+    """A page wants to change something while another one drives."""
+
+    def __init__(self) -> None:
+        super().__init__("Someone else is driving; take over first.")
 
 
 class Driver:
@@ -41,6 +50,15 @@ class Driver:
         """Who drives."""
         with self._lock:
             return DriverChanged(self._driver, len(self._streams))
+
+    def check(self, visitor: str | None) -> None:
+        """Refuse a page that only watches; programs, which have no name, may do what they like.
+
+        Raises:
+            NotDriving: if another page drives.
+        """
+        if visitor is not None and self.now().driver not in (None, visitor):
+            raise NotDriving
 
     def arrive(self, visitor: str) -> None:
         """A page has opened its stream; the first one drives."""

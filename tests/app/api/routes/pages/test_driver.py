@@ -29,6 +29,28 @@ def test_programs_do_not_count_and_are_never_refused(live):
     until(lambda: live.request("GET", "/api/driver")[1]["visitors"] == 0)
 
 
+def test_a_page_that_watches_can_look_at_everything_and_change_nothing(live):
+    def request(method, path, body=None, visitor="two"):
+        return live.request(method, path, body, headers={"X-OSF-Visitor": visitor})
+
+    with Stream(live, "?visitor=one") as page:
+        page.next("driver")
+        assert request("GET", "/api/scenes")[0] == 200
+        for method, path, body in (
+            ("POST", "/api/scenes", {"count": 1}),
+            ("POST", "/api/jobs", {"kind": "fetch_assets", "params": {}}),
+            ("DELETE", "/api/goals/draft", None),
+            ("POST", "/api/presets/first", None),
+        ):
+            status, problem = request(method, path, body)
+            assert (status, problem["detail"]) == (409, "Someone else is driving; take over first.")
+        assert request("PUT", "/api/views/two", {"replay": None})[0] == 200
+        assert request("POST", "/api/driver", {"visitor": "two"})[0] == 200
+        assert request("DELETE", "/api/goals/draft")[0] < 300
+        assert request("DELETE", "/api/goals/draft", visitor="one")[0] == 409
+    until(lambda: live.request("GET", "/api/driver")[1]["visitors"] == 0)
+
+
 @pytest.mark.parametrize("visitor", ["", "a b", "x" * 65, "<b>", "é", None, 5])
 def test_odd_names_of_pages_are_refused(service, visitor):
     is_problem(service.post("/api/driver", json={"visitor": visitor}), 422)
