@@ -62,16 +62,25 @@ class JobTable:
         waiting = self._waiting()
         return [self._told(job, waiting) for job in list(self._jobs.values())]
 
-    def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
+    def page(
+        self,
+        limit: int,
+        before: int | None = None,
+        kind: str | None = None,
+        fits: Callable[[Job], bool] = lambda _: True,
+    ) -> JobPage:
         """Some of the jobs, newest first.
 
         Args:
             limit: how many at most.
             before: only jobs with smaller numbers; jobs that come or go meanwhile shift nothing.
             kind: only jobs of it.
+            fits: only jobs for which it is true.
         """
         numbers = dict(self._numbers)  # read without a lock
-        found = [job for job in list(self._jobs.values()) if kind in (None, job.kind) and job.id in numbers]
+        found = [
+            job for job in list(self._jobs.values()) if kind in (None, job.kind) and job.id in numbers and fits(job)
+        ]
         found.reverse()
         start = 0 if before is None else bisect_right(found, -before, key=lambda job: -numbers[job.id])
         shown, waiting = found[start : start + limit], self._waiting()

@@ -97,9 +97,26 @@ class Jobs:
         """All jobs, newest first."""
         return tuple(reversed(self._table.all()))
 
-    def page(self, limit: int, before: int | None = None, kind: str | None = None) -> JobPage:
+    def page(
+        self,
+        limit: int,
+        before: int | None = None,
+        kind: str | None = None,
+        fits: Callable[[Job], bool] = lambda _: True,
+    ) -> JobPage:
         """Some of the jobs, newest first, see `JobTable.page`."""
-        return self._table.page(limit, before, kind)
+        return self._table.page(limit, before, kind, fits)
+
+    def rename(self, job: str, title: str) -> Job:
+        """Call a job something else, whatever its state.
+
+        Raises:
+            UnknownName: if there is no such job.
+        """
+        with self._changed:
+            known = self._table.get(job)
+            self._table.set(replace(self._table[job], params={**known.params, "title": title}))
+            return self.get(job)
 
     def get(self, job: str, kind: str | None = None) -> Job:
         """One job.

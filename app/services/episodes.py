@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from app.episodes.file_names import (
-    CSV_FILE,
-    FRAMES_FOLDER,
-    GOAL_FILE,
-    PREPARED_FILE,
-    RECORDING_FILE,
-    REPORT_FILE,
-    TRAJECTORY_FILE,
-    VIDEO_FILE,
-)
-from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
+from app.episodes.file_names import GOAL_FILE, PREPARED_FILE
 from app.jobs.job import Job, JobPage
 from app.jobs.kinds.episodes import settings_of
+from app.services.episode_results import EpisodeResults
 from app.services.examples.stories import Stories
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals import Goals, NoTable
@@ -29,16 +20,12 @@ from app.services.runner import Runner
 from app.storage.database import CannotStore
 from app.storage.goal_store import Poses, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
+from osfcore.errors import InvalidInput, OsfError, check_seed
 from osfcore.geometry.poses import unit_quaternion
-from osfcore.geometry.states import SceneState
-from osfcore.io.files import read_json
-from osfcore.io.image_file import encode_png
-from osfcore.io.json_codec import Entry, decode
-from osfcore.io.scene_file import StateJson, camera_to_json
+from osfcore.io.scene_file import camera_to_json
 
 KIND = "episode"
-FILES = (REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, RECORDING_FILE)
+_MOST_NAMES = 1000  # that a new one is compared with
 _PLAN = ("samples", "horizon", "temperature")
 
 
@@ -47,15 +34,6 @@ class NoGoal(OsfError):
 
     def __init__(self) -> None:
         super().__init__("An episode needs a goal: name a goal image (goal), or give poses of all objects (poses).")
-
-
-class NoTrajectory(OsfError):
-    """An episode that cannot be replayed."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "This episode cannot be replayed in 3D: it has not looked at anything yet, or an earlier version ran it."
-        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,7 +55,7 @@ class AskedEpisode:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Episodes:
+class Episodes(EpisodeResults):
     """The episodes of one service. Methods that change something block; any thread may call.
 
     Args:
@@ -87,10 +65,9 @@ class Episodes:
     """
 
     def __init__(self, runner: Runner, fields: FieldCatalogue, goals: Goals) -> None:
-        self._runner = runner
+        super().__init__(runner)
         self._fields = fields
         self._goals = goals
-        self._making = threading.Lock()  # of files on demand
 
     # Asking for one
 
@@ -117,6 +94,7 @@ class Episodes:
         with self._runner.jobs.new_inputs() as folder:
             params = {
                 "scene": scene,
+                "title": self._new_name(asked, names),
                 "names": list(names),
                 "seed": asked.seed,
                 "settings": settings,
@@ -159,9 +137,51 @@ class Episodes:
 
     # Telling of one
 
-    def page(self, limit: int, before: int | None = None) -> JobPage:
-        """Some of the episodes, newest first, see `JobTable.page`."""
-        return self._runner.jobs.page(limit, before, KIND)
+    def page(self, limit: int, before: int | None = None, search: str = "", outcome: str | None = None) -> JobPage:
+        """Some of the episodes, newest first, see `JobTable.page`.
+
+        Args:
+            limit: how many at most.
+            before: only older ones than this number.
+            search: words that name or objects hold, all of them; capitals do not count.
+            outcome: only those that ended so, or are in that state.
+        """
+        words = search.casefold().split()
+
+        def fits(job: Job) -> bool:
+            text = " ".join((self.name(job), *map(self._label, job.params["names"]))).casefold()
+            ended = (job.result or {}).get("outcome")
+            return all(word in text for word in words) and outcome in (None, ended, job.state)
+
+        return self._runner.jobs.page(limit, before, KIND, fits)
+
+    def name(self, job: Job) -> str:
+        """What people call an episode: its own name, or that of its objects in episodes of earlier versions."""
+        return job.params.get("title") or ", ".join(map(self._label, job.params["names"]))
+
+    def rename(self, job: Job, name: str) -> Job:
+        """Call an episode something else.
+
+        Raises:
+            InvalidInput: if the name is empty.
+        """
+        if not name.strip():
+            raise InvalidInput("name", "empty", "some letters")
+        return self._runner.jobs.rename(job.id, name.strip())
+
+    def _label(self, name: str) -> str:
+        try:
+            return self._runner.library.info(name).label
+        except OsfError:  # removed since
+            return name
+
+    def _new_name(self, asked: AskedEpisode, names: tuple[str, ...]) -> str:
+        """That of the goal, or of the objects; with a number if there is one of that name already."""
+        goal = None if asked.goal is None else self._goals.get(asked.goal)
+        name = ", ".join(map(self._label, names)) if goal is None else goal.name
+        taken = {self.name(job) for job in self._runner.jobs.page(_MOST_NAMES, None, KIND).jobs}
+        names = itertools.chain([name], (f"{name} {n}" for n in itertools.count(2)))
+        return next(one for one in names if one not in taken)
 
     def get(self, episode: str) -> Job:
         """One episode.
@@ -175,84 +195,6 @@ class Episodes:
     def settings(job: Job) -> EpisodeSettings:
         """How an episode goes now."""
         return settings_of(job.params["settings"])
-
-    def report(self, job: Job) -> dict[str, Any] | None:
-        """What report.json holds so far; None before there is one.
-
-        Raises:
-            CorruptFile: if it is damaged.
-        """
-        path = self._folder(job) / REPORT_FILE
-        return read_json(path, _as_report) if path.is_file() else None
-
-    def trajectory(self, job: Job) -> Path:
-        """The file with an episode's course so far, see `app.episodes.trajectory`.
-
-        Raises:
-            NoTrajectory: if there is none yet, or the episode was run by an earlier version.
-        """
-        path = self._folder(job) / TRAJECTORY_FILE
-        if not path.is_file():
-            raise NoTrajectory
-        return path
-
-    def frame(self, job: Job, step: int, part: Part) -> bytes:
-        """PNG of one frame, or of one of its pictures.
-
-        Args:
-            job: the episode.
-            step: actions executed before the frame.
-            part: "all" for the whole frame, or which of the pictures in its upper row.
-
-        Raises:
-            UnknownName: if there is no such frame.
-            CorruptFile: if it is damaged.
-        """
-        path = self._folder(job) / FRAMES_FOLDER / f"{step:03d}.png"
-        try:
-            whole = path.read_bytes()
-        except FileNotFoundError:
-            count = len(list(path.parent.glob("[0-9]*.png")))
-            known = [f"0 to {count - 1}"] if count else ["none yet"]
-            raise UnknownName("frame", str(step), known) from None
-        return whole if part == "all" else encode_png(part_of(read_frame(path), part))
-
-    def files(self, job: Job) -> tuple[str, ...]:
-        """Names that can be downloaded now; those of an episode that was broken off are made when they are."""
-        folder = self._folder(job)
-        has_frames = job.is_finished and (folder / FRAMES_FOLDER / "000.png").is_file()
-        made = (VIDEO_FILE, RECORDING_FILE) if has_frames else ()
-        return tuple(name for name in FILES if (folder / name).is_file() or name in made)
-
-    def file(self, job: Job, name: str) -> Path:
-        """One of them.
-
-        Raises:
-            UnknownName: if there is none of this name.
-            CorruptFile: if what it would be made of is damaged.
-            CannotWrite: if it cannot be made.
-        """
-        names = self.files(job)
-        if name not in names:
-            raise UnknownName(f"file of episode {job.id}", name[:80], names)
-        path = self._folder(job) / name
-        with self._making:
-            if not path.is_file():
-                self._make(job, path)
-        return path
-
-    def _make(self, job: Job, path: Path) -> None:
-        """Video and recording of an episode that was broken off, from the steps that it has left."""
-        if path.name == VIDEO_FILE:
-            write_video(path, read_frames(path.parent / FRAMES_FOLDER))
-            return
-        from app.episodes.recording import write_recording
-
-        states = read_json(path.with_name(REPORT_FILE), _as_states)
-        write_recording(path, self._runner.library, states)
-
-    def _folder(self, job: Job) -> Path:
-        return self._runner.jobs.folder(job.id)
 
 
 def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -275,25 +217,3 @@ def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
     for name, pose in poses:
         unit_quaternion(pose.quaternion, f"quaternion of {name}")
     return poses
-
-
-class _Step(Entry):
-    truth: StateJson
-
-
-class _Report(Entry):
-    steps: list[_Step]
-
-
-def _as_report(data: object) -> dict[str, Any]:
-    if not isinstance(data, dict) or not isinstance(data.get("steps"), list):
-        raise InvalidInput("report", shown(repr(data)), "a JSON object with a list of steps")
-    return data
-
-
-def _as_states(data: object) -> list[SceneState]:
-    """The true states of a report."""
-    steps = decode(_Report, data, "report").steps
-    if not steps:
-        raise InvalidInput("number of steps", 0, "1 at least")
-    return [step.truth.state() for step in steps]

@@ -96,7 +96,8 @@ function drawStandIn() {
 
 function drawHead(episode) {
   const { text, state } = outcomeOf(episode);
-  byId("shown-title").title = byId("shown-title").textContent = episode.objects.map(labelOf).join(", ");
+  byId("shown-title").textContent = episode.name;
+  byId("shown-title").title = episode.objects.map(labelOf).join(", ");
   byId("shown-outcome").textContent = text;
   byId("shown-outcome").dataset.state = state;
   byId("shown-text").textContent = inWords(episode.text ?? "");
@@ -118,7 +119,7 @@ function show3D(moment) {
   const isAtEnd = !moment || (!moment.plays && moment.at_s >= timeline.at(timeline.last));
   isLive = !moment || (isAtEnd && LIVE.has(shown.status));
   if (isLive) showLive();
-  else if (shown.steps.length) replay({ episode: shown.id, ...moment }, `Recorded: ${shown.objects.map(labelOf).join(", ")}`);
+  else if (shown.steps.length) replay({ episode: shown.id, ...moment }, `Recorded: ${shown.name}`);
 }
 
 /** Somebody wants to see the live table in the 3D view again. */

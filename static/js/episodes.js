@@ -1,6 +1,6 @@
 // All episodes, newest first, and links to a moment of one: ?episode=ID&step=N.
 import { asked } from "./address.js";
-import { get, remove } from "./api.js";
+import { get, patch, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { dropShown, openEpisode, outcomeOf, showEpisode } from "./episode-view.js";
@@ -11,6 +11,7 @@ import { tellFailure, toast } from "./toasts.js";
 const FEW = 6;
 const PAGE = 50;
 const MOST = 500; // that the service tells at once
+const ARCHIVE = "episode.zip";
 let all = []; // those that were fetched
 let total = 0;
 let older = null; // where the others begin
@@ -24,20 +25,56 @@ function tookText({ started_at: started, finished_at: finished, done, status }) 
   return `, ${done} ${done === 1 ? "push" : "pushes"}${time}`;
 }
 
+/** The table before and after; of a few kilobytes each, and only once they come into view. */
+function thumbnails(episode) {
+  if (LIVE.has(episode.status) || !episode.files.length) return el("span", { className: "thumbnails" });
+  const picture = (at, what) => {
+    const image = el("img", { src: `api/episodes/${encodeURIComponent(episode.id)}/thumbnail.png?at=${at}`, alt: what, width: 56, height: 56, loading: "lazy" });
+    image.addEventListener("error", () => image.remove());
+    return image;
+  };
+  return el("span", { className: "thumbnails" }, picture("start", "Before"), picture("end", "After"));
+}
+
+/** A field comes in place of the name; Enter keeps what it says, Escape does not. */
+function renameButton(episode, item) {
+  return el("button", { type: "button", className: "plain", textContent: "Rename", on: { click: () => {
+    const field = el("input", { type: "text", value: episode.name, maxLength: 100, attributes: { "aria-label": "Name of the episode" } });
+    let isOver = false;
+    const finish = async (keeps) => {
+      if (isOver) return;
+      isOver = true;
+      const name = field.value.trim();
+      if (keeps && name && name !== episode.name) await tellFailure(() => patch(`episodes/${encodeURIComponent(episode.id)}`, { name }));
+      await refreshEpisodes();
+    };
+    field.addEventListener("keydown", ({ key }) => { if (key === "Enter" || key === "Escape") finish(key === "Enter"); });
+    field.addEventListener("blur", () => finish(true));
+    item.querySelector(".title").replaceWith(field);
+    field.select();
+  } } });
+}
+
 function entry(episode) {
   const { text, state } = outcomeOf(episode);
   const made = new Date(episode.created_at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   const badge = el("span", { className: "badge", textContent: text });
   badge.dataset.state = state;
-  const item = el(
-    "li", {},
-    el("div", { className: "row" },
-      el("span", { className: "title", textContent: episode.objects.map(labelOf).join(", ") }), badge),
-    el("div", { className: "row" },
-      el("span", { className: "hint", textContent: `${made}${tookText(episode)}` }),
-      el("span", { className: "row" },
-        el("button", { type: "button", className: "plain", textContent: "Show", on: { click: () => openEpisode(episode.id) } }),
-        LIVE.has(episode.status) ? null : deleteButton(episode))),
+  const item = el("li", { className: "episode-entry" });
+  const buttons = [
+    el("button", { type: "button", className: "plain", textContent: "Show", on: { click: () => openEpisode(episode.id) } }),
+    ...(LIVE.has(episode.status) ? [] : [
+      renameButton(episode, item),
+      episode.files.includes(ARCHIVE) ? el("a", { href: `api/episodes/${encodeURIComponent(episode.id)}/files/${ARCHIVE}`, textContent: "Download", download: `${episode.name}.zip` }) : null,
+      deleteButton(episode),
+    ]),
+  ];
+  item.append(
+    thumbnails(episode),
+    el("div", {},
+      el("div", { className: "row" }, el("span", { className: "title", textContent: episode.name, title: episode.name }), badge),
+      el("span", { className: "hint", textContent: `${made}${tookText(episode)}`, title: episode.objects.map(labelOf).join(", ") }),
+      el("span", { className: "row entry-buttons" }, ...buttons)),
   );
   item.dataset.episode = episode.id;
   return item;
@@ -56,8 +93,16 @@ export async function dropEpisode(id) {
   if (all.some((episode) => episode.id === id)) await refreshEpisodes();
 }
 
+const wanted = () => {
+  const search = byId("episode-search").value.trim();
+  const outcome = byId("episode-outcome").value;
+  return { ...(search && { search }), ...(outcome && { outcome }) };
+};
+
 function draw() {
   byId("no-episodes").hidden = all.length > 0;
+  byId("no-episodes").textContent = Object.keys(wanted()).length ? "None like this." : "None yet. The first one begins with Start.";
+  byId("episode-find").hidden = total <= FEW && !Object.keys(wanted()).length;
   byId("episode-list").replaceChildren(...(showsAll ? all : all.slice(0, FEW)).map(entry));
   const button = byId("all-episodes");
   button.hidden = total <= FEW;
@@ -73,12 +118,12 @@ function take(answer, before) {
 
 export async function refreshEpisodes() {
   const limit = Math.min(Math.max(all.length, PAGE), MOST);
-  const answer = await tellFailure(() => get(`episodes?limit=${limit}`));
+  const answer = await tellFailure(() => get(`episodes?${new URLSearchParams({ limit, ...wanted() })}`));
   if (answer) take(answer, []);
 }
 
 async function showOlder() {
-  take(await get(`episodes?limit=${PAGE}&after=${older}`), all);
+  take(await get(`episodes?${new URLSearchParams({ limit: PAGE, after: older, ...wanted() })}`), all);
 }
 
 /** Opens what the page's address asks for. */
@@ -100,6 +145,8 @@ export function setUpEpisodes() {
   });
   const more = byId("more-episodes");
   more.addEventListener("click", () => whileDisabled(more, () => tellFailure(showOlder)));
+  byId("episode-search").addEventListener("input", () => refreshEpisodes());
+  byId("episode-outcome").addEventListener("change", () => refreshEpisodes());
   watch("objects", draw);
   watch("episode", (job) => {
     const now = job ? `${job.id} ${job.state}` : "";

@@ -19,7 +19,7 @@ from schemathesis.specs.openapi.checks import (
 from app.api.app_factory import create_app
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
-from app.services.episodes import FILES
+from app.services.episode_results import FILES
 from app.services.service_settings import Settings
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png

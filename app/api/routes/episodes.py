@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Response, status
 from fastapi.responses import FileResponse
@@ -16,8 +16,8 @@ from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.routes.events import StreamDep, followed
-from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, SettingsIn
-from app.api.schemas.limits import STEP, within
+from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, RenameIn, SettingsIn
+from app.api.schemas.limits import SEARCH, STEP, sized, within
 from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
@@ -31,6 +31,7 @@ _MEDIA_TYPES = {
     ".png": "image/png",
     ".mp4": "video/mp4",
     ".viser": "application/octet-stream",
+    ".zip": "application/zip",
 }
 _FILE = {
     200: {
@@ -63,10 +64,22 @@ def create(services: ServicesDep, body: EpisodeIn, response: Response) -> Episod
 
 
 @router.get("")
-def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob = None) -> EpisodeList:
+def list_all(
+    services: ServicesDep,
+    limit: Limit = DEFAULT_PAGE,
+    after: AfterJob = None,
+    search: Annotated[str, Query(**sized(SEARCH), description="Words that name or objects hold, all of them.")] = "",
+    outcome: Annotated[
+        Literal["reached", "out of steps", "refused", "cancelled", "failed"] | None,
+        Query(description="Only those that ended so."),
+    ] = None,
+) -> EpisodeList:
     """List episodes, newest first, without their steps."""
-    episodes, page = services.episodes, services.episodes.page(limit, after)
-    listed = [EpisodeOut.of_job(job, episodes.settings(job), None, episodes.files(job)) for job in page.jobs]
+    episodes, page = services.episodes, services.episodes.page(limit, after, search, outcome)
+    listed = [
+        EpisodeOut.of_job(job, episodes.name(job), episodes.settings(job), None, episodes.files(job))
+        for job in page.jobs
+    ]
     return EpisodeList(episodes=listed, total=page.total, next=page.next)
 
 
@@ -74,6 +87,13 @@ def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob
 def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     """Tell how an episode is: its steps so far with distances, costs and times, and how it ended."""
     return _out(services, job)
+
+
+@router.patch("/{episode}", responses=problems(404, 409, 507))
+@urgent
+def rename(services: ServicesDep, job: FoundDep, body: RenameIn) -> EpisodeOut:
+    """Call an episode something else."""
+    return _out(services, services.episodes.rename(job, body.name))
 
 
 @router.delete("/{episode}", response_model=EpisodeOut, responses={**problems(404, 409, 507), **FORGOTTEN})
@@ -139,6 +159,19 @@ async def frame(
     return Response(png, media_type="image/png", headers={"Cache-Control": "max-age=3600"})
 
 
+@router.get("/{episode}/thumbnail.png", response_class=Response, responses={**problems(404, 409), **PNG})
+async def thumbnail(
+    services: ServicesDep,
+    job: FoundDep,
+    at: Annotated[Literal["start", "end"], Query(description="The table before, or so far.")] = "end",
+) -> Response:
+    """Show the table in small, as the goal camera saw it."""
+    with named_in_path():
+        png = await asyncio.to_thread(services.episodes.thumbnail, job, at)
+    kept = "max-age=3600" if job.is_finished or at == "start" else "no-cache"
+    return Response(png, media_type="image/png", headers={"Cache-Control": kept})
+
+
 @router.get("/{episode}/files/{name}", response_class=FileResponse, responses={**problems(404, 409, 507), **_FILE})
 def file(
     services: ServicesDep, job: FoundDep, name: Annotated[str, Path(description="One of the episode's files.")]
@@ -154,7 +187,7 @@ def _out(services: Services, job: Job) -> EpisodeOut:
     episodes = services.episodes
     settings, files, report = episodes.settings(job), episodes.files(job), episodes.report(job)
     try:
-        return EpisodeOut.of_job(job, settings, report, files)
+        return EpisodeOut.of_job(job, episodes.name(job), settings, report, files)
     except (ValidationError, TypeError) as error:
         if report is None:
             raise

@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field
 
 from app.api.schemas.common import Input, Seed
 from app.api.schemas.goals import Poses, SceneRef
-from app.api.schemas.limits import HORIZON, NAME, SAMPLES, STEPS, TEMPERATURE, sized, within
+from app.api.schemas.limits import GOAL_NAME, HORIZON, NAME, SAMPLES, STEPS, TEMPERATURE, sized, within
 from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.services.episodes import AskedEpisode, flat
@@ -107,6 +107,12 @@ class ServiceSettings(BaseModel):
         return ServiceSettings(episode=EpisodeSettingsOut(defaults=defaults, bounds=bounds))
 
 
+class RenameIn(Input):
+    """What to call an episode."""
+
+    name: str = Field(**sized(GOAL_NAME), description="For people.")
+
+
 class NoticeOut(BaseModel):
     """Something that was noticed on the way."""
 
@@ -139,6 +145,7 @@ class EpisodeOut(BaseModel):
     """An episode as it is now."""
 
     id: str
+    name: str = Field(description="For people.")
     scene: str
     goal: str | None = Field(description="Identifier of the goal image; null where poses were given.")
     objects: list[str]
@@ -164,12 +171,13 @@ class EpisodeOut(BaseModel):
 
     @staticmethod
     def of_job(
-        job: Job, settings: EpisodeSettings, report: dict[str, Any] | None, files: tuple[str, ...]
+        job: Job, name: str, settings: EpisodeSettings, report: dict[str, Any] | None, files: tuple[str, ...]
     ) -> EpisodeOut:
         """From the registry's job and what it has written so far.
 
         Args:
             job: of the kind "episode".
+            name: for people.
             settings: as they are now.
             report: what report.json holds; None before there is one, or where steps are not asked for.
             files: names that can be downloaded.
@@ -177,6 +185,7 @@ class EpisodeOut(BaseModel):
         report, result = report or {}, job.result or {}
         return EpisodeOut(
             id=job.id,
+            name=name,
             scene=job.params["scene"],
             goal=job.params["goal"]["id"],
             objects=job.params["names"],

@@ -33,7 +33,8 @@ FETCHED = (0, 64)  # names of objects to fetch
 # Lengths of texts
 NAME = (1, 64)  # also of identifiers
 VISITOR = "[A-Za-z0-9_-]+"  # what a page calls itself
-GOAL_NAME = (1, 100)
+GOAL_NAME = (1, 100)  # of episodes, too
+SEARCH = (0, 200)
 FILE_NAME = (0, 200)
 CAMERA_JSON = (0, 4000)
 CURSOR_TEXT = (0, 200)

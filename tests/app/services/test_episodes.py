@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +12,18 @@ import cv2
 import numpy as np
 import pytest
 
-from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, RECORDING_FILE, REPORT_FILE, VIDEO_FILE
+from app.episodes.file_names import (
+    ARCHIVE_FILE,
+    CSV_FILE,
+    FRAMES_FOLDER,
+    GOAL_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    VIDEO_FILE,
+)
 from app.episodes.frames import HEIGHT, TILE_PX, WIDTH, frame, part_of
-from app.services.episodes import FILES, AskedEpisode, Episodes, NoGoal, flat, nested
+from app.services.episode_results import FILES
+from app.services.episodes import AskedEpisode, Episodes, NoGoal, flat, nested
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals import NoTable
 from app.storage.database import CannotStore
@@ -357,7 +367,10 @@ def test_every_file_can_be_downloaded_and_read(service, done, tmp_path):
         GOAL_FILE: "image/png",
         VIDEO_FILE: "video/mp4",
         RECORDING_FILE: "application/octet-stream",
+        ARCHIVE_FILE: "application/zip",
     }
+    with zipfile.ZipFile(io.BytesIO(files.pop(ARCHIVE_FILE))) as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == files
     report = json.loads(files[REPORT_FILE])
     assert (report["outcome"], report["text"]) == (episode["outcome"], episode["text"])
     assert [step["to_goal_mm"] for step in report["steps"]] == [step["to_goal_mm"] for step in episode["steps"]]
@@ -372,6 +385,40 @@ def test_every_file_can_be_downloaded_and_read(service, done, tmp_path):
     assert [picture.shape for picture in pictures] == [(HEIGHT, WIDTH, 3)] * 3
     assert len(files[RECORDING_FILE]) > 1000
     is_problem(service.get(f"/api/episodes/{episode['id']}/files/none.txt"), 404)
+
+
+def test_it_has_a_name_that_can_be_changed_and_found(service, done):
+    episode, *_ = done
+    address = f"/api/episodes/{episode['id']}"
+    assert episode["name"].startswith("Mustard bottle")
+    renamed = service.patch(address, json={"name": " Bottle to the left "})
+    assert renamed.json()["name"] == service.get(address).json()["name"] == "Bottle to the left"
+    is_problem(service.patch(address, json={"name": "  "}), 422)
+    is_problem(service.patch(address, json={"name": ""}), 422)
+    is_problem(service.patch("/api/episodes/nobody", json={"name": "x"}), 404)
+
+    def found(**query):
+        return [one["id"] for one in service.get("/api/episodes", params=query).json()["episodes"]]
+
+    assert episode["id"] in found(search="LEFT bottle")
+    assert episode["id"] in found(search="mustard", outcome="out of steps")  # its object is called so
+    assert episode["id"] not in found(search="left shoe")
+    assert episode["id"] not in found(outcome="reached")
+    is_problem(service.get("/api/episodes", params={"outcome": "unhappy"}), 422)
+
+
+def test_its_thumbnails_are_small_and_of_its_ends(service, done):
+    episode, *_ = done
+    address = f"/api/episodes/{episode['id']}"
+    for at, step in (("start", 0), ("end", 2)):
+        small = cv2.imdecode(np.frombuffer(service.get(f"{address}/thumbnail.png?at={at}").content, np.uint8), 1)
+        whole = cv2.imdecode(np.frombuffer(service.get(f"{address}/frames/{step}.png?part=now").content, np.uint8), 1)
+        np.testing.assert_allclose(small, cv2.resize(whole, small.shape[:2], interpolation=cv2.INTER_AREA), atol=1)
+
+
+def test_names_that_are_taken_get_a_number(episodes):
+    names = [episodes.name(episodes.start(AskedEpisode(goal="made"))) for _ in range(3)]
+    assert names == ["Made", "Made 2", "Made 3"]
 
 
 def test_every_step_can_be_seen(service, done):

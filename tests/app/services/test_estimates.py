@@ -60,8 +60,8 @@ class Jobs(JobFolders):
     def all(self):
         return tuple(self._all)
 
-    def page(self, limit, before, kind):
-        shown = [job for job in self._all if job.kind == kind]
+    def page(self, limit, before, kind, fits=lambda _: True):
+        shown = [job for job in self._all if job.kind == kind and fits(job)]
         return JobPage(tuple(shown[:limit]), len(shown), None)
 
     def get(self, name, kind=None):
