@@ -94,7 +94,7 @@ def test_every_step_has_a_row_and_a_frame(ran):
 
 @pytest.mark.slow
 def test_everything_lies_in_the_folder_and_nothing_else(ran):
-    names = {"report.json", "steps.csv", "goal.png", "frames", "video.mp4", "episode.viser"}
+    names = {"report.json", "steps.csv", "goal.png", "frames", "video.mp4", "episode.viser", "trajectory.npz"}
     assert {path.name for path in ran.out.iterdir()} == names
     assert cv2.imread(str(ran.out / "goal.png")).shape == (128, 128, 3)
     assert (ran.out / "episode.viser").stat().st_size > 100_000
