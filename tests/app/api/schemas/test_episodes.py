@@ -25,7 +25,7 @@ REPORT = {"steps": [STEP], "noticed": [{"step": 0, "matter": "goal", "text": "It
 
 
 def told(job, report=None, files=()):
-    return EpisodeOut.of_job(job, settings_of(job.params["settings"]), report, files)
+    return EpisodeOut.of_job(job, "A box", settings_of(job.params["settings"]), report, files)
 
 
 def test_only_what_was_said_is_handed_on():
