@@ -94,7 +94,12 @@ export function fetchObjects(pressed) {
   }));
 }
 
+let drawn = ""; // what the tiles show: those that turn, or are about to be pressed, stay where nothing has changed
+
 function draw() {
+  const now = JSON.stringify([objects(), (known("fields") ?? []).map(({ name }) => name)]);
+  if (now === drawn) return;
+  drawn = now;
   const there = objects().filter((object) => object.available).length;
   const missing = objects().some((object) => object.fetchable && !object.available);
   byId("object-list").replaceChildren(...objects().map(entry));

@@ -100,7 +100,7 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     episode = service.episode()
     assert (episode["status"], episode["done"]) == ("done", 3), episode["error"]
     page.wait_for_selector("#downloads a", timeout=WAIT_MS)
-    assert page.eval_on_selector_all("#downloads a", "links => links.length") == len(episode["files"]) == 5
+    assert page.eval_on_selector_all("#downloads a", "links => links.length") == len(episode["files"]) == 6
     assert page.input_value("#timeline") == "3"
     whole = "img => img.complete && img.naturalWidth === 768"
     until(lambda: page.eval_on_selector("#tiles img", whole))
