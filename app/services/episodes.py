@@ -180,8 +180,8 @@ class Episodes(EpisodeResults):
         goal = None if asked.goal is None else self._goals.get(asked.goal)
         name = ", ".join(map(self._label, names)) if goal is None else goal.name
         taken = {self.name(job) for job in self._runner.jobs.page(_MOST_NAMES, None, KIND).jobs}
-        names = itertools.chain([name], (f"{name} {n}" for n in itertools.count(2)))
-        return next(one for one in names if one not in taken)
+        numbered = itertools.chain([name], (f"{name} {n}" for n in itertools.count(2)))
+        return next(one for one in numbered if one not in taken)
 
     def get(self, episode: str) -> Job:
         """One episode.
