@@ -66,8 +66,7 @@ def test_a_page_sees_an_episode_in_place_of_the_live_table_and_other_pages_do_no
         assert one.hides("/lamp")
         assert two.own("/replay") is two.own("/objects") is None
         ask(live, "one")
-        until(lambda: one.own("/replay") is None)
-        assert one.own("/objects") is None
+        until(lambda: one.own("/replay") is None and one.own("/objects") is None)
 
 
 @pytest.mark.parametrize("step", [0, 3, -1])
