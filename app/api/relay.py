@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import websockets
 from fastapi import APIRouter, HTTPException, Path, Request, WebSocket
-from fastapi.responses import FileResponse
+from fastapi.responses import HTMLResponse
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -40,8 +40,10 @@ _VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
 @router.get("/viewer/")
 @router.get("/viewer/{visitor}")
 @router.get("/viewer/{visitor}/")
-def page(request: Request, services: ServicesDep) -> FileResponse:
+def page(request: Request, services: ServicesDep) -> HTMLResponse:
     """The viewer's client, one file; below what a page calls itself, it is the view of that page.
+
+    A script of ours comes before its own, for browsers without a graphics card.
 
     It obeys its address: `websocket` and `playbackPath` name where its messages come from, and messages may hold
     scripts. So nothing but looks and this service's own relay (viser writes it there) may be asked for.
@@ -50,7 +52,9 @@ def page(request: Request, services: ServicesDep) -> FileResponse:
         if name not in _LOOKS and not _is_own(name, value, request, services):
             raise HTTPException(400, f"The 3D view cannot be opened with {shown(name)!r}; open it from the page.")
     # no-cache, because a client of another version than the server is refused by it
-    return FileResponse(services.viewer.client_page, media_type="text/html", headers={"Cache-Control": "no-cache"})
+    script = f'<head><script src="{request.scope.get("root_path", "")}/js/software-renderer.js"></script>'
+    client = services.viewer.client_page.read_text("utf-8").replace("<head>", script, 1)
+    return HTMLResponse(client, headers={"Cache-Control": "no-cache"})
 
 
 def _is_own(name: str, address: str, request: Request, services: Services) -> bool:

@@ -14,6 +14,7 @@ from app.jobs.context import JobContext, JobControl
 from app.processes.child_process import end_own_group, import_quietly, own_group
 from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep, RunJob
 from app.processes.process_server import ProcessServer
+from osfcore.errors import OsfError
 
 STEP_INTERVAL_S = 0.1
 
@@ -92,11 +93,21 @@ _LOADED = (  # by a process that waits for its job
 )  # fmt: skip
 
 
+def _prepare() -> None:
+    """Load code, and use it once."""
+    for module in _LOADED:
+        import_quietly(module)
+    from app.jobs.kinds.rehearsal import rehearse
+
+    with contextlib.suppress(OsfError):  # a job that lacks what this lacks says so
+        rehearse()
+
+
 def job_main(server: ProcessServer, is_in_reserve: bool = False) -> None:
     """Do the job that is asked for; one in reserve loads code beforehand."""
     own_group()
-    for module in _LOADED if is_in_reserve else ():
-        import_quietly(module)
+    if is_in_reserve:
+        _prepare()
     control = JobControl(server.send)
     # A service that died leaves nobody who wants the result, and what is half-written counts as never begun.
     server.serve(lambda job, _: run_job(job, control, server.send), on_message=control.take, on_lost=end_own_group)

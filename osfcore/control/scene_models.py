@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.dynamics.network_weights import read_network
+from osfcore.dynamics.push_models import load_shapes, network_path
 from osfcore.dynamics.rollout import PushModel
 from osfcore.dynamics.shapes.object_shapes import ObjectShape
 from osfcore.estimation.objective.object_models import ObjectModels
@@ -48,9 +49,10 @@ def load_scene_models(
         UnknownName: if one has no field.
         CorruptFile: if a file is broken.
     """
+    shapes = load_shapes(data_dir, fields, names)
     return SceneModels(
         ObjectModels({name: fields.load(name) for name in names}, fields.load_table(), device=device),
-        load_push_model(data_dir, fields, names, device),
-        load_shapes(data_dir, fields, names),
+        PushModel(read_network(network_path(data_dir)), shapes, device),
+        shapes,
         {name: assets.info(name).symmetry for name in names},
     )

@@ -11,7 +11,7 @@ import { refreshScenes } from "./scenes.js";
 import { known, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { tellFailure, toast } from "./toasts.js";
-import { isViewerShown, replayStory, showLive } from "./viewer.js";
+import { isViewerShown, pace, replayStory, showLive } from "./viewer.js";
 
 const TICK_MS = 80;
 const LENGTH_S = 11; // of a story; its replay is played as much faster as that takes
@@ -144,6 +144,7 @@ async function runLive() {
     showTab("objects");
     return toast(`${missing.map(labelOf).join(", ")} must be fetched first.`, "warning");
   }
+  pace(true);
   await layTable();
   closeStory();
   return startEpisode();

@@ -1,8 +1,12 @@
 // The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
 import { VISITOR, put } from "./api.js";
 import { byId } from "./dom.js";
+import { LIVE } from "./jobs.js";
 import { Newest } from "./newest.js";
+import { known, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
+
+const [FRAMES_PER_S, FRAMES_WHILE_BUSY] = [12, 2]; // of a view that no graphics card draws
 
 let replayed = null; // what is replayed, as the service was told last
 let shows = "meshes";
@@ -51,9 +55,16 @@ export function showLive() {
   ask(null);
 }
 
+/** A processor that also draws the view has more time for the search while there is one. */
+export function pace(isBusy) {
+  byId("viewer").contentWindow.framesPerSecond = isBusy ? FRAMES_WHILE_BUSY : FRAMES_PER_S;
+}
+
 /** `listener` is told when somebody wants the live table back. */
 export function setUpViewer(listener) {
   onLive = listener;
+  watch("episode", (job) => pace(LIVE.has(job?.state)));
+  byId("viewer").addEventListener("load", () => pace(LIVE.has(known("episode")?.state)));
   for (const radio of document.getElementsByName("shows")) {
     radio.addEventListener("change", () => {
       shows = radio.value;

@@ -1,4 +1,5 @@
 import collections
+import re
 import socket
 import urllib.error
 import urllib.request
@@ -35,6 +36,14 @@ def test_the_client_page_is_served_and_not_kept(service):
         assert page.headers["content-type"].startswith("text/html")
         assert page.headers["cache-control"] == "no-cache"
         assert "'unsafe-inline'" in page.headers["content-security-policy"]  # it is one file of inline script
+
+
+def test_a_script_for_browsers_without_a_graphics_card_comes_before_the_client(service):
+    first = re.search("<script[^>]*>", service.get("/viewer/").text)
+    assert first is not None
+    source = re.search('src="([^"]*)"', first[0])
+    assert source is not None
+    assert "javascript" in service.get(source[1]).headers["content-type"]
 
 
 @pytest.mark.parametrize(
