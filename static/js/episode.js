@@ -103,9 +103,9 @@ function drawLive(job) {
     if (isNow) item.setAttribute("aria-current", "step");
     else item.removeAttribute("aria-current");
   }
-  byId("run-bar").value = job.total ? job.done / job.total : 0;
+  byId("run-bar").value = job.result?.share ?? 0;
   byId("run-stage").title = byId("run-stage").textContent;
-  byId("run-left").textContent = job.state === "running" ? timeLeft(job.eta_s).replace(/^, /, "") : "";
+  byId("run-left").textContent = job.state === "running" ? timeLeft(job.result?.left_s ?? null).replace(/^, /, "") : "";
   byId("run-told").textContent = isPaused ? PAUSED : "";
   byId("run-pause").textContent = isPaused ? "Resume" : "Pause";
   byId("run-pause").disabled = job.state === "queued";

@@ -157,7 +157,7 @@ class EpisodeOut(BaseModel):
     total: int = Field(description="Actions at most.")
     stage: Literal["first", "goal", "plan", "act", "next", "search"] | None
     note: str
-    eta_s: float | None = Field(description="Estimated time left, if all actions are needed [s].")
+    eta_s: float | None = Field(description="Estimated time left [s].")
     created_at: str
     started_at: str | None
     finished_at: str | None
@@ -197,7 +197,7 @@ class EpisodeOut(BaseModel):
             total=job.total,
             stage=result.get("stage"),
             note=job.note,
-            eta_s=job.eta_s,
+            eta_s=(job.result or {}).get("left_s") if job.state == "running" else None,
             created_at=job.created_at,
             started_at=job.started_at,
             finished_at=job.finished_at,

@@ -42,6 +42,8 @@ class EpisodeProgress:
         done: actions executed.
         total: actions at most; 0 until the goal is known, for looking tells nothing of how long acting takes.
         note: what is being done, for a person.
+        share: of the episode that is over, from 0 to 1.
+        left_s: time left, estimated [s]; None before it begins.
         stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
         steps: rounds whose results are in the report.
         outcome: how it ended; only at the end.
@@ -52,6 +54,8 @@ class EpisodeProgress:
     done: int
     total: int
     note: str
+    share: float = 0.0
+    left_s: float | None = None
     stage: str | None = None
     steps: int = 0
     outcome: str | None = None
@@ -81,6 +85,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     """
     from app.episodes.record import About, EpisodeRecord
     from app.episodes.recording import write_recording
+    from app.episodes.time_left import TimeLeft
     from app.jobs.kinds.remote_world import RemoteWorld
     from osfcore.control.closed_loop import Episode
     from osfcore.control.scene_models import load_scene_models
@@ -99,13 +104,17 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     inputs = place.folder / INPUTS
     prepared = _prepared(inputs / PREPARED_FILE)
     episode = Episode(world, models, _goal(goal, names, inputs), settings, rng, prepared=prepared)
-    progress = EpisodeProgress(0, 0, "Looking")
+    progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft()
     for event in episode.run():
         for change in place.orders.changes():
             episode.settings = settings_of(change["settings"])
         record.take(event)
-        progress = _progress_after(progress, event, episode.settings.steps)
+        share, left_s = timer.take(event, episode.settings.steps)
+        progress = replace(
+            _progress_after(progress, event, episode.settings.steps), share=share, left_s=round(left_s, 1)
+        )
         yield progress
+        timer.go_on()  # not before a pause is over
     yield replace(progress, note="Writing video and recording", view=None)
     record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)

@@ -122,10 +122,12 @@ def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
 
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     told = []
-    steps = [EpisodeProgress(1, 2, "Pushing", stage="act", steps=1)]
+    steps = [EpisodeProgress(1, 2, "Pushing", 0.5, 9.0, stage="act", steps=1)]
     monkeypatch.setitem(KINDS, "episode", lambda _params, _place: (step for step in steps))
     run_job(RunJob("episode", {}, place.data_dir, place.folder), JobControl(told.append), told.append)
-    assert told[0].result == {"stage": "act", "steps": 1, "outcome": None, "text": None}
+    assert told[0].result == {
+        "share": 0.5, "left_s": 9.0, "stage": "act", "steps": 1, "outcome": None, "text": None,
+    }  # fmt: skip
 
 
 def test_the_report_is_there_after_every_round(place, stage, sighted):  # noqa: F811

@@ -1,0 +1,91 @@
+"""How far an episode is and how long it will take, over all of looking, planning and pushing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from osfcore.control.events import ActionExecuted, Event, Finished, Looking, Stepped
+
+# On two cores, where nothing is known yet: medians of the episodes that the shipped stories were chosen from.
+_LOOK_S = {"first": 30.0, "goal": 25.0}
+_ROUND_S = 4.0
+_PUSHES = 20
+_FEW = 3  # pushes that tell nothing of how many it takes
+
+
+@dataclass(slots=True)
+class TimeLeft:
+    """The share of an episode that is over, from its events.
+
+    A look takes a usual time, or what its steps so far predict, by the share that is over; pushing goes on until
+    the sum of the offsets from the goal is gone at the mean rate so far. A rest that ends with `go_on` does not count.
+
+    Attributes:
+        clock: tells the time [s].
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    _now: float = field(init=False)
+    _elapsed: float = field(init=False, default=0.0)  # [s], of the whole episode
+    _since: dict[str, float] = field(init=False, default_factory=dict)  # when each part began, on `_elapsed`
+    _left: dict[str, float] = field(init=False, default_factory=lambda: dict(_LOOK_S))
+    _first_off_m: float = field(init=False, default=0.0)
+    _off_m: float = field(init=False, default=0.0)
+    _pushes: int = field(init=False, default=0)
+    _share: float = field(init=False, default=0.0)
+
+    def __post_init__(self) -> None:
+        """Begin."""
+        self._now = self.clock()
+
+    def go_on(self) -> None:
+        """A rest is over."""
+        self._now = self.clock()
+
+    def take(self, event: Event, most: int) -> tuple[float, float]:
+        """What an event tells.
+
+        Args:
+            event: of the episode.
+            most: pushes at most.
+
+        Returns:
+            Share of the episode that is over, which never falls, and time left [s].
+        """
+        now = self.clock()
+        self._elapsed += now - self._now
+        self._now = now
+        match event:
+            case Looking(look=look) if look in _LOOK_S:
+                self._look(look, event)
+            case Stepped():
+                self._left.clear()
+                self._off_m = float(event.offsets_m.sum())
+                self._first_off_m = self._first_off_m or self._off_m
+            case ActionExecuted(number):
+                self._since.setdefault("push", self._elapsed)
+                self._pushes = number
+            case _:
+                pass
+        left = 0.0 if isinstance(event, Finished) else sum(self._left.values()) + self._pushing(most)
+        self._share = max(self._share, self._elapsed / max(self._elapsed + left, 1e-9))
+        return self._share, left
+
+    def _look(self, look: str, event: Looking) -> None:
+        begun = self._since.setdefault(look, self._elapsed)
+        progress, spent = event.step.progress, self._elapsed - begun
+        share = progress.done / progress.total if progress.total else 0.0
+        whole = (1 - share) * _LOOK_S[look] + spent  # `spent / share` has the weight `share`
+        self._left[look] = 0.0 if event.step.estimate is not None else (1 - share) * whole
+
+    def _pushing(self, most: int) -> float:
+        """Time for the pushes that are still needed [s]."""
+        gained = self._first_off_m - self._off_m
+        needed = max(_PUSHES - self._pushes, 1.0)
+        if self._pushes > _FEW and gained > 0:
+            needed = self._off_m / (gained / self._pushes)
+        spent = self._elapsed - self._since.get("push", self._elapsed)
+        each = spent / (self._pushes - 1) if self._pushes > 1 else _ROUND_S
+        return min(needed, max(most - self._pushes, 0)) * each
