@@ -50,7 +50,8 @@ from app.services.disturber import Disturber
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
-from app.services.goals import Goals
+from app.services.goals.goal_checks import GoalChecks
+from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
@@ -138,7 +139,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.push_async_callback(run_in_threadpool, photos.stop)
         goal_service = Goals(runner, settings.data_dir, settings.max_goals, photos)
         await run_in_threadpool(goal_service.start)
-        episode_service = Episodes(runner, fields, goal_service)
+        checks = GoalChecks(runner, fields, goal_service, neural, objects.labels)
+        episode_service = Episodes(runner, fields, goal_service, checks)
         viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
@@ -155,6 +157,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             estimate_service,
             prediction_service,
             goal_service,
+            checks,
             episode_service,
             Driver(runner.hub.publish),
             OwnObjects(runner),

@@ -19,7 +19,8 @@ from app.services.disturber import Disturber
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
 from app.services.fields import FieldCatalogue
-from app.services.goals import Goals
+from app.services.goals.goal_checks import GoalChecks
+from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
@@ -91,6 +92,7 @@ class Services:
     estimates: Estimates
     predictions: Predictions
     goals: Goals
+    goal_checks: GoalChecks
     episodes: Episodes
     driver: Driver
     own_objects: OwnObjects

@@ -37,6 +37,8 @@ STATUS_OF_KIND = {
     "NoTrajectory": 409,
     "NotDriving": 409,
     "NoRoomToNudge": 409,
+    "GoalRefused": 409,
+    "NoPhoto": 409,
     "NoDraft": 404,
     "DraftUnsound": 409,
     "TooManyGoals": 409,

@@ -12,14 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import UInt8
 
-from app.processes.messages.neural_messages import CompareView, Comparison, DrawnView, DrawView, Order
+from app.processes.messages.neural_messages import CheckPhoto, CompareView, Comparison, DrawnView, DrawView, Order
 from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.render_cameras import bands
 from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME, FieldLibrary
 from osfcore.io.image_file import encode_png, to_uint8
 
 if TYPE_CHECKING:
+    from osfcore.estimation.content_check import ContentChecker
+    from osfcore.estimation.content_verdict import ContentCheck
+    from osfcore.fields.kiloosf import KiloOSF
     from osfcore.geometry.cameras import Camera
     from osfcore.geometry.states import SceneState
     from osfcore.render.scene_renderer import SceneRenderer
@@ -42,8 +46,11 @@ class NeuralRenderer:
     def __init__(self, fields: FieldLibrary) -> None:
         self._fields = fields
         self._renderers: OrderedDict[object, SceneRenderer] = OrderedDict()
+        self._latest_checker: tuple[object, ContentChecker] | None = None
 
-    def render(self, order: Order, is_overtaken: IsOvertaken = lambda: False) -> DrawnView | Comparison | None:
+    def render(
+        self, order: Order, is_overtaken: IsOvertaken = lambda: False
+    ) -> DrawnView | Comparison | ContentCheck | None:
         """What answers an order; None if it was overtaken on the way.
 
         Raises:
@@ -55,6 +62,8 @@ class NeuralRenderer:
                 return self._draw(order, is_overtaken)
             case CompareView():
                 return self._compare(order)
+            case CheckPhoto():
+                return self._check(order)
             case _:
                 raise TypeError(f"{type(order).__name__} is no picture")
 
@@ -72,14 +81,10 @@ class NeuralRenderer:
         return DrawnView(np.concatenate(images), np.concatenate(depths) if order.is_sharp else None)
 
     def _compare(self, order: CompareView) -> Comparison:
-        import cv2
-
         from osfcore.metrics.image_errors import psnr
         from osfcore.render.types import EXACT
 
-        decoded = cv2.imdecode(np.frombuffer(order.observed, np.uint8), cv2.IMREAD_COLOR)
-        assert decoded is not None
-        pixels = decoded[..., ::-1]
+        pixels = _decoded(order.observed)
         # Cameras blend what falls into one pixel, so a fair comparison does so too.
         quality = replace(EXACT, samples_per_side=2)
         rgb, _ = self._picture(order.state, order.camera, quality, {"rgb"})
@@ -88,6 +93,13 @@ class NeuralRenderer:
         shown = to_uint8(rendered)
         side_by_side = np.concatenate([pixels, shown, difference], axis=1)
         return Comparison(encode_png(shown), encode_png(difference), encode_png(side_by_side), psnr(observed, rendered))
+
+    def _check(self, order: CheckPhoto) -> ContentCheck:
+        from osfcore.geometry.states import Observation
+
+        image = _decoded(order.photo)[None] / np.float32(255)
+        observation = Observation((order.camera,), image, order.state.names, None, None, 0.0)
+        return self._checker(order.state.names).check(observation, order.state)
 
     def _picture(
         self, state: SceneState, camera: Camera, quality: Quality, outputs: set[str]
@@ -100,14 +112,30 @@ class NeuralRenderer:
     def _renderer(self, names: tuple[str, ...]) -> SceneRenderer:
         from osfcore.render.scene_renderer import SceneRenderer
 
-        key = (names, *(self._stamp(name) for name in (*names, TABLE_NAME)))
+        key = self._key(names)
         if key not in self._renderers:
-            fields = {name: self._fields.load(name) for name in names}
-            self._renderers[key] = SceneRenderer(fields, self._fields.load_table())
+            self._renderers[key] = SceneRenderer(self._load(names), self._fields.load_table())
             while len(self._renderers) > _MOST_RENDERERS:
                 self._renderers.popitem(last=False)
         self._renderers.move_to_end(key)
         return self._renderers[key]
+
+    def _checker(self, names: tuple[str, ...]) -> ContentChecker:
+        """That of the latest objects only: a photo is checked when it comes, or when the table changes."""
+        from osfcore.estimation.content_check import ContentChecker
+        from osfcore.estimation.objective.object_models import ObjectModels
+
+        key = self._key(names)
+        if self._latest_checker is None or self._latest_checker[0] != key:
+            models = ObjectModels(self._load(names), self._fields.load_table())
+            self._latest_checker = key, ContentChecker(models)
+        return self._latest_checker[1]
+
+    def _load(self, names: tuple[str, ...]) -> dict[str, KiloOSF]:
+        return {name: self._fields.load(name) for name in names}
+
+    def _key(self, names: tuple[str, ...]) -> object:
+        return names, *(self._stamp(name) for name in (*names, TABLE_NAME))
 
     def _stamp(self, name: str) -> object:
         """Changes when a field is trained, trained again or deleted; those that ship with the program stay."""
@@ -116,3 +144,11 @@ class NeuralRenderer:
         except OSError:
             return None
         return status.st_mtime_ns, status.st_size
+
+
+def _decoded(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    import cv2
+
+    decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded[..., ::-1]

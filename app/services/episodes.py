@@ -15,7 +15,8 @@ from app.jobs.kinds.episodes import settings_of
 from app.services.episode_results import EpisodeResults
 from app.services.examples.stories import Stories
 from app.services.fields import FieldCatalogue, MissingFields
-from app.services.goals import Goals, NoTable
+from app.services.goals.goal_checks import GoalChecks
+from app.services.goals.goals import Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
 from app.storage.goal_store import Poses, poses_to_json
@@ -62,12 +63,14 @@ class Episodes(EpisodeResults):
         runner: holds scenes and jobs.
         fields: what can be recognised.
         goals: goal images.
+        checks: of goal images.
     """
 
-    def __init__(self, runner: Runner, fields: FieldCatalogue, goals: Goals) -> None:
+    def __init__(self, runner: Runner, fields: FieldCatalogue, goals: Goals, checks: GoalChecks) -> None:
         super().__init__(runner)
         self._fields = fields
         self._goals = goals
+        self._checks = checks
 
     # Asking for one
 
@@ -78,6 +81,7 @@ class Episodes(EpisodeResults):
             NoTable, UnknownName: if there is no such scene or goal.
             NoGoal: if there is neither goal nor poses, or both.
             MissingFields: if an object cannot be recognised.
+            GoalRefused: if the goal image does not show the scene's objects, unless doubts are not to matter.
             InvalidInput: if a setting is out of range, or the poses are not those of the scene's objects.
             QueueFull: if too many jobs wait.
             StorageFull: if nothing more may be written.
@@ -90,7 +94,9 @@ class Episodes(EpisodeResults):
         if missing := sorted(set(names) - set(self._fields.names())):
             raise MissingFields(missing)
         settings = nested(asked.settings)
-        settings_of(settings)
+        despite_doubts = settings_of(settings).despite_doubts
+        if asked.goal is not None and asked.poses is None and not despite_doubts:
+            self._checks.require(asked.goal, scene)
         with self._runner.jobs.new_inputs() as folder:
             params = {
                 "scene": scene,

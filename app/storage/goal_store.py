@@ -1,4 +1,4 @@
-"""Goal images on disk: DATA_DIR/goals/ID with `goal.png` and `goal.json`, there whole or not at all."""
+"""Goal images on disk: DATA_DIR/goals/ID with `goal.png`, `goal.json`, and the photo it was cut out of, if it was."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import json
 import shutil
 import threading
 import uuid
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import FiniteFloat
+
 from app.storage.durable import put_in_place
+from app.storage.photo_crop import PhotoCrop
 from app.storage.schema import CannotStore
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
@@ -22,7 +25,7 @@ from osfcore.io.scene_file import CameraJson, ObjectJson, camera_to_json
 
 Source = Literal["upload", "composed", "drawn"]
 Poses = tuple[tuple[str, Pose], ...]
-IMAGE, _FACTS = "goal.png", "goal.json"
+IMAGE, PHOTO, _FACTS = "goal.png", "photo.jpg", "goal.json"
 _TEMPORARY_PREFIX = ".new-"
 
 
@@ -31,6 +34,21 @@ class TooManyGoals(OsfError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"There are {limit} goals already, which is the most; delete one first.")
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoRecord:
+    """The photo that a goal image was cut out of.
+
+    Attributes:
+        width: as it was sent [px].
+        height: as it was sent [px].
+        crop: what was cut out.
+    """
+
+    width: int
+    height: int
+    crop: PhotoCrop
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,6 +64,7 @@ class GoalRecord:
         camera: that took the image.
         poses: of the objects in it, where they are known.
         example: that it belongs to; None if it is anybody's own.
+        photo: that it was cut out of; None if it was made here, or by an earlier version.
     """
 
     id: str
@@ -56,6 +75,24 @@ class GoalRecord:
     camera: Camera
     poses: Poses | None
     example: str | None = None
+    photo: PhotoRecord | None = None
+
+
+class CropJson(Entry):
+    """What of a photo became the goal image, in its pixels and degrees."""
+
+    left: FiniteFloat
+    top: FiniteFloat
+    width: FiniteFloat
+    turn_deg: FiniteFloat
+
+
+class PhotoJson(Entry):
+    """The photo in goal.json."""
+
+    width: int
+    height: int
+    crop: CropJson
 
 
 class GoalJson(Entry):
@@ -69,6 +106,7 @@ class GoalJson(Entry):
     camera: CameraJson
     objects: list[ObjectJson] | None
     example: Text | None = None
+    photo: PhotoJson | None = None
 
 
 class GoalStore:
@@ -113,8 +151,12 @@ class GoalStore:
         """The image of a goal that exists."""
         return self._root / goal / IMAGE
 
-    def keep(self, record: GoalRecord, png: bytes) -> None:
-        """Keep a new goal.
+    def photo(self, goal: str) -> Path:
+        """The photo that a goal that exists was cut out of; it may have none."""
+        return self._root / goal / PHOTO
+
+    def keep(self, record: GoalRecord, png: bytes, photo: bytes | None = None) -> None:
+        """Keep a new goal, and the photo that it was cut out of.
 
         Raises:
             TooManyGoals: if there are too many.
@@ -125,14 +167,39 @@ class GoalStore:
             with self._lock:  # others may come in at the same time
                 if len(self.all()) >= self._max_goals:
                     raise TooManyGoals(self._max_goals)
-                folder.mkdir(parents=True)
-                (folder / IMAGE).write_bytes(png)
-                (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
+                self._write(folder, record, png, photo)
                 put_in_place(folder, self._root / record.id)
         except OSError as error:
             raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+    def replace(self, record: GoalRecord, png: bytes) -> None:
+        """Give a goal another image, and other facts.
+
+        Raises:
+            UnknownName: if there is none.
+            CannotStore: if the disk is full.
+        """
+        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
+        try:
+            with self._lock:
+                self.get(record.id)
+                self._write(folder, record, png, None)
+                for name in (IMAGE, _FACTS):  # the photo stays
+                    (folder / name).replace(self._root / record.id / name)
+        except OSError as error:
+            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @staticmethod
+    def _write(folder: Path, record: GoalRecord, png: bytes, photo: bytes | None) -> None:
+        folder.mkdir(parents=True)
+        (folder / IMAGE).write_bytes(png)
+        if photo is not None:
+            (folder / PHOTO).write_bytes(photo)
+        (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
 
     def remove(self, goal: str) -> None:
         """Delete a goal; episodes that had it keep their own copy.
@@ -158,7 +225,8 @@ def poses_to_json(poses: Poses) -> list[dict[str, Any]]:
 def _to_json(record: GoalRecord) -> dict[str, Any]:
     facts = {key: getattr(record, key) for key in ("id", "name", "created_at", "source", "scene", "example")}
     objects = None if record.poses is None else poses_to_json(record.poses)
-    return {**facts, "camera": camera_to_json(record.camera), "objects": objects}
+    photo = None if record.photo is None else asdict(record.photo)
+    return {**facts, "camera": camera_to_json(record.camera), "objects": objects, "photo": photo}
 
 
 def _read(path: Path) -> GoalRecord:
@@ -169,7 +237,10 @@ def _read(path: Path) -> GoalRecord:
         poses = None if entry.objects is None else tuple((placed.name, placed.pose()) for placed in entry.objects)
         for name, pose in poses or ():
             unit_quaternion(pose.quaternion, f"quaternion of {shown(name)}")
-        facts = entry.model_dump(exclude={"camera", "objects"})
-        return GoalRecord(**facts, camera=entry.camera.camera(), poses=poses)
+        facts = entry.model_dump(exclude={"camera", "objects", "photo"})
+        photo = None
+        if entry.photo is not None:
+            photo = PhotoRecord(entry.photo.width, entry.photo.height, PhotoCrop(**entry.photo.crop.model_dump()))
+        return GoalRecord(**facts, camera=entry.camera.camera(), poses=poses, photo=photo)
 
     return read_json(path, parse)

@@ -10,21 +10,22 @@ import io
 import threading
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, UnidentifiedImageError
+from pillow_heif import register_heif_opener
 
 from app.processes.child_process import limit_memory
 from app.processes.process_client import ProcessClient, ProcessHangs
 from app.processes.process_server import ProcessServer
 from osfcore.errors import OsfError
 
-FORMATS = ("PNG", "JPEG")
-MAX_SIDE, MAX_PIXELS = 4096, 4096 * 4096
-MIN_SIDE, MAX_RATIO = 32, 4
-KEPT_SIDE = 512  # larger photos are scaled down to this: estimators look at less
-_SIGNATURES = (b"\x89PNG", b"\xff\xd8")
+FORMATS = ("PNG", "JPEG", "WEBP", "HEIF", "AVIF", "TIFF", "GIF", "BMP")
+MAX_PIXELS = 150_000_000
+MIN_SIDE = 32
+KEPT_SIDE = 2048  # larger photos are scaled down to this: enough to cut the table out of a wide one
 _WIDE_MODES = ("I;16", "I;16B", "I;16L", "I;16N")
 _EIGHT_BITS = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)  # of sixteen, rounded
 _UPRIGHT = {  # how to turn a picture that its EXIF orientation says is turned
@@ -36,68 +37,90 @@ _UPRIGHT = {  # how to turn a picture that its EXIF orientation says is turned
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+_ON_ITS_SIDE = (5, 6, 7, 8)
 _PATIENCE_S = 20.0  # sound photos take two, and a busy machine some to start the process
-_MEMORY_BYTES = 1 << 30  # sound photos take half of it
+_MEMORY_BYTES = 3 << 29  # sound photos take two thirds of it
 
 
 class PhotoRefused(OsfError):
     """A photo that cannot be used."""
 
 
-def read_photo(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
-    """The pixels of a PNG or JPEG, upright, no side longer than 512 px.
+@dataclass(frozen=True, eq=False, slots=True)
+class Photo:
+    """A decoded photo, upright.
 
-    Grey, palettes, CMYK, transparency (which is dropped) and 16 bits a channel are understood.
+    Attributes:
+        pixels: perhaps scaled down.
+        width: as it was sent [px].
+        height: as it was sent [px].
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    width: int
+    height: int
+
+
+def read_photo(data: bytes) -> Photo:
+    """The pixels of a photo in any usual format, upright, no side longer than 2048 px.
+
+    Grey, palettes, CMYK, transparency (which is dropped) and 16 bits a channel are understood; of an animation the
+    first image counts.
 
     Raises:
-        PhotoRefused: if it is no such image, is broken or animated, or has too many or too few pixels.
+        PhotoRefused: if it is no such image, is broken, or has too many or too few pixels.
     """
+    register_heif_opener()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            warnings.simplefilter("ignore", UserWarning)  # about odd metadata, which nobody needs
+            warnings.simplefilter("ignore")  # about odd metadata, which nobody needs, and sizes, which are checked here
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                _check_header(image)
-                return _pixels(image)
+                _check_size(*image.size)
+                return _decoded(image)
     except PhotoRefused:  # a ValueError itself
         raise
     except MemoryError:
         raise PhotoRefused("The photo needs too much memory to be decoded; send a smaller one.") from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise PhotoRefused(f"The photo has far too many pixels; {MAX_SIDE} a side are allowed.") from None
+    except UnidentifiedImageError:
+        kinds = "a JPEG, PNG, WebP, HEIC, AVIF, TIFF, GIF or BMP file"
+        raise PhotoRefused(f"The file is no picture that can be read here; send {kinds}.") from None
+    except Image.DecompressionBombError:
+        raise PhotoRefused(f"The photo has far too many pixels; {_millions(MAX_PIXELS)} are allowed.") from None
     except Exception:  # decoders raise whatever their own code stumbles over
-        if not data.startswith(_SIGNATURES):
-            raise PhotoRefused("The photo is neither a PNG nor a JPEG image.") from None
         raise PhotoRefused("The photo is damaged or incomplete; it cannot be decoded.") from None
 
 
-def _check_header(image: Image.Image) -> None:
-    width, height = image.size
-    if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
-        raise PhotoRefused(f"The photo has {width} x {height} pixels; {MAX_SIDE} a side are allowed.")
+def _check_size(width: int, height: int) -> None:
+    size = f"The photo has {width} x {height} pixels"
+    if width * height > MAX_PIXELS:
+        raise PhotoRefused(f"{size}; {_millions(MAX_PIXELS)} are allowed.")
     if min(width, height) < MIN_SIDE:
-        raise PhotoRefused(f"The photo has {width} x {height} pixels; at least {MIN_SIDE} a side are needed.")
-    if max(width, height) > MAX_RATIO * min(width, height):
-        raise PhotoRefused(f"The photo has {width} x {height} pixels; one side may be {MAX_RATIO} times the other.")
-    if image.format == "PNG" and getattr(image, "is_animated", False):  # JPEGs of telephones may bring further views
-        raise PhotoRefused("The photo is animated; a single image is expected.")
+        raise PhotoRefused(f"{size}; at least {MIN_SIDE} a side are needed.")
 
 
-def _pixels(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+def _millions(pixels: int) -> str:
+    return f"{pixels // 1_000_000} million"
+
+
+def _decoded(image: Image.Image) -> Photo:
+    size = image.size
     image.draft("RGB", (KEPT_SIDE, KEPT_SIDE))  # lets a JPEG be decoded small at once
     if image.mode in _WIDE_MODES:
         plain = Image.fromarray(_EIGHT_BITS[np.asarray(image)]).convert("RGB")
     else:
-        plain = image.convert("RGB")
+        plain = image if image.mode == "RGB" else image.convert("RGB")
     plain.thumbnail((KEPT_SIDE, KEPT_SIDE), Image.Resampling.BOX)
-    turn = _turn(image)
-    return np.asarray(plain if turn is None else plain.transpose(turn))
+    orientation = _orientation(image)
+    upright = plain.transpose(_UPRIGHT[orientation]) if orientation in _UPRIGHT else plain
+    width, height = size[::-1] if orientation in _ON_ITS_SIDE else size
+    return Photo(np.asarray(upright), width, height)
 
 
-def _turn(image: Image.Image) -> Image.Transpose | None:
-    """What makes a decoded image stand upright; None if it does, or if its metadata cannot be understood."""
+def _orientation(image: Image.Image) -> int | None:
+    """What EXIF says; None if its metadata cannot be understood (ImageOps gives up)."""
     try:
-        return _UPRIGHT.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        return orientation if orientation in _UPRIGHT else None
     except Exception:  # there are too many kinds of mistakes in metadata to name them
         return None
 
@@ -106,17 +129,17 @@ class PhotoReader:
     """Decodes photos in a process of its own, one at a time; it starts at the first photo, and again if it dies.
 
     Args:
-        read: a function of a module that takes a photo and returns its pixels.
+        read: a function of a module that takes a photo and returns it decoded.
         answer_s: how long it may take, the start of the process included [s].
     """
 
-    def __init__(self, read: Callable[[bytes], np.ndarray] = read_photo, answer_s: float = _PATIENCE_S) -> None:
+    def __init__(self, read: Callable[[bytes], Photo] = read_photo, answer_s: float = _PATIENCE_S) -> None:
         self._answer_s = answer_s
         self._process = ProcessClient(reader_main, (read,), "decoder of photos", answer_s=answer_s)
         self._one_at_a_time = threading.Lock()  # so that none waits for another's time
 
-    def read(self, data: bytes) -> UInt8[np.ndarray, "h w 3"]:
-        """The pixels of a photo, see `read_photo`. Blocks.
+    def read(self, data: bytes) -> Photo:
+        """A photo, see `read_photo`. Blocks.
 
         Raises:
             PhotoRefused: if it cannot be used, or takes too long.
@@ -126,7 +149,7 @@ class PhotoReader:
             with self._one_at_a_time:
                 return self._process.call(data)
         except ProcessHangs:
-            late = f"The photo could not be decoded within {self._answer_s:g} s; save it anew as a plain PNG or JPEG."
+            late = f"The photo could not be decoded within {self._answer_s:g} s; save it anew as a plain JPEG."
             raise PhotoRefused(late) from None
 
     def stop(self) -> None:
@@ -134,7 +157,7 @@ class PhotoReader:
         self._process.stop()
 
 
-def reader_main(server: ProcessServer, read: Callable[[bytes], np.ndarray]) -> None:
+def reader_main(server: ProcessServer, read: Callable[[bytes], Photo]) -> None:
     """Decode the photos that are sent."""
     limit_memory(_MEMORY_BYTES)
     server.serve(lambda data, _: read(data))

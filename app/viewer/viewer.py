@@ -19,7 +19,7 @@ from app.processes.messages.scene_messages import SceneRecord
 from app.processes.process_client import ProcessClient
 from app.services.estimates import Estimates
 from app.services.event_hub import CurrentScene
-from app.services.goals import DraftChanged, Goals
+from app.services.goals.goals import DraftChanged, Goals
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.storage.paths import without_places

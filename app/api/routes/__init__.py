@@ -8,6 +8,9 @@ PROBLEM_REF = {"$ref": "#/components/schemas/Problem"}
 PNG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}, "description": "The image."}
 }
+JPEG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}}, "description": "The photo."}
+}
 FORGOTTEN: dict[int | str, dict[str, Any]] = {204: {"description": "It is gone, with all its files."}}
 Forget = Annotated[
     bool, Query(description="Remove one that has finished for good, with all its files; nothing is answered then.")

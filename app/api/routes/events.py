@@ -25,7 +25,7 @@ from app.api.schemas.limits import NAME, VISITOR, sized
 from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.event_hub import CurrentScene, Notice
-from app.services.goals import DraftChanged, GoalsChanged
+from app.services.goals.goals import DraftChanged, GoalsChanged
 from app.services.visitors.driver import DriverChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking

@@ -13,18 +13,28 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.lanes import slow
 from app.api.open_file import OpenFile
 from app.api.problems import NotFound, named_in_path
-from app.api.routes import PNG, problems
-from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalList, GoalOut
-from app.api.schemas.limits import CAMERA_JSON, GOAL_NAME, sized
+from app.api.routes import JPEG, PNG, problems
+from app.api.schemas.goals import (
+    DraftIn,
+    DraftKeep,
+    DraftOut,
+    DraftPatch,
+    GoalCheckOut,
+    GoalIn,
+    GoalList,
+    GoalOut,
+    GoalPatch,
+)
+from app.api.schemas.limits import CAMERA_JSON, GOAL_NAME, NAME, sized
 from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
-from app.services.goals import Draft, NoDraft
+from app.services.goals.goals import Draft, NoDraft
 from app.storage.goal_store import GoalRecord
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.io.scene_file import camera_from_json
 
 UPLOAD_PATH = "/api/goals"
-PHOTOS = ("image/png", "image/jpeg")
+_ANY_FILE = "application/octet-stream"  # what browsers call formats that they do not know
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _BODY = {
     "requestBody": {
@@ -32,7 +42,7 @@ _BODY = {
         "description": "A photo, or JSON for a goal that is made from a scene of the simulation.",
         "content": {
             JSON: {"schema": {"$ref": "#/components/schemas/GoalIn"}, "example": {"random": {"seed": 0}}},
-            **dict.fromkeys(PHOTOS, _BINARY),
+            "image/*": _BINARY,
         },
     }
 }
@@ -60,13 +70,14 @@ async def create(
         ),
     ] = None,
 ) -> GoalOut:
-    """Keep a photo (PNG or JPEG) of how the table should look, or make a goal image of objects that lie elsewhere.
+    """Keep a photo of how the table should look, or make a goal image of objects that lie elsewhere.
 
-    A photo shows the table without the pusher, as the scenes' goal camera sees it unless `camera` says otherwise.
+    A photo may be of any size and usual format. It shows the table without the pusher; its middle counts as what the
+    scenes' goal camera sees, unless `camera` says otherwise or it is cropped later.
     """
     kind = kind_of(request)
     try:
-        if kind in PHOTOS:
+        if kind.startswith("image/") or kind == _ANY_FILE:
             data = await whole_body(request, services.settings.max_photo_bytes)
             seen_by = None if camera is None else _camera(camera)
             record = await run_in_threadpool(services.goals.receive, data, name, seen_by)
@@ -74,10 +85,8 @@ async def create(
             body = parsed(GoalIn, await whole_body(request, SMALL_BODY_BYTES))
             record = await services.lanes.slow.run(_made, services, body)
         else:
-            allowed = f"{' or '.join(PHOTOS)} for a photo, or {JSON}"
-            raise HTTPException(
-                status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, f"The body is {kind or 'untyped'}, but it must be {allowed}."
-            )
+            told = "Send a photo, such as a JPEG or PNG file, or JSON that says how the objects lie."
+            raise HTTPException(status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, told)
     except ClientDisconnect:
         raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
     response.headers["Location"] = f"{UPLOAD_PATH}/{record.id}"
@@ -140,6 +149,31 @@ def save(services: ServicesDep, body: DraftKeep, response: Response) -> GoalOut:
 def get(record: FoundDep) -> GoalOut:
     """Tell about a goal."""
     return GoalOut.of(record)
+
+
+@router.patch("/{goal}", responses=problems(404, 409, 507))
+@slow
+def crop(services: ServicesDep, record: FoundDep, body: GoalPatch) -> GoalOut:
+    """Cut another part out of a goal's photo."""
+    return GoalOut.of(services.goals.crop(record.id, body.crop.crop()))
+
+
+@router.get("/{goal}/check", responses=problems(404, 409, 503))
+@slow
+def check(
+    services: ServicesDep,
+    record: FoundDep,
+    scene: Annotated[str | None, Query(**sized(NAME), description="Identifier; by default the one shown.")] = None,
+) -> GoalCheckOut:
+    """Tell within seconds whether a goal shows the objects of a table; the first time this waits for models."""
+    return GoalCheckOut.of(services.goal_checks.check(record.id, scene))
+
+
+@router.get("/{goal}/photo.jpg", response_class=FileResponse, responses={**problems(404), **JPEG})
+def photo(services: ServicesDep, record: FoundDep) -> OpenFile:
+    """Show the whole photo that a goal was cut out of, no side longer than 2048 px."""
+    gone = f"{record.name} was not cut out of a photo."
+    return OpenFile(services.goals.photo(record.id), gone, media_type="image/jpeg")
 
 
 @router.get("/{goal}/image.png", response_class=FileResponse, responses={**problems(404), **PNG})

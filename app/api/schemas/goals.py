@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 from pydantic import BaseModel, Field, model_validator
@@ -9,8 +10,10 @@ from pydantic import BaseModel, Field, model_validator
 from app.api.schemas.common import Input, LightIn, ObjectPose, SceneObject, Seed
 from app.api.schemas.limits import GOAL_NAME, NAME, OBJECTS, sized, within
 from app.api.schemas.paging import PageOut
-from app.services.goals import Draft
+from app.services.goals.goal_checks import GoalCheck, GoalVerdict
+from app.services.goals.goals import Draft
 from app.storage.goal_store import GoalRecord, Source
+from app.storage.photo_crop import PhotoCrop
 from osfcore.geometry.poses import Pose
 from osfcore.io.scene_file import CameraJson, ObjectJson
 
@@ -66,6 +69,59 @@ class DraftKeep(Input):
     name: GoalName = "Composed"
 
 
+class CropIn(Input):
+    """A rectangle of the photo that becomes the goal image, in pixels of the photo as it was sent."""
+
+    left: float = Field(allow_inf_nan=False, description="Before it is turned [px].")
+    top: float = Field(allow_inf_nan=False, description="Before it is turned [px].")
+    width: float = Field(allow_inf_nan=False, description="Its height follows from the camera's proportions [px].")
+    turn_deg: float = Field(0.0, allow_inf_nan=False, description="Clockwise about its centre.")
+
+    def crop(self) -> PhotoCrop:
+        """Unchecked."""
+        return PhotoCrop(self.left, self.top, self.width, self.turn_deg)
+
+
+class GoalPatch(Input):
+    """Another part of the photo."""
+
+    crop: CropIn
+
+
+class CropOut(BaseModel):
+    """The rectangle of the photo that is the goal image [px, degrees]."""
+
+    left: float
+    top: float
+    width: float
+    turn_deg: float
+
+
+class PhotoOut(BaseModel):
+    """The photo that a goal image was cut out of."""
+
+    width: int = Field(description="As it was sent [px].")
+    height: int = Field(description="As it was sent [px].")
+    crop: CropOut
+
+
+class GoalCheckOut(BaseModel):
+    """Whether a goal can be one for a table."""
+
+    verdict: GoalVerdict = Field(
+        description='"bare": nothing is on the table; "elsewhere": not the table as its camera would see it; '
+        '"others": not these objects.'
+    )
+    refused: bool = Field(description="Whether episodes refuse it unless they are told to go on despite doubts.")
+    text: str = Field(description="What is wrong and what to do; empty if nothing is.")
+    scene: str | None = Field(description="The table that it was made for, if that is another one and still there.")
+
+    @staticmethod
+    def of(check: GoalCheck) -> GoalCheckOut:
+        """From the service's own."""
+        return GoalCheckOut(verdict=check.verdict, refused=check.is_refused, text=check.text, scene=check.scene)
+
+
 class GoalOut(BaseModel):
     """A goal image that is kept."""
 
@@ -78,6 +134,7 @@ class GoalOut(BaseModel):
     height: int = Field(description="[px]")
     camera: CameraJson = Field(description="That took the image.")
     objects: list[ObjectJson] | None = Field(description="Where they are in the image; null where nobody knows.")
+    photo: PhotoOut | None = Field(description="That the image was cut out of; null if it was made here.")
 
     @staticmethod
     def of(record: GoalRecord) -> GoalOut:
@@ -92,6 +149,7 @@ class GoalOut(BaseModel):
             height=record.camera.height,
             camera=CameraJson.of(record.camera),
             objects=None if record.poses is None else [ObjectJson.of(*placed) for placed in record.poses],
+            photo=None if record.photo is None else PhotoOut.model_validate(asdict(record.photo)),
         )
 
 

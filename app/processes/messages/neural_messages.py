@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from osfcore.estimation.content_verdict import ContentCheck
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
@@ -84,6 +85,24 @@ class Comparison:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class CheckPhoto:
+    """Look whether a photo shows the objects of a scene. Answered by a ContentCheck.
+
+    Attributes:
+        key: different for every order, since none is to be left out.
+        state: how the objects lie now.
+        camera: that took the photo.
+        photo: PNG of the camera's size.
+    """
+
+    key: str
+    state: SceneState
+    camera: Camera
+    photo: bytes
+    patience: ClassVar[int] = 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class PredictPushes:
     """Where sequences of actions would lead. Answered by Predicted, or by None if a newer order overtook it.
 
@@ -113,5 +132,5 @@ class Predicted:
     took_s: float
 
 
-Order = DrawView | CompareView | PredictPushes
-NeuralAnswer = DrawnView | Comparison | Predicted | None
+Order = DrawView | CompareView | CheckPhoto | PredictPushes
+NeuralAnswer = DrawnView | Comparison | ContentCheck | Predicted | None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from app.processes.messages.scene_messages import SceneRecord
-from app.services.goals import Goals
+from app.services.goals.goals import Goals
 from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord
 from osfcore.errors import UnknownName

@@ -19,7 +19,7 @@ from app.episodes.request import EpisodeOrder
 from app.episodes.trajectory import read_trajectory
 from app.services.examples.presets import Preset
 from app.services.examples.stories import STORY_FILE, as_mapping
-from app.services.goals import GOAL_SIDE
+from app.services.goals.goals import GOAL_SIDE
 from osfcore.control.events import GoalFound, Observed, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.control.prepared_look import PreparedLook, PreparedLooks, prepared_to_json

@@ -18,7 +18,7 @@ from app.processes.messages.scene_messages import SceneChanged
 from app.processes.plan_summary import PlanSketch
 from app.services.episodes import KIND
 from app.services.event_hub import CurrentScene
-from app.services.goals import DraftChanged
+from app.services.goals.goals import DraftChanged
 from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.panel import Panel, RunCommand, status

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from app.services.event_hub import CurrentScene
-from app.services.goals import Draft, DraftChanged
+from app.services.goals.goals import Draft, DraftChanged
 from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.nodes.ghosts import mesh_of

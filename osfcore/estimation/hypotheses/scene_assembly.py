@@ -25,6 +25,7 @@ from osfcore.geometry.poses import Pose
 
 OUT_OF_VIEW = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
 _LIGHTS = 40  # over the whole sphere, to begin with
+_FEW_LIGHTS = 10
 _KEPT_ROUGH, _KEPT = 8, 3  # of the scenes found under them, for another round, and for one on finer images
 _PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, matches for the second
 
@@ -46,6 +47,27 @@ def assemble_scene(
         matches: of each object.
     """
     yield from _SceneAssembly(models, rough, coarse, matches).scenes(start)
+
+
+def quick_scene(
+    models: ObjectModels,
+    rough: ObservedViews,
+    coarse: ObservedViews,
+    names: tuple[str, ...],
+    matches: list[TemplateMatches],
+) -> SceneParameters:
+    """A scene put together under few lights, good enough to tell whether the objects are there at all.
+
+    Args:
+        models: fields.
+        rough: images for all lights.
+        coarse: images for the best of them.
+        names: of the objects.
+        matches: of each object.
+    """
+    nowhere, unturned = (np.tile(part, (len(names), 1)) for part in (OUT_OF_VIEW.position, OUT_OF_VIEW.quaternion))
+    empty = SceneParameters(names, nowhere, unturned, np.array([0.0, 0.0, 1.0]), None)
+    return _SceneAssembly(models, rough, coarse, matches).quick_scene(empty)
 
 
 def reassign_poses(
@@ -122,6 +144,13 @@ class _SceneAssembly:
             params, loss = self._replaced(params, loss, pair)
             yield params, loss
         yield self._alternated(params, self._coarse)
+
+    def quick_scene(self, empty: SceneParameters) -> SceneParameters:
+        begun = [self._alternated(replace(empty, light=light), self._rough) for light in hemisphere(_FEW_LIGHTS)]
+        params, _ = min(begun, key=lambda pair: pair[1])
+        for views in (self._rough, self._coarse):
+            params, _ = self._alternated(params, views)
+        return params
 
     def _alternated(self, params: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
         """In turn each object at its best match, and the light."""

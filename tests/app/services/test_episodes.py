@@ -25,7 +25,8 @@ from app.episodes.frames import HEIGHT, TILE_PX, WIDTH, frame, part_of
 from app.services.episode_results import FILES
 from app.services.episodes import AskedEpisode, Episodes, NoGoal, flat, nested
 from app.services.fields import FieldCatalogue, MissingFields
-from app.services.goals import NoTable
+from app.services.goals.goal_checks import GoalRefused
+from app.services.goals.goals import NoTable
 from app.storage.database import CannotStore
 from app.storage.goal_store import GoalRecord, GoalStore, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings
@@ -84,9 +85,24 @@ def goals(tmp_path):
     return goals
 
 
+class Checks:
+    """Lets every goal pass but one."""
+
+    refused = None
+
+    def require(self, goal, scene):
+        if goal == self.refused:
+            raise GoalRefused(f"{goal} does not show what is on {scene}.")
+
+
 @pytest.fixture
-def episodes(runner, goals, tmp_path):
-    return Episodes(runner, FieldCatalogue(tmp_path, lambda: ()), goals)
+def checks():
+    return Checks()
+
+
+@pytest.fixture
+def episodes(runner, goals, checks, tmp_path):
+    return Episodes(runner, FieldCatalogue(tmp_path, lambda: ()), goals, checks)
 
 
 def left_over(tmp_path):
@@ -118,6 +134,16 @@ def test_an_episode_toward_poses_knows_where_everything_truly_should_be(episodes
     goal = episodes.start(AskedEpisode(scene="s", poses=POSES)).params["goal"]
     assert goal == {"id": None, "camera": None, "poses": poses_to_json(POSES), "truth": poses_to_json(POSES)}
     assert left_over(tmp_path) == []
+
+
+def test_a_goal_that_shows_something_else_is_refused_unless_doubts_do_not_matter(episodes, goals, checks, tmp_path):
+    checks.refused = "photo"
+    with pytest.raises(GoalRefused, match="photo does not show what is on s"):
+        episodes.start(AskedEpisode(goal="photo"))
+    assert goals.has_draft
+    assert left_over(tmp_path) == []
+    assert episodes.start(AskedEpisode(goal="photo", settings={"despite_doubts": True})).kind == "episode"
+    assert episodes.start(AskedEpisode(goal="made")).kind == "episode"
 
 
 def test_composing_ends_when_an_episode_takes_the_scene_but_not_when_it_is_refused(episodes, goals):

@@ -11,7 +11,7 @@ from PIL import Image
 from app.api.routes.events import Mailbox
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.event_hub import CurrentScene, Notice
-from app.services.goals import Draft, DraftChanged, GoalsChanged
+from app.services.goals.goals import Draft, DraftChanged, GoalsChanged
 from app.services.visitors.driver import DriverChanged
 from tests.app.api.routes.test_jobs import TABLE
 from tests.app.conftest import until

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalOut
-from app.services.goals import Draft
+from app.services.goals.goals import Draft
 from app.storage.goal_store import GoalRecord
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose

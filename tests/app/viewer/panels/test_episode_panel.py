@@ -9,7 +9,7 @@ import pytest
 from app.jobs.job import Job, JobChanged, JobView, State
 from app.processes.messages.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
-from app.services.goals import Draft, DraftChanged
+from app.services.goals.goals import Draft, DraftChanged
 from app.viewer.nodes.episode_nodes import PARTS, EpisodeNodes
 from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.nodes.scene_nodes import SceneNodes

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from app.services.event_hub import CurrentScene
-from app.services.goals import Draft, DraftChanged, NoDraft
+from app.services.goals.goals import Draft, DraftChanged, NoDraft
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.panels.goal_panel import NAME, WRONG, GoalPanel
 from osfcore.errors import OsfError

@@ -5,16 +5,19 @@ from __future__ import annotations
 import io
 import threading
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal
 from app.services.runner import Runner
 from app.storage.database import now_utc
-from app.storage.goal_store import GoalRecord, GoalStore, Poses, Source
-from app.storage.photos import PhotoReader
+from app.storage.goal_store import GoalRecord, GoalStore, PhotoRecord, Poses, Source
+from app.storage.photo_crop import PhotoCrop, central_crop, check_crop, cut_out
+from app.storage.photos import Photo, PhotoReader
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -35,6 +38,13 @@ class NoTable(OsfError):
 
     def __init__(self) -> None:
         super().__init__("There is no scene to make a goal of; make one first.")
+
+
+class NoPhoto(OsfError):
+    """A goal of which nothing can be cut out."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name} was not cut out of a photo, so there is nothing to crop; upload the photo again.")
 
 
 class DraftUnsound(OsfError):
@@ -110,6 +120,10 @@ class Goals:
         """The image of a goal that exists."""
         return self._store.image(goal)
 
+    def photo(self, goal: str) -> Path:
+        """The photo that a goal that exists was cut out of; it may have none."""
+        return self._store.photo(goal)
+
     def remove(self, goal: str) -> None:
         """Delete a goal.
 
@@ -122,27 +136,48 @@ class Goals:
         self._runner.hub.publish(GoalsChanged())
 
     def receive(self, data: bytes, name: str, camera: Camera | None = None) -> GoalRecord:
-        """Keep a photo.
+        """Keep a photo; its middle, in the proportions of its camera, becomes the goal image.
 
         Args:
-            data: a PNG or JPEG.
+            data: a picture in any usual format.
             name: for people.
             camera: that took it; None for the scenes' goal camera.
 
         Raises:
             PhotoRefused: if it cannot be used.
             ProcessUnavailable: if what decodes it died.
-            InvalidInput: if its sides are not in the proportion of the camera's.
             TooManyGoals: if there are too many.
             StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
-        pixels = self._photos.read(data)
-        height, width = pixels.shape[:2]
+        photo = self._photos.read(data)
         camera = camera or goal_camera()
-        if abs(width * camera.height / (height * camera.width) - 1) > 0.01:  # scaling down rounds
-            asked = f"in proportion {camera.width}:{camera.height}, as its camera sees; crop it"
-            raise InvalidInput("size of the photo [px]", f"{width} x {height}", asked)
-        return self._keep("upload", name, None, camera.resized(width, height), None, _png(pixels))
+        crop = central_crop(photo.width, photo.height, camera)
+        pixels = cut_out(photo, crop, camera)
+        kept = PhotoRecord(photo.width, photo.height, crop)
+        seen_by = camera.resized(pixels.shape[1], pixels.shape[0])
+        return self._keep("upload", name, None, seen_by, None, _encoded(pixels, "PNG"), photo=(kept, photo))
+
+    def crop(self, goal: str, crop: PhotoCrop) -> GoalRecord:
+        """Cut another part out of the photo of a goal.
+
+        Raises:
+            UnknownName: if there is no such goal.
+            NoPhoto: if it was not cut out of a photo.
+            InvalidInput: if the part is too small, or beside the photo.
+            CannotStore: if the disk is full.
+        """
+        record = self.get(goal)
+        if record.photo is None:
+            raise NoPhoto(record.name)
+        size = record.photo.width, record.photo.height
+        check_crop(crop, *size, record.camera)
+        with Image.open(self.photo(goal)) as image:
+            pixels = cut_out(Photo(np.asarray(image.convert("RGB")), *size), crop, record.camera)
+        camera = record.camera.resized(pixels.shape[1], pixels.shape[0])
+        record = replace(record, camera=camera, photo=PhotoRecord(*size, crop))
+        self._store.replace(record, _encoded(pixels, "PNG"))
+        self._runner.hub.publish(GoalsChanged())
+        return record
 
     def compose(self, scene: str | None, poses: Poses, name: str, light: Light | None = None) -> GoalRecord:
         """Keep a goal in which objects of a scene lie elsewhere.
@@ -200,10 +235,12 @@ class Goals:
         poses: Poses | None,
         png: bytes,
         example: str | None = None,
+        photo: tuple[PhotoRecord, Photo] | None = None,
     ) -> GoalRecord:
         self._runner.storage.check_room()
-        record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses, example)
-        self._store.keep(record, png)
+        facts, whole = (None, None) if photo is None else photo
+        record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses, example, facts)
+        self._store.keep(record, png, None if whole is None else _encoded(whole.pixels, "JPEG", quality=95))
         self._runner.hub.publish(GoalsChanged())
         return record
 
@@ -304,7 +341,7 @@ class Goals:
         return 1 if self._draft is None else self._draft.revision + 1
 
 
-def _png(pixels: object) -> bytes:
+def _encoded(pixels: UInt8[np.ndarray, "h w 3"], kind: str, **options: int) -> bytes:
     data = io.BytesIO()
-    Image.fromarray(pixels).save(data, "PNG")  # pyright: ignore[reportArgumentType]
+    Image.fromarray(pixels).save(data, kind, **options)
     return data.getvalue()

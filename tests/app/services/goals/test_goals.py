@@ -13,10 +13,21 @@ from app.processes.messages.scene_messages import ComposedGoal
 from app.processes.process_client import ProcessUnavailable
 from app.processes.process_server import InternalError
 from app.services.event_hub import Hub
-from app.services.goals import GOAL_SIDE, Draft, DraftChanged, DraftUnsound, Goals, GoalsChanged, NoDraft, NoTable
+from app.services.goals.goals import (
+    GOAL_SIDE,
+    Draft,
+    DraftChanged,
+    DraftUnsound,
+    Goals,
+    GoalsChanged,
+    NoDraft,
+    NoPhoto,
+    NoTable,
+)
 from app.services.scenes import SceneHeld
 from app.storage.database import CannotStore
 from app.storage.goal_store import GoalStore, TooManyGoals
+from app.storage.photo_crop import PhotoCrop
 from app.storage.photos import PhotoRefused, read_photo
 from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
@@ -77,10 +88,14 @@ def goals(runner, tmp_path):
     return goals
 
 
-def photo(width=64, height=64, kind="PNG"):
+def encoded(pixels, kind="PNG"):
     data = io.BytesIO()
-    Image.new("RGB", (width, height), (200, 100, 50)).save(data, kind)
+    Image.fromarray(pixels).save(data, kind)
     return data.getvalue()
+
+
+def photo(width=64, height=64, kind="PNG"):
+    return encoded(np.full((height, width, 3), (200, 100, 50), np.uint8), kind)
 
 
 def same(one, other):
@@ -110,17 +125,44 @@ def test_a_photo_may_bring_its_camera(goals):
     np.testing.assert_allclose(made.camera.intrinsics[0], 2 * camera.intrinsics[0])
 
 
-@pytest.mark.parametrize("size", [(96, 64), (64, 96), (64, 66)])
-def test_a_photo_in_other_proportions_than_its_camera_is_refused(goals, runner, size):
-    with pytest.raises(InvalidInput, match=f"{size[0]} x {size[1]}"):
-        goals.receive(photo(*size), "Mine")
-    assert goals.all() == ()
-    assert runner.told == []
+@pytest.mark.parametrize("size", [(96, 64), (64, 96), (640, 66)])
+def test_of_a_photo_in_other_proportions_the_middle_counts(goals, size):
+    made = goals.receive(photo(*size), "Mine")
+    side = min(size)
+    assert (made.camera.width, made.camera.height) == (side, side)
+    assert (made.photo.width, made.photo.height) == size
+    assert made.photo.crop == PhotoCrop((size[0] - side) / 2, (size[1] - side) / 2, side)
+    with Image.open(goals.photo(made.id)) as whole:
+        assert whole.size == size
+
+
+def test_another_part_of_a_photo_becomes_the_goal(goals, runner):
+    pixels = np.zeros((100, 300, 3), np.uint8)
+    pixels[:, 200:] = 255
+    made = goals.receive(encoded(pixels), "Mine")
+    cropped = goals.crop(made.id, PhotoCrop(200, 0, 100))
+    assert goals.get(made.id).photo == cropped.photo == replace(made.photo, crop=PhotoCrop(200, 0, 100))
+    with Image.open(goals.image(made.id)) as image:
+        assert image.size == (100, 100) == (cropped.camera.width, cropped.camera.height)
+        assert np.asarray(image).mean() > 250
+    np.testing.assert_allclose(cropped.camera.intrinsics, made.camera.intrinsics)
+    assert runner.told == [GoalsChanged(), GoalsChanged()]
+
+
+def test_what_cannot_be_cropped_stays(goals):
+    made = goals.receive(photo(96, 64), "Mine")
+    before = goals.image(made.id).read_bytes()
+    with pytest.raises(InvalidInput, match="within the photo's 96 x 64"):
+        goals.crop(made.id, PhotoCrop(50, 0, 64))
+    assert goals.image(made.id).read_bytes() == before
+    drawn = goals.draw("s", 0, None, "Random")
+    with pytest.raises(NoPhoto, match="Random was not cut out of a photo"):
+        goals.crop(drawn.id, PhotoCrop(0, 0, 64))
 
 
 def test_what_is_no_photo_leaves_nothing(goals, runner, tmp_path):
     with pytest.raises(PhotoRefused):
-        goals.receive(b"GIF89a", "Mine")
+        goals.receive(b"%PDF", "Mine")
     assert not (tmp_path / "goals").exists()
     assert runner.told == []
 

@@ -1,0 +1,1 @@
+"""Goal images: keeping and composing them, and checking what a photo shows."""

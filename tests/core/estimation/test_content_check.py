@@ -1,0 +1,83 @@
+"""Whether a photo shows some objects at all."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import UnknownName
+from osfcore.estimation.content_check import ContentChecker
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import Observation
+from tests.core.estimation.scenes import NAMES, lying, observe, scene
+
+CAMERA = goal_camera(96)
+OTHERS = ("013_apple", "024_bowl")
+
+
+@pytest.fixture(scope="module")
+def models():
+    library = FieldLibrary(None)
+    return ObjectModels({name: library.load(name) for name in (*NAMES, *OTHERS)}, library.load_table())
+
+
+@pytest.fixture(scope="module")
+def checker(models):
+    return ContentChecker(models)
+
+
+def at_rest(models, names, light=(0.5, 0.3, 0.8)):
+    places = ((0.07, -0.08), (-0.08, 0.07))
+    poses = {name: lying(models, name, 0, *place) for name, place in zip(names, places, strict=True)}
+    return scene(poses, np.array(light) / np.linalg.norm(light))
+
+
+def photo(pixels, names=NAMES):
+    return Observation((CAMERA,), pixels[None], names, None, None, 0.0)
+
+
+@pytest.mark.parametrize("names", [NAMES, OTHERS])
+@pytest.mark.parametrize("light", [(0.5, 0.3, 0.8), (-0.7, 0.6, 0.3)])
+def test_objects_that_are_there_are_found_and_others_are_missed(models, checker, names, light):
+    table = at_rest(models, names)
+    seen = observe(models, at_rest(models, names, light), [CAMERA], masks=False)
+    found = checker.check(seen, table)
+    assert found.verdict == "shown"
+    absent = NAMES if names == OTHERS else OTHERS
+    missed = checker.check(photo(seen.images[0], absent), at_rest(models, absent))
+    assert missed.verdict in ("others", "doubtful")
+    assert missed.colours < found.colours
+    assert missed.template < found.template
+
+
+def test_where_the_objects_lie_now_plays_no_part(models, checker):
+    seen = observe(models, at_rest(models, NAMES), [CAMERA], masks=False)
+    here = at_rest(models, NAMES)
+    away = replace(here, poses=Pose(here.poses.position + [0.1, 0.05, 0], here.poses.quaternion))
+    assert checker.check(seen, here) == checker.check(seen, away)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.4, 1.0])
+def test_a_plain_square_shows_nothing(models, checker, level):
+    assert checker.check(photo(np.full((96, 96, 3), level)), at_rest(models, NAMES)).verdict == "bare"
+
+
+def test_the_table_alone_shows_nothing(models, checker):
+    bare = replace(at_rest(models, NAMES), light=Light(np.array([0.6, 0, 0.8])))
+    beside = replace(bare, poses=Pose(bare.poses.position + [5.0, 0, 0], bare.poses.quaternion))
+    seen = observe(models, beside, [CAMERA], masks=False)
+    assert checker.check(seen, bare).verdict == "bare"
+
+
+def test_a_picture_of_something_else_is_not_the_table(models, checker):
+    pixels = np.random.default_rng(0).random((96, 96, 3))
+    assert checker.check(photo(pixels), at_rest(models, NAMES)).verdict == "elsewhere"
+
+
+def test_an_object_without_a_field_is_told(models, checker):
+    with pytest.raises(UnknownName, match="teapot"):
+        checker.check(photo(np.zeros((96, 96, 3)), ("teapot",)), at_rest(models, NAMES))
