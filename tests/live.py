@@ -75,7 +75,11 @@ def call(port: int, method: str, path: str, body: object = None) -> Any:
         request.add_header("Content-Type", "application/json")
     with urllib.request.urlopen(request, timeout=60) as answer:
         content = answer.read()
-    return json.loads(content) if answer.headers.get("Content-Type", "").startswith("application/json") else content
+    return (
+        json.loads(content)
+        if content and answer.headers.get("Content-Type", "").startswith("application/json")
+        else content
+    )
 
 
 def children(process: int) -> list[int]:

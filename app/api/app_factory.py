@@ -140,31 +140,16 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         goal_service = Goals(runner, settings.data_dir, settings.max_goals, photos)
         await run_in_threadpool(goal_service.start)
         checks = GoalChecks(runner, fields, goal_service, neural, objects.labels)
-        episode_service = Episodes(runner, fields, goal_service, checks)
         viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
         thumbnails = Thumbnails(runner.library, settings.data_dir / "thumbnails")
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
         services = Services(
-            settings,
-            store,
-            runner,
-            viewer,
-            objects,
-            fields,
-            neural,
-            estimate_service,
-            prediction_service,
-            goal_service,
-            checks,
-            episode_service,
-            Driver(runner.hub.publish),
-            OwnObjects(runner),
-            thumbnails,
-            Outliner(runner.library),
-            Disturber(runner, np.random.default_rng()),
-        )
+            settings, store, runner, viewer, objects, fields, neural, estimate_service, prediction_service,
+            goal_service, checks, Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish),
+            OwnObjects(runner), thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()),
+        )  # fmt: skip
         app.state.services = services
         app.state.metrics.watch(runner)
         stack.callback(services.lanes.close)

@@ -26,13 +26,14 @@ from osfcore.geometry.poses import quaternion_multiply, rotate
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.render.types import SceneBatch
 
-_YAWS, _MATCHES = 16, 60
+_YAWS, _MATCHES = 12, 60
+_COARSE_SIDE, _ROUGH_SIDE = 48, 32  # of the images that templates are compared with [px]
 _PLAIN = 0.01  # standard deviation of the radiance, below which a photo is one plain colour
 _OFF_TABLE = 0.06  # error of a pixel that the table, lit or shaded, does not explain [radiance]
-_BARE_SHARE, _ELSEWHERE_SHARE = 0.0015, 0.5  # of such pixels
+_BARE_SHARE, _ELSEWHERE_SHARE = 0.0006, 0.5  # of such pixels
 _BINS, _MOST_CHROMA = 24, 0.8
 _DARK = 0.05  # added to the sum of the colours, so that noise of dark pixels has no hue
-_VIEWS_OF_PALETTE = 24
+_VIEWS_OF_PALETTE, _PALETTE_SIDE = 16, 64
 _SURPLUS = 1.5  # times its share of the photo's colours that an object may have: some are larger, or nearer
 _PRESENT = 1 / 8  # of a palette's strongest bin, from which a colour counts as the object's
 # Weights of colour evidence, template evidence and one, fitted to right and wrong objects (BENCHMARKS.md).
@@ -72,8 +73,12 @@ class ContentChecker:
         if off_table.mean() < _BARE_SHARE:
             return ContentCheck("bare")
         colours = self._colour_evidence(image, off_table, observation.names)
+        of_colours, of_template, bias = _EVIDENCE
+        odds = of_colours * colours + bias
+        if odds > _SHOWN:  # the other cue, which takes most of the time, could only add to it
+            return ContentCheck("shown", colours)
         template = self._template_evidence(observation, prior)
-        odds = float(np.dot(_EVIDENCE, (colours, template, 1.0)))
+        odds += of_template * template
         verdict: Verdict = "shown" if odds > _SHOWN else "doubtful" if odds > _OTHERS else "others"
         return ContentCheck(verdict, colours, template)
 
@@ -96,14 +101,14 @@ class ContentChecker:
             positions[:, 2] = resting.heights[chosen] - rotate(quaternions, resting.centre)[:, 2]
             light = np.tile([0.36, -0.48, 0.8], (len(chosen), 1))
             batch = SceneBatch((name,), positions[:, None], quaternions[:, None], light, None)
-            camera = goal_camera(96)
+            camera = goal_camera(_PALETTE_SIDE)
             drawn = self._models.alone.render(batch, (camera,), quality=QUALITY, outputs={"rgb", "opacity"})
             assert drawn.opacity is not None
             self._palettes[name] = _chromaticities(drawn.rgb[:, 0][drawn.opacity[:, 0, 0] > 0.9])
         return self._palettes[name]
 
     def _template_evidence(self, observation: Observation, prior: SceneState) -> float:
-        coarse, rough = views_of(observation, FINE_SIDE // 2), views_of(observation, FINE_SIDE // 4)
+        coarse, rough = views_of(observation, _COARSE_SIDE), views_of(observation, _ROUGH_SIDE)
         turns = yaw_quaternions(np.arange(_YAWS) * 2 * np.pi / _YAWS)
         matches = []
         for name in observation.names:

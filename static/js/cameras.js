@@ -1,6 +1,7 @@
 // The camera strip: live images from the event stream, masks and the goal view by request, a large view on click.
 import { byId, el } from "./dom.js";
 import { enlargeComparison, isComparing } from "./neural.js";
+import { imageOf } from "./goals.js";
 import { current, known, watch } from "./state.js";
 
 const NAMES = ["0", "1", "2", "3", "goal"];
@@ -44,7 +45,7 @@ const showsGoal = (camera) => camera === "goal" && !showsMasks && Boolean(known(
 const labelOfTile = (name) => (name !== "goal" ? `Camera ${name}` : showsGoal(name) ? "Goal" : "Goal camera, now");
 
 function url(scene, camera, size, { pusher = true } = {}) {
-  if (showsGoal(camera)) return `api/goals/${encodeURIComponent(known("goal").id)}/image.png`;
+  if (showsGoal(camera)) return imageOf(known("goal"));
   const query = new URLSearchParams({ size, masks: showsMasks, pusher, v: scene.revision });
   return `api/scenes/${scene.id}/images/${camera}.png?${query}`;
 }

@@ -58,13 +58,15 @@ export function drawEnding(episode) {
   byId("ending-why").textContent = why(episode);
   byId("ending-why").hidden = !byId("ending-why").textContent;
   byId("ending-next").hidden = !canGoOn(episode);
+  byId("go-on-anyway").hidden = episode.outcome !== "refused";
+  byId("more-pushes").hidden = episode.outcome === "refused";
 }
 
-function goOn() {
+function goOn(changes) {
   const goal = known("goals").find(({ id }) => id === shown.goal);
   if (!goal) return toast("The goal of this episode has been deleted; choose another one.", "warning");
   set("goal", goal);
-  return startEpisode({ steps: MORE });
+  return startEpisode(changes);
 }
 
 export function setUpEnding() {
@@ -72,7 +74,8 @@ export function setUpEnding() {
   const wipe = () => { after.style.clipPath = `inset(0 0 0 ${100 - byId("ending-at").value}%)`; };
   byId("ending-at").addEventListener("input", wipe);
   wipe();
-  byId("more-pushes").addEventListener("click", goOn);
+  byId("more-pushes").addEventListener("click", () => goOn({ steps: MORE }));
+  byId("go-on-anyway").addEventListener("click", () => goOn({ despite_doubts: true }));
   byId("another-photo").addEventListener("click", () => {
     showTab("episode");
     byId("goal-card").open = true;

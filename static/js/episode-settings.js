@@ -68,6 +68,7 @@ function tell() {
 
 /** A change by hand: at once, where an episode runs. */
 function change() {
+  if (!offered) return;
   tell();
   const settings = chosenSettings();
   if (!settings) form().reportValidity();
@@ -101,6 +102,7 @@ export function setUpEpisodeSettings() {
   form().addEventListener("submit", (event) => event.preventDefault());
   form().addEventListener("input", tell);
   form().addEventListener("change", change);
+  byId("despite-doubts").addEventListener("change", change); // it stands where doubts are told, outside the form
   byId("settings-defaults").addEventListener("click", () => {
     if (!offered) return;
     fill(offered.defaults);

@@ -24,7 +24,7 @@ const path = (what = "") => `episodes/${live().id}${what}`;
 // Starting
 
 /** Why an episode cannot start now; "" if it can. */
-function reason() {
+function reason(changes = {}) {
   const scene = current();
   if (!isDriving()) return "Someone else is driving; take over to start.";
   if (scene === undefined) return "The simulation is starting.";
@@ -35,13 +35,14 @@ function reason() {
   const missing = fields ? scene.objects.filter(({ name }) => !fields.some((field) => field.name === name)) : [];
   if (missing.length) return `No field has been learned of ${missing.map(({ label }) => label).join(", ")}; train one under Fields.`;
   if (!chosenSettings()) return "A setting cannot be used; see Settings.";
+  if (known("check")?.refused && !{ ...chosenSettings(), ...changes }.despite_doubts) return known("check").text;
   return "";
 }
 
 /** Starts an episode as the page's settings say, or with some of them changed. */
 export function startEpisode(changes = {}) {
   if (live() || byId("run-idle").hidden) return undefined;
-  const why = reason();
+  const why = reason(changes);
   if (why) return toast(why, "warning");
   const body = { scene: current().id, goal: known("goal").id, seed: 0, settings: { ...chosenSettings(), ...changes } };
   return whileDisabled(byId("start-episode"), () => tellFailure(async () =>
@@ -136,6 +137,6 @@ export function setUpEpisode() {
   byId("run-step").addEventListener("click", stepOnce);
   byId("run-cancel").addEventListener("click", cancelEpisode);
   byId("run-reset").addEventListener("click", resetTable);
-  for (const what of ["scene", "objects", "fields", "goal", "draft", "driver", "settings"]) watch(what, drawStart);
+  for (const what of ["scene", "objects", "fields", "goal", "check", "draft", "driver", "settings"]) watch(what, drawStart);
   watch("episode", draw);
 }

@@ -1,16 +1,21 @@
 // The goal: an image of how the table should look. Uploaded, drawn at random, composed, or one of the earlier ones.
 import { getAll, post, remove, upload } from "./api.js";
+import { openCrop } from "./crop.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { mayDrive } from "./driver.js";
 import { current, known, set, watch } from "./state.js";
-import { tellFailure, tellMissingScene, toast } from "./toasts.js";
+import { tellFailure, tellMissingScene } from "./toasts.js";
 
 const DRAWN_SEEDS = 1_000_000; // short to read, and far fewer than may be asked for
 const NAME_MAX = 100;
 const CHOSEN = "osf-goal"; // what this page has chosen outlives a reload of it
 const remembered = JSON.parse(sessionStorage.getItem(CHOSEN) ?? "{}");
 let pickedFor = remembered.scene ?? null; // the scene for which a goal of another table was chosen by hand
+
+/** The address of a goal's image, another one after it was cropped. */
+export const imageOf = (goal) =>
+  `api/goals/${encodeURIComponent(goal.id)}/image.png${goal.photo ? `?${new URLSearchParams(goal.photo.crop)}` : ""}`;
 
 const fits = (goal, scene) => goal.source === "upload" || !goal.scene || goal.scene === scene?.id || pickedFor === scene?.id;
 
@@ -33,7 +38,7 @@ function settle() {
   const goals = known("goals");
   const chosen = goals.find((goal) => goal.id === (known("goal")?.id ?? remembered.goal));
   const next = chosen && fits(chosen, scene) ? chosen : goals.find((goal) => scene && goal.scene === scene.id) ?? null;
-  if (next?.id !== known("goal")?.id) set("goal", next);
+  if (next !== known("goal")) set("goal", next);
 }
 
 export function randomGoal() {
@@ -54,9 +59,9 @@ export async function uploadGoal(file) {
   bar.value = 0;
   await tellFailure(async () => {
     const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
-    const goal = await upload(`goals?${query}`, file, (share) => { bar.value = share; }, file.type || "application/octet-stream");
+    const goal = await upload(`goals?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
     takeGoal(goal);
-    toast(`${goal.name} is the goal now.`);
+    if (goal.photo.width !== goal.photo.height) openCrop(); // its middle is a guess
   });
   bar.hidden = true;
 }
@@ -66,7 +71,7 @@ export async function uploadGoal(file) {
 const ORIGINS = { drawn: "Drawn at random", composed: "Composed by hand" };
 
 function originText(goal, scene) {
-  const origin = ORIGINS[goal.source] ?? `Uploaded, ${goal.width} × ${goal.height} px; where things go is read from the image`;
+  const origin = ORIGINS[goal.source] ?? "Uploaded; where things go is read from the photo";
   return goal.scene && goal.scene !== scene?.id ? `${origin}, for another table` : origin;
 }
 
@@ -74,7 +79,7 @@ function draw(goal) {
   if (goal) sessionStorage.setItem(CHOSEN, JSON.stringify({ goal: goal.id, scene: pickedFor }));
   const image = byId("goal-image");
   image.hidden = !goal;
-  if (goal) image.src = `api/goals/${encodeURIComponent(goal.id)}/image.png`;
+  if (goal) image.src = imageOf(goal);
   else image.removeAttribute("src");
   image.alt = goal ? `Goal: ${goal.name}` : "";
   byId("goal-drop").classList.toggle("filled", Boolean(goal));

@@ -24,7 +24,7 @@ from app.services.service_settings import Settings
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
 from tests.app.conftest import keep_busy, leave_running, running
-from tests.app.services.test_goals import photo
+from tests.app.services.goals.test_goals import photo
 
 CHECKS = (
     not_a_server_error,

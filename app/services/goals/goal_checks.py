@@ -125,7 +125,7 @@ class GoalChecks:
 
     def _listed(self, names: tuple[str, ...]) -> str:
         labels = self._labels()
-        *others, last = [labels.get(name, name) for name in names]
+        *others, last = [f"the {labels[name].lower()}" if name in labels else name for name in names]
         return f"{', '.join(others)} and {last}" if others else last
 
 

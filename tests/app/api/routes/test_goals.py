@@ -14,7 +14,7 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.io.scene_file import camera_to_json
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import LONG, until
-from tests.app.services.test_goals import photo
+from tests.app.services.goals.test_goals import photo
 from tests.app.storage.test_photos import ODD_ANY, ODD_TURNED, ODD_UPRIGHT, jpeg_with
 
 BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"
@@ -84,7 +84,38 @@ def test_a_photo_may_bring_its_own_camera(service):
     camera = camera_to_json(replace(goal_camera(96), name="mine", height=64))
     goal = upload(service, photo(96, 64), camera=json.dumps(camera)).json()
     assert (goal["width"], goal["height"], goal["camera"]["name"]) == (96, 64, "mine")
-    assert "96 x 64" in is_problem(upload(service, photo(96, 64)), 422)["detail"]
+    assert goal["photo"]["crop"] == {"left": 0, "top": 0, "width": 96, "turn_deg": 0}
+
+
+def test_a_photo_is_cropped_in_its_own_pixels(service):
+    made = upload(service, photo(96, 64)).json()
+    assert made["photo"] == {"width": 96, "height": 64, "crop": {"left": 16, "top": 0, "width": 64, "turn_deg": 0}}
+    path = f"/api/goals/{made['id']}"
+    cropped = service.patch(path, json={"crop": {"left": 0, "top": 10, "width": 50}}).json()
+    assert (cropped["width"], cropped["photo"]["crop"]["top"]) == (50, 10)
+    assert service.get(path).json() == cropped
+    with Image.open(io.BytesIO(service.get(f"{path}/photo.jpg").content)) as whole:
+        assert whole.size == (96, 64)
+    beside = is_problem(service.patch(path, json={"crop": {"left": 60, "top": 0, "width": 50}}), 422)
+    assert "within the photo's 96 x 64" in beside["detail"]
+
+
+def test_a_goal_that_was_made_here_has_no_photo(service, scene):
+    made = service.post("/api/goals", json={"random": {"seed": 1}}).json()
+    path = f"/api/goals/{made['id']}"
+    assert made["photo"] is None
+    is_problem(service.get(f"{path}/photo.jpg"), 404)
+    crop = {"crop": {"left": 0, "top": 0, "width": 50}}
+    assert "nothing to crop" in is_problem(service.patch(path, json=crop), 409)["detail"]
+    assert service.get(f"{path}/check").json() == {"verdict": "shown", "refused": False, "text": "", "scene": None}
+
+
+def test_a_photo_of_nothing_is_refused_by_the_check_and_by_episodes(service, scene):
+    goal = upload(service, photo(96, 96)).json()["id"]
+    check = service.get(f"/api/goals/{goal}/check").json()
+    assert (check["verdict"], check["refused"]) == ("bare", True)
+    assert is_problem(service.post("/api/episodes", json={"goal": goal}), 409)["detail"] == check["text"]
+    is_problem(service.get(f"/api/goals/{goal}/check", params={"scene": "nowhere"}), 422)
 
 
 def test_odd_metadata_is_no_defect_of_the_service(service):
@@ -124,14 +155,14 @@ def test_a_camera_that_makes_no_sense_is_refused(service, camera):
 @pytest.mark.parametrize(
     ("request_", "status", "words"),
     [
-        ({"content": b"GIF89a", "headers": PNG}, 422, "neither a PNG nor a JPEG"),
+        ({"content": b"GIF89a", "headers": PNG}, 422, "no picture that can be read here"),
         ({"content": photo()[:100], "headers": PNG}, 422, "damaged or incomplete"),
         ({"content": photo(31, 31), "headers": PNG}, 422, "31 x 31"),
-        ({"content": b"", "headers": PNG}, 422, "photo"),
+        ({"content": b"", "headers": PNG}, 422, "picture"),
         ({"content": photo(), "headers": PNG, "params": {"name": ""}}, 422, "name"),
         ({"content": photo(), "headers": PNG, "params": {"name": "x" * 101}}, 422, "name"),
-        ({"content": photo(), "headers": {"Content-Type": "image/gif"}}, 415, "image/png or image/jpeg"),
-        ({"content": photo()}, 415, "untyped"),
+        ({"content": photo(), "headers": {"Content-Type": "video/mp4"}}, 415, "such as a JPEG"),
+        ({"content": photo()}, 415, "Send a photo"),
         ({"json": {}}, 422, "either objects or random"),
         ({"json": {"random": {}, "objects": []}}, 422, "#/objects"),
         ({"json": {"random": {"moved": 3}}}, 422, "between 1 and 2"),

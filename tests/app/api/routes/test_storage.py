@@ -6,7 +6,7 @@ from app.storage.field_files import open_workshop
 from tests.app.api.routes.test_jobs import TABLE
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import keep_busy, running
-from tests.app.services.test_goals import photo
+from tests.app.services.goals.test_goals import photo
 
 PNG = {"content-type": "image/png"}
 ZIP = {"content-type": "application/zip"}

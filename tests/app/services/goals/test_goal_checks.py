@@ -19,7 +19,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from tests.app.storage.test_database import record
 
-LABELS = {"x": "cracker box", "y": "mug", "z": "bowl"}
+LABELS = {"x": "Cracker box", "y": "Mug", "z": "Bowl"}
 
 
 def scene(key, *names):
@@ -81,9 +81,9 @@ def checks(goals, link):
     ("verdict", "is_refused", "words"),
     [
         ("shown", False, ""),
-        ("doubtful", False, "not certain that this photo shows cracker box and mug"),
+        ("doubtful", False, "not certain that this photo shows the cracker box and the mug"),
         ("bare", True, "Nothing can be seen on the table"),
-        ("others", True, "does not seem to show cracker box and mug"),
+        ("others", True, "does not seem to show the cracker box and the mug"),
         ("elsewhere", True, "does not show the table as the goal camera sees it; crop it"),
     ],
 )
@@ -120,7 +120,7 @@ def test_a_goal_made_here_is_known_without_looking(checks, link):
 def test_a_goal_for_another_table_names_that_table(checks, goal, home):
     check = checks.check(goal, "s")
     assert (check.verdict, check.scene, check.is_refused) == ("other table", home, True)
-    assert "another table, with bowl" in check.text
+    assert "another table, with the bowl" in check.text
 
 
 def test_without_a_table_a_goal_or_a_field_there_is_nothing_to_compare(checks, monkeypatch):
