@@ -140,7 +140,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         goal_service = Goals(runner, settings.data_dir, settings.max_goals, photos)
         await run_in_threadpool(goal_service.start)
         checks = GoalChecks(runner, fields, goal_service, neural, objects.labels)
-        viewer = Viewer(runner, neural, fields.names, estimate_service, prediction_service, goal_service)
+        viewer = Viewer(runner, neural, fields.names, prediction_service, goal_service)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
         thumbnails = Thumbnails(runner.library, settings.data_dir / "thumbnails")

@@ -17,7 +17,6 @@ import viser
 from app.jobs.job import JobChanged
 from app.processes.messages.scene_messages import SceneRecord
 from app.processes.process_client import ProcessClient
-from app.services.estimates import Estimates
 from app.services.event_hub import CurrentScene
 from app.services.goals.goals import DraftChanged, Goals
 from app.services.predictions import Predictions
@@ -40,8 +39,6 @@ from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 
-PUSHES = {"+x": (0.2, 0.0, 0.0), "-x": (-0.2, 0.0, 0.0), "+y": (0.0, 0.2, 0.0), "-y": (0.0, -0.2, 0.0)}
-PUSH_STEPS = 2
 _log = logging.getLogger(__name__)
 
 
@@ -53,7 +50,6 @@ class Viewer:
         runner: Runner,
         neural: ProcessClient,
         fields: Callable[[], Collection[str]],
-        estimates: Estimates,
         predictions: Predictions,
         goals: Goals,
     ) -> None:
@@ -63,12 +59,10 @@ class Viewer:
             runner: executes commands on scenes.
             neural: renders fields.
             fields: names of the objects that have a field.
-            estimates: estimates poses and light from images.
             predictions: predicts pushes.
             goals: goal images, and the draft of one.
         """
         self._goals = goals
-        self._estimates = estimates
         self._predictions = predictions
         self._runner = runner
         self._neural = neural
@@ -131,19 +125,12 @@ class Viewer:
 
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
         """The panels, in the order of their folders."""
-        library, table, jobs = self._runner.library, self._drawing, self._runner.jobs
+        library, table = self._runner.library, self._drawing
         table.watch(self.pages.neural.scene_moved)
-        estimate = EstimatePanel(
-            server,
-            (table, EstimateNodes(server, library, table.has)),
-            self._estimates,
-            self._neural,
-            self._run_command,
-            jobs.cancel,
-        )
+        estimate = EstimatePanel(server, (table, EstimateNodes(server, library, table.has)))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
         drawings = table, EpisodeNodes(server, library, table.has)
-        episode = EpisodePanel(server, drawings, jobs, self._run_command, estimate.forget)
+        episode = EpisodePanel(server, drawings, estimate.forget)
         push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
         return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push
 
@@ -168,24 +155,14 @@ class Viewer:
         gui = server.gui
         gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
         gui.set_panel_label("Scene")
-        push = gui.add_button_group("Push", tuple(PUSHES), hint="Move the pusher along an axis of the table.")
-        reset = gui.add_button("Reset", hint="Back to how the scene was created.")
-        new = gui.add_button("New scene", hint="Other objects, other light.")
         self._wants_gizmos = gui.add_checkbox("Move objects", False, hint="Show handles to drag and turn the objects.")
         cameras = gui.add_checkbox("Cameras", False)
         names = gui.add_checkbox("Names", True)
         gui.main_panel.minimize()
 
-        push.on_click(lambda event: self._push(event.target.value, event.client))
-        reset.on_click(lambda event: self._on_current(self._runner.reset_scene, event.client))
-        new.on_click(lambda event: self._run_command(self._runner.create_scene, event.client))
         self._wants_gizmos.on_update(lambda _: self._update_gizmos())
         cameras.on_update(lambda event: self._drawing.show_cameras(event.target.value))
         names.on_update(lambda event: self._drawing.show_names(event.target.value))
-
-    def _push(self, direction: str, client: Client) -> None:
-        if direction in PUSHES:  # clients may send anything
-            self._on_current(lambda scene: self._runner.act(scene, [PUSHES[direction]] * PUSH_STEPS), client)
 
     def _move_object(self, name: str, pose: Pose, client: Client) -> None:
         """An object was let go; where it must not be, it goes back. Called on viser's loop."""

@@ -8,9 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
-import numpy as np
 import viser
 
 from app.jobs.job import Job, JobChanged, JobView
@@ -21,39 +19,18 @@ from app.services.event_hub import CurrentScene
 from app.services.goals.goals import DraftChanged
 from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
 from app.viewer.nodes.scene_nodes import SceneNodes
-from app.viewer.panels.panel import Panel, RunCommand, status
-from osfcore.control.events import Finished, GoalFound, Looking, Noticed, Stepped
+from app.viewer.panels.panel import Panel
+from osfcore.control.events import GoalFound, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.planning.pose_cost import PoseGoal
 
 DRAW_INTERVAL_S = 0.08
-_IDLE = "No episode yet"
 _SHOWN: tuple[tuple[Part, str, str], ...] = (
     ("goal", "Show goal", "Golden: where everything should be."),
     ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
     ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
 )
-
-
-class JobCommands(Protocol):
-    """Commands to the job that runs an episode."""
-
-    def pause(self, job: str) -> object:
-        """Let it rest."""
-        ...
-
-    def resume(self, job: str) -> object:
-        """Let it go on."""
-        ...
-
-    def step(self, job: str) -> object:
-        """Let it go on to the end of its round."""
-        ...
-
-    def cancel(self, job: str) -> object:
-        """End it."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,18 +42,12 @@ class _EpisodeState:
         goal: target poses.
         sight: a step of an estimator at work, or the last estimate.
         plan: the last round of planning.
-        left: largest remaining distance to the goal, in words.
-        notice: last warning.
-        end: how the episode ended, in words.
     """
 
     job: Job | None = None
     goal: PoseGoal | None = None
     sight: Looking | EstimatedState | None = None
     plan: PlanSketch | None = None
-    left: str = ""
-    notice: str = ""
-    end: str = ""
 
     @property
     def is_live(self) -> bool:
@@ -103,38 +74,25 @@ class _EpisodeState:
             case PlanSketch():
                 return replace(self, plan=event)
             case Stepped(estimate=estimate):
-                return replace(self, sight=estimate, left=_far(event))
-            case Noticed(number, _, text):
-                return replace(self, notice=f"Step {number}: {text}")
-            case Finished(text=text):
-                return replace(self, end=text)
+                return replace(self, sight=estimate)
             case _:
                 return self
 
 
 class EpisodePanel(Panel):
-    """The folder and the nodes of episodes; the same in all browsers.
+    """The nodes of episodes, and a folder to choose which are drawn; the same in all browsers.
 
     Args:
         server: whose panel gets the folder.
         nodes: of the table, whose own light is the true one, and of episodes.
-        commands: to the job that runs one.
-        run_command: carries out a command and notifies its client if it is refused.
         make_room: called before an episode is drawn, to remove what would be in its way.
     """
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        nodes: tuple[SceneNodes, EpisodeNodes],
-        commands: JobCommands,
-        run_command: RunCommand,
-        make_room: Callable[[], object],
+        self, server: viser.ViserServer, nodes: tuple[SceneNodes, EpisodeNodes], make_room: Callable[[], object]
     ) -> None:
         super().__init__("episode-panel", DRAW_INTERVAL_S)
         self._table, self._nodes = nodes
-        self._commands = commands
-        self._run_command = run_command
         self._make_room = make_room
         self._state = _EpisodeState()
         self._current: str | None = None
@@ -180,21 +138,12 @@ class EpisodePanel(Panel):
 
     def _add_panel(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Episode", expand_by_default=False):
-            self._status = gui.add_html(status("episode", _IDLE))
-            self._bar = gui.add_progress_bar(0.0, visible=False)
-            self._notice = gui.add_html("", visible=False)
-            self._pause_button = gui.add_button("Pause", disabled=True)
-            self._step_button = gui.add_button("Step", disabled=True, hint="One more round, then rest again.")
-            self._cancel_button = gui.add_button("Cancel", disabled=True, hint="End it; its steps are kept.")
             for part, label, hint in _SHOWN:
                 self._add_part(gui, part, label, hint)
             self._wants_truth = gui.add_checkbox(
                 "Show true light", False, hint="The simulation's own light, which the estimator does not know."
             )
             clear = gui.add_button("Clear", hint="Remove what a finished episode has drawn.")
-        self._pause_button.on_click(lambda event: self._run_command(self._toggle, event.client))
-        self._step_button.on_click(lambda event: self._run_command(self._step, event.client))
-        self._cancel_button.on_click(lambda event: self._run_command(self._cancel, event.client))
         self._wants_truth.on_update(lambda _: self._draw_truth())
         clear.on_click(lambda _: self._forget())
 
@@ -206,23 +155,6 @@ class EpisodePanel(Panel):
             self._draw_truth()
 
         box.on_update(show)
-
-    def _toggle(self) -> None:
-        job = self._state.job
-        if job is not None and job.state == "paused":
-            self._commands.resume(job.id)
-        elif job is not None:
-            self._commands.pause(job.id)
-
-    def _step(self) -> None:
-        job = self._state.job
-        if job is not None:
-            self._commands.step(job.id)
-
-    def _cancel(self) -> None:
-        job = self._state.job
-        if job is not None:
-            self._commands.cancel(job.id)
 
     def _forget(self) -> None:
         with self._thread.changed:
@@ -259,7 +191,6 @@ class EpisodePanel(Panel):
             self._nodes.show_plan(state.plan)
             self._plan_at = time.monotonic()
         self._draw_truth()
-        self._draw_state(state)
         self._drawn = state
 
     def _draw_truth(self) -> None:
@@ -269,44 +200,6 @@ class EpisodePanel(Panel):
         else:
             self._table.show_lamp(is_on=True, by=KIND)
 
-    def _draw_state(self, state: _EpisodeState) -> None:
-        job = state.job
-        is_paused = job is not None and job.state == "paused"
-        can_pause = job is not None and job.state in ("running", "paused")
-        self._bar.visible = state.is_live
-        if job is not None:
-            self._bar.value = 100.0 * job.done / max(job.total, 1)
-        self._pause_button.label = "Resume" if is_paused else "Pause"
-        self._pause_button.disabled = not can_pause
-        self._step_button.disabled = not is_paused
-        self._cancel_button.disabled = not state.is_live
-        self._status.content = status("episode", _sentence(state))
-        self._notice.content, self._notice.visible = status("episode", state.notice), bool(state.notice)
-
 
 def _id(job: Job | None) -> str | None:
     return None if job is None else job.id
-
-
-def _sentence(state: _EpisodeState) -> str:
-    """The state in words."""
-    job = state.job
-    if job is None:
-        return _IDLE
-    match job.state:
-        case "queued":
-            return "Waiting for other jobs"
-        case "cancelled":
-            return "Cancelled"
-        case "done":
-            return state.end or "Done"
-        case "running" | "paused":
-            parts = [f"Paused: {job.note}" if job.state == "paused" else job.note, state.left]
-            return " · ".join(text for text in parts if text)
-        case _:
-            return job.error or job.note
-
-
-def _far(stepped: Stepped) -> str:
-    far_mm, turned_deg = 1000 * stepped.offsets_m.max(), np.rad2deg(stepped.offsets_rad.max())
-    return f"at most {far_mm:.0f} mm and {turned_deg:.0f}° to go"

@@ -1,4 +1,4 @@
-"""Composing a goal in the 3D view: golden copies of the objects with handles, and the folder in the panel.
+"""Composing a goal in the 3D view: golden copies of the objects with handles.
 
 Drafts come from whoever changes them and are only stored; drawing happens in the thread. Hands are answered by the
 simulation, so what they moved is on its way for a moment: until then it stays where it was let go.
@@ -6,15 +6,13 @@ simulation, so what they moved is on its way for a moment: until then it stays w
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Protocol
 
 import numpy as np
 import viser
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Float
 
 from app.services.event_hub import CurrentScene
 from app.services.goals.goals import Draft, DraftChanged
@@ -22,21 +20,16 @@ from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.episode_nodes import GOAL
 from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.scene_nodes import NO_TURN, Client
-from app.viewer.panels.panel import Panel, RunCommand, status
-from osfcore.errors import OsfError
+from app.viewer.panels.panel import Panel, RunCommand
 from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary
 
 WRONG = (225, 30, 35)
-NAME = "Composed"
 _OPACITY, _SCALE = 0.55, 1.015  # or a copy and the object that it lies upon would flicker
 _CELLS = 28
 _GIZMO_M = 0.11
 _WORDS_AT = (0.0, 0.0, 0.3)
 _STILL = 1e-6  # poses that differ by less are not sent again
-_NO_PICTURE = np.full((64, 64, 3), 235, np.uint8)
-_IDLE = "Lay the objects out as they should be, then save."
-_COMPOSING = "Drag the golden copies, or turn them by their rings."
 
 
 class Drafts(Protocol):
@@ -47,32 +40,16 @@ class Drafts(Protocol):
         """As it is now."""
         ...
 
-    def begin_draft(self) -> object:
-        """Begin with where the objects are."""
-        ...
-
     def move_draft(self, poses: tuple[tuple[str, Pose], ...]) -> object:
         """Put objects elsewhere."""
         ...
 
-    def drop_draft(self) -> None:
-        """End it."""
-        ...
-
-    def draft_image(self) -> bytes:
-        """PNG of what it looks like."""
-        ...
-
-    def keep_draft(self, name: str) -> object:
-        """Keep it as a goal image, and end it."""
-        ...
-
 
 class GoalPanel(Panel):
-    """The folder and the nodes of a goal that is being composed; the same in all browsers.
+    """The nodes of a goal that is being composed; the same in all browsers.
 
     Args:
-        server: to draw in, and whose panel gets the folder.
+        server: to draw in.
         library: meshes of the objects.
         goals: what is composed.
         commands: carries out what hands do; viser's loop must not wait for it.
@@ -96,11 +73,9 @@ class GoalPanel(Panel):
         self._draft = goals.draft
         self._current: str | None = None
         self._copies: dict[str, _Copy] = {}
-        self._pictured: Draft | None = None
         self._words = server.scene.add_label(
             "/goal/problem", "", position=_WORDS_AT, visible=False, font_screen_scale=1.0, anchor="bottom-center"
         )
-        self._add_panel(server.gui)
 
     def _store(self, event: object) -> bool:
         match event:
@@ -118,29 +93,11 @@ class GoalPanel(Panel):
         with self._thread.changed:
             return self._draft is not None and self._draft.scene == self._current
 
-    # The panel
-
-    def _add_panel(self, gui: viser.GuiApi) -> None:
-        goals = self._goals
-        with gui.add_folder("Goal", expand_by_default=False):
-            self._status = gui.add_html(status("goal", _IDLE))
-            self._begin_button = gui.add_button("Compose a goal", hint="Begins with where the objects are now.")
-            self._keep_button = gui.add_button("Save as goal image", disabled=True)
-            self._drop_button = gui.add_button("Stop composing", disabled=True, hint="Nothing is kept.")
-            self._image = gui.add_image(_NO_PICTURE, label="As the goal camera sees it", visible=False)
-        self._begin_button.on_click(lambda event: self._run_command(goals.begin_draft, event.client))
-        self._keep_button.on_click(lambda event: self._run_command(lambda: goals.keep_draft(NAME), event.client))
-        self._drop_button.on_click(lambda event: self._run_command(goals.drop_draft, event.client))
-
     # The thread
 
     def _draw(self) -> None:
         with self._thread.changed:
             draft = self._draft if self.is_composing else None
-        self._draw_draft(draft)
-        self._draw_picture(draft)
-
-    def _draw_draft(self, draft: Draft | None) -> None:
         poses = {} if draft is None else dict(draft.poses)
         problem = "" if draft is None else draft.problem
         with atomic(self._server):
@@ -152,21 +109,6 @@ class GoalPanel(Panel):
                 self._copies[name].place(pose)
                 self._copies[name].colour(WRONG if problem else GOAL)
             self._words.text, self._words.visible = problem, bool(problem)
-        self._status.content = status("goal", _IDLE if draft is None else problem or _COMPOSING)
-        self._begin_button.disabled = draft is not None
-        self._keep_button.disabled = self._drop_button.disabled = draft is None
-
-    def _draw_picture(self, draft: Draft | None) -> None:
-        if draft is self._pictured:
-            return
-        self._pictured = draft
-        try:
-            pixels = None if draft is None else _pixels(self._goals.draft_image())
-        except OsfError:  # it has ended meanwhile
-            pixels = None
-        if pixels is not None:
-            self._image.image = pixels
-        self._image.visible = pixels is not None
 
     def _let_go(self, copy: _Copy, grip: int, pose: Pose, client: Client) -> None:
         """A copy was let go; where that is refused, it goes back. Called on viser's loop."""
@@ -264,8 +206,3 @@ def _about_z(turn: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
     flat = turn * np.array([1.0, 0.0, 0.0, 1.0])
     length = float(np.linalg.norm(flat))
     return flat / length if np.isfinite(length) and length > 1e-6 else NO_TURN
-
-
-def _pixels(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
-    with Image.open(io.BytesIO(png)) as image:
-        return np.asarray(image.convert("RGB"))

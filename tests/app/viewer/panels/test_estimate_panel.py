@@ -1,16 +1,9 @@
-"""The folder in the panel, with estimates that are told by the test."""
-
-import io
-from concurrent.futures import Future
-from types import SimpleNamespace
+"""Estimates in the 3D view, told by the test."""
 
 import numpy as np
 import pytest
-import viser
-from PIL import Image
 
 from app.jobs.job import Job, JobChanged, JobView
-from app.processes.messages.neural_messages import Comparison
 from app.services.event_hub import CurrentScene
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import SceneNodes
@@ -41,36 +34,18 @@ def step(number=1, estimate=None, x=0.1):
     return EstimateStep(Progress(number, 6, ""), "objects", moved, losses=(1 / number,), estimate=estimate)
 
 
-class Renderer:
-    def __init__(self):
-        self.orders = []
-
-    def submit(self, order):
-        self.orders.append((order, Future()))
-        return self.orders[-1][1]
-
-
 class Room:
     """A view whose service is made of air."""
 
     def __init__(self, server, library):
         self.gui = ViewerDriver(server)
-        self.asked, self.cancelled = [], []
         self.table = SceneNodes(server, library, lambda *_: None, lambda *_: None)
         self.drawing = EstimateNodes(server, library)
-        self.renderer = Renderer()
-        estimates = SimpleNamespace(of_scene=self.asked.append, comparison=lambda job, view: (job.id, view))
-        self.panel = EstimatePanel(
-            server, (self.table, self.drawing), estimates, self.renderer, lambda command, _: command(),
-            self.cancelled.append,
-        )  # fmt: skip
+        self.panel = EstimatePanel(server, (self.table, self.drawing))
 
     def see(self, of, what):
         self.panel.show(JobView(of, what))
         until(lambda: self.panel.is_idle)
-
-    def says(self, words):
-        until(lambda: words in self.gui.element("Status").value)
 
     def guess(self):
         node = self.gui.node(f"/estimate/guess/{BOX}")
@@ -87,29 +62,19 @@ def room(server, library):
     room.panel.close()
 
 
-def test_steps_are_drawn_and_the_panel_tells_how_far_it_is(room):
+def test_steps_are_drawn(room):
     room.see(job(), step())
     until(lambda: not room.drawing.is_empty)
-    room.says("Looking")
-    assert room.gui.progress() == 50
-    assert not room.gui.element("Cancel").disabled
     room.see(job(), step(2, x=0.2))
     until(lambda: np.allclose(room.guess(), [[0.3, 0, 0.1]]))
-    until(lambda: len(room.gui.element(viser.GuiUplotHandle).data[0]) == 3)  # two steps and the gap behind them
 
 
-def test_buttons_ask_and_cancel(room):
-    room.gui.press("Estimate from cameras")
-    assert [asked.mode for asked in room.asked] == ["first"]
-    room.gui.press("Cancel")
-    assert room.cancelled == []  # there is nothing to cancel
+def test_what_an_estimate_has_drawn_is_cleared_once_it_is_over(room):
     room.see(job(), step())
-    room.gui.press("Cancel")
-    assert room.cancelled == ["a"]
     room.gui.press("Clear")
     assert not room.drawing.is_empty  # it still runs
     room.panel.show(JobChanged(1, job("done", result={"trusted": True})))
-    room.says("Done, trusted")
+    until(lambda: room.panel.is_idle)
     room.gui.press("Clear")
     until(lambda: room.drawing.is_empty)
 
@@ -127,8 +92,6 @@ def test_the_true_light_is_told_on_demand_only_and_is_back_when_the_estimate_is_
     until(lambda: room.drawing.is_empty)
     until(lambda: not room.gui.shows("/light_name"))
     assert room.gui.shows("/light")
-    room.says("Cancelled")
-    assert room.gui.element("Cancel").disabled
 
 
 def test_only_what_is_about_the_scene_on_view_is_drawn(room):
@@ -137,7 +100,7 @@ def test_only_what_is_about_the_scene_on_view_is_drawn(room):
     room.see(job(scene=None, name="upload"), step())
     until(lambda: not room.drawing.is_empty)
     room.panel.show(JobChanged(1, job("done", scene=None, name="upload", result={"trusted": False})))
-    room.says("NOT trusted")
+    until(lambda: room.panel.is_idle)
     room.see(job(), step())
     assert not room.drawing.is_empty
     room.panel.show(CurrentScene(record()))
@@ -146,12 +109,9 @@ def test_only_what_is_about_the_scene_on_view_is_drawn(room):
 
 def test_one_that_waits_does_not_take_the_view_from_one_that_runs(room):
     room.see(job(), step())
-    room.says("Looking")
     room.panel.show(JobChanged(1, job("queued", name="b")))
     until(lambda: room.panel.is_idle)
-    room.says("Looking")
-    room.panel.show(JobChanged(2, job(note="Looking again")))
-    room.says("Looking again")
+    assert not room.drawing.is_empty
 
 
 def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
@@ -160,37 +120,12 @@ def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
     room.panel.show(JobChanged(1, other))
     assert room.panel.is_idle
     assert room.drawing.is_empty
-    room.says("Not asked yet")
 
 
-def test_why_it_failed_is_told(room):
+def test_of_one_that_failed_nothing_stays(room):
     room.see(job(), step())
     room.panel.show(JobChanged(1, job("failed", error="mask of x is empty.")))
-    room.says("mask of x is empty.")
-    assert room.drawing.is_empty
-
-
-def test_observed_and_rendered_are_shown_side_by_side_one_order_at_a_time(room, monkeypatch):
-    monkeypatch.setattr(room.gui.server, "get_clients", lambda: {7: None})
-    room.see(job(), step())
-    until(lambda: room.renderer.orders)
-    room.see(job(), step(2))
-    order, answer = room.renderer.orders[0]
-    assert order == ("a", 0)
-    assert len(room.renderer.orders) == 1  # the second waits for the first
-    buffer = io.BytesIO()
-    Image.fromarray(np.repeat(np.arange(12, dtype=np.uint8)[None, :, None] * 20, 4, axis=0).repeat(3, axis=2)).save(
-        buffer, "PNG"
-    )
-    answer.set_result(Comparison(b"", b"", buffer.getvalue(), 30.0))
-    until(lambda: room.gui.element("Observed, rendered").visible)
-    shown = room.gui.element("Observed, rendered").image
-    np.testing.assert_array_equal(shown[0, :, 0], np.arange(8) * 20)  # without the difference
-    until(lambda: len(room.renderer.orders) == 2)
-    room.renderer.orders[1][1].set_exception(RuntimeError("the renderer is gone"))
-    room.gui.set("Camera", "1")
-    until(lambda: len(room.renderer.orders) == 3)
-    assert room.renderer.orders[2][0] == ("a", 1)
+    until(lambda: room.drawing.is_empty)
 
 
 def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
