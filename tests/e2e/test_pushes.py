@@ -61,12 +61,23 @@ def press(frame, name):
     frame.get_by_role("button", name=name, exact=True).click()
 
 
+def unfold(frame, folder, words):
+    """Open a folder; a click that comes while the panel still unfolds itself is lost."""
+
+    def is_open():
+        if not frame.get_by_text(words).is_visible():
+            frame.get_by_text(folder).click()
+            frame.owner.page.wait_for_timeout(1000)
+        return frame.get_by_text(words).is_visible()
+
+    wait_until(is_open)
+
+
 def test_a_push_is_chosen_predicted_executed_and_compared(page, url):
     frame = page.frame_locator("#viewer")
     frame.locator("canvas").first.wait_for(timeout=WAIT_MS)
     frame.get_by_text("Scene", exact=True).first.click()
-    frame.get_by_text("What will a push do?").click()
-    frame.get_by_text("true poses").wait_for()
+    unfold(frame, "What will a push do?", "true poses")
     before, plain = scene_of(url), purple(page)
     press(frame, "↙")
     number = frame.get_by_text("Steps", exact=True).locator("xpath=following::input[not(@type='hidden')][1]")
