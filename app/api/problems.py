@@ -35,6 +35,8 @@ STATUS_OF_KIND = {
     "NoScene": 409,
     "NoTable": 409,
     "NoTrajectory": 409,
+    "NoClip": 409,
+    "EpisodeGoesOn": 409,
     "NotDriving": 409,
     "NoRoomToNudge": 409,
     "GoalRefused": 409,

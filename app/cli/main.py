@@ -13,6 +13,7 @@ from app.cli.commands.assets import Assets
 from app.cli.commands.backup import Backup, Restore
 from app.cli.commands.bench import Bench
 from app.cli.commands.check import Check
+from app.cli.commands.clip import Clip
 from app.cli.commands.collect import Collect
 from app.cli.commands.episode import RunEpisode
 from app.cli.commands.estimate import Estimate
@@ -47,6 +48,7 @@ Commands = Annotated[
     | Annotated[Estimate, tyro.conf.subcommand("estimate", description="Find poses and light in images.")]
     | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
     | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
+    | Annotated[Clip, tyro.conf.subcommand("clip", description="Make a clip of an episode.")]
     | Annotated[Record, tyro.conf.subcommand("record", description="Make the stories that the page plays.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]

@@ -5,3 +5,4 @@ GOAL_FILE, FRAMES_FOLDER = "goal.png", "frames"
 ARCHIVE_FILE = "episode.zip"  # all that can be downloaded, made on demand
 TRAJECTORY_FILE = "trajectory.npz"
 PREPARED_FILE = "prepared.json"  # what was found out beforehand about an example
+CLIP_FILE = "clip.mp4"  # to be posted, made on demand

@@ -20,7 +20,7 @@ from app.processes.plan_summary import PlanSketch
 from osfcore.errors import CorruptFile
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_atomically
@@ -83,6 +83,19 @@ class Trajectory:
     def names(self) -> tuple[str, ...]:
         """Of the objects."""
         return self.states[0].names
+
+    def state_at(self, action: float) -> SceneState:
+        """The true state after some actions; between two whole numbers, on the way."""
+        number = min(max(int(action), 0), len(self.states) - 1)
+        first, then = self.states[number], self.states[min(number + 1, len(self.states) - 1)]
+        share = min(max(action - number, 0.0), 1.0)
+        turn = quaternion_log(quaternion_multiply(then.poses.quaternion, quaternion_conjugate(first.poses.quaternion)))
+        quaternions = quaternion_multiply(quaternion_exp(share * turn), first.poses.quaternion)
+        positions = (1 - share) * first.poses.position + share * then.poses.position
+        pusher = first.pusher
+        if first.pusher is not None and then.pusher is not None:
+            pusher = (1 - share) * first.pusher + share * then.pusher
+        return SceneState(first.names, Pose(positions, quaternions), first.light, pusher)
 
 
 # The file

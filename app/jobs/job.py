@@ -19,6 +19,7 @@ Kind = Literal[
     "train_field",
     "estimate",
     "episode",
+    "clip",
 ]
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files

@@ -50,12 +50,18 @@ class _Episode(Entry):
     goal: _Goal
 
 
+class _Clip(Entry):
+    episode: Text
+    title: Text
+
+
 _PARAMS = {
     "collect_object": _Named,
     "add_object": _Adding,
     "train_field": _Training,
     "estimate": _Estimate,
     "episode": _Episode,
+    "clip": _Clip,
 }
 
 

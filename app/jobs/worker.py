@@ -73,6 +73,12 @@ def _episode(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
     yield from episode_job(params, place)
 
 
+def _clip(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.clips import clip_job
+
+    yield from clip_job(params, place)
+
+
 KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "collect_pushes": _collect_pushes,
     "collect_object": _collect_object,
@@ -82,8 +88,9 @@ KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "train_field": _train_field,
     "estimate": _estimate,
     "episode": _episode,
+    "clip": _clip,
 }
-_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate")
+_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate", "clip")
 _NOT_EXTRA = ("done", "total", "note", "view")
 
 

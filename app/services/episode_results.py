@@ -11,6 +11,7 @@ import cv2
 
 from app.episodes.file_names import (
     ARCHIVE_FILE,
+    CLIP_FILE,
     CSV_FILE,
     FRAMES_FOLDER,
     GOAL_FILE,
@@ -29,7 +30,7 @@ from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import Entry, decode
 from osfcore.io.scene_file import StateJson
 
-FILES = (REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, RECORDING_FILE, ARCHIVE_FILE)
+FILES = (REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, CLIP_FILE, RECORDING_FILE, ARCHIVE_FILE)
 THUMBNAIL_PX = 96
 
 

@@ -25,7 +25,7 @@ from osfcore.errors import InvalidInput, OsfError, check_seed
 from osfcore.geometry.poses import unit_quaternion
 from osfcore.io.scene_file import camera_to_json
 
-KIND = "episode"
+KIND, CLIP_KIND = "episode", "clip"
 _MOST_NAMES = 1000  # that a new one is compared with
 _PLAN = ("samples", "horizon", "temperature")
 
@@ -35,6 +35,13 @@ class NoGoal(OsfError):
 
     def __init__(self) -> None:
         super().__init__("An episode needs a goal: name a goal image (goal), or give poses of all objects (poses).")
+
+
+class EpisodeGoesOn(OsfError):
+    """A clip of something that is not over."""
+
+    def __init__(self) -> None:
+        super().__init__("The episode goes on; a clip can be made when it is over.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -140,6 +147,23 @@ class Episodes(EpisodeResults):
         is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
         truth = poses_to_json(goal.poses) if is_known and goal.poses is not None else None
         return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": None, "truth": truth}
+
+    def make_clip(self, job: Job) -> Job:
+        """Queue the job that makes a clip of an episode; the one that is at it already, if there is one.
+
+        Raises:
+            NoTrajectory: if the episode cannot be drawn again.
+            EpisodeGoesOn: if it is not over yet.
+            QueueFull: if too many jobs wait.
+            StorageFull: if nothing more may be written.
+        """
+        if not job.is_finished:
+            raise EpisodeGoesOn
+        self.trajectory(job)
+        for other in self._runner.jobs.live(CLIP_KIND):
+            if other.params["episode"] == job.id:
+                return other
+        return self._runner.submit_job(CLIP_KIND, {"episode": job.id, "title": self.name(job)})
 
     # Telling of one
 

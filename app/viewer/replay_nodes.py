@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-
-import numpy as np
 import viser
 
 from app.episodes.replay_clock import Moment, ReplayClock
 from app.episodes.trajectory import LookFrame, Round, Trajectory
 from app.viewer.nodes.episode_nodes import EpisodeNodes
-from app.viewer.nodes.ghosts import pose_at
 from app.viewer.nodes.scene_nodes import LIVE_NODES, SceneNodes
 from osfcore.control.events import Looking
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.planning.pose_cost import PoseGoal
@@ -61,7 +56,7 @@ class ReplayNodes:
         """Show a moment [s]."""
         moment, before = self._clock.moment(at_s), self._shown
         if moment.action != before.action:
-            self._table.place(self._state(moment.action))
+            self._table.place(self._trajectory.state_at(moment.action))
         if moment.look is not before.look:
             self._show_look(moment.look)
         if moment.estimate is not before.estimate:
@@ -77,25 +72,6 @@ class ReplayNodes:
         self._root.remove()
         for node in self._hidden:
             node.remove()
-
-    def _state(self, action: float) -> SceneState:
-        """The true state after some actions; in between, on the way."""
-        states = self._trajectory.states
-        number = min(max(bisect_right(range(len(states)), action) - 1, 0), len(states) - 1)
-        first, then = states[number], states[min(number + 1, len(states) - 1)]
-        share = action - number
-        pairs = [
-            Pose(np.stack([a, b]), np.stack([p, q]))
-            for a, b, p, q in zip(
-                first.poses.position, then.poses.position, first.poses.quaternion, then.poses.quaternion, strict=True
-            )
-        ]
-        between = [pose_at(pair, share) for pair in pairs]
-        poses = Pose(np.array([p.position for p in between]), np.array([p.quaternion for p in between]))
-        pusher = first.pusher
-        if first.pusher is not None and then.pusher is not None:
-            pusher = first.pusher + share * (then.pusher - first.pusher)
-        return SceneState(first.names, poses, first.light, pusher)
 
     def _show_look(self, look: LookFrame | None) -> None:
         if look is None:

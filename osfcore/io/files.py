@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from PIL import Image
 
-from osfcore.errors import CannotWrite, CorruptFile, OsfError
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 
 MAX_JSON_BYTES = 16_000_000
 _PNG_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
@@ -98,6 +98,17 @@ def read_json(path: Path, parse: Callable[[object], T]) -> T:
         raise CorruptFile(path, str(error).rstrip(".")) from error
     except ValueError as error:  # a number with thousands of digits
         raise CorruptFile(path, f"it is not valid JSON ({error})") from error
+
+
+def as_mapping(data: object) -> dict[str, Any]:
+    """Parsed JSON that is an object.
+
+    Raises:
+        InvalidInput: if it is something else.
+    """
+    if not isinstance(data, dict):
+        raise InvalidInput("content", shown(repr(data)), "a JSON object")
+    return data
 
 
 def is_text(name: str) -> bool:

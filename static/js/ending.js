@@ -1,4 +1,5 @@
 // How an episode ended: before and after, what it came to in one line, what is missing, and what to do about it.
+import { drawClip } from "./clip.js";
 import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
 import { LIVE } from "./jobs.js";
@@ -57,6 +58,7 @@ export function drawEnding(episode) {
   byId("ending-sum").textContent = summary(episode);
   byId("ending-why").textContent = why(episode);
   byId("ending-why").hidden = !byId("ending-why").textContent;
+  drawClip(episode);
   byId("ending-next").hidden = !canGoOn(episode);
   byId("go-on-anyway").hidden = episode.outcome !== "refused";
   byId("more-pushes").hidden = episode.outcome === "refused";

@@ -2,6 +2,7 @@
 import { setUpAddress } from "./address.js";
 import { VISITOR, get } from "./api.js";
 import { setUpCameras, showFrames } from "./cameras.js";
+import { setUpClip } from "./clip.js";
 import { setUpCompose } from "./compose.js";
 import { setUpCrop } from "./crop.js";
 import { byId } from "./dom.js";
@@ -102,6 +103,7 @@ setUpDrop();
 setUpEpisodeView();
 setUpResults(shownStep);
 setUpEnding();
+setUpClip();
 setUpEpisodeSettings();
 setUpEpisode();
 setUpEpisodes();

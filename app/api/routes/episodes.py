@@ -17,6 +17,7 @@ from app.api.problems import named_in_path
 from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.routes.events import StreamDep, followed
 from app.api.schemas.episodes import EpisodeIn, EpisodeList, EpisodeOut, RenameIn, SettingsIn
+from app.api.schemas.jobs import JobOut
 from app.api.schemas.limits import SEARCH, STEP, sized, within
 from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.episodes.file_names import REPORT_FILE
@@ -118,6 +119,13 @@ def pause(services: ServicesDep, job: FoundDep) -> EpisodeOut:
 def resume(services: ServicesDep, job: FoundDep) -> EpisodeOut:
     """Let a paused episode go on."""
     return _out(services, services.runner.jobs.resume(job.id))
+
+
+@router.post("/{episode}/clip", status_code=status.HTTP_202_ACCEPTED, responses=problems(404, 409, 429, 507))
+@slow
+def clip(services: ServicesDep, job: FoundDep) -> JobOut:
+    """Make a clip in 1080p of an episode that is over; then it is one of the episode's files, `clip.mp4`."""
+    return JobOut.of(services.episodes.make_clip(job))
 
 
 @router.post("/{episode}/step", responses=problems(404, 409))

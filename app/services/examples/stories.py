@@ -12,8 +12,8 @@ from typing import Any
 
 from app.episodes.file_names import PREPARED_FILE, TRAJECTORY_FILE
 from app.storage.paths import static_folder
-from osfcore.errors import InvalidInput, UnknownName, shown
-from osfcore.io.files import read_json
+from osfcore.errors import UnknownName
+from osfcore.io.files import as_mapping, read_json
 
 STORY_FILE = "story.json"
 
@@ -58,14 +58,3 @@ class Stories:
         if name not in self.names():
             raise UnknownName("story", name[:80], self.names())
         return self.root / name
-
-
-def as_mapping(data: object) -> dict[str, Any]:
-    """Parsed JSON that is an object.
-
-    Raises:
-        InvalidInput: if it is something else.
-    """
-    if not isinstance(data, dict):
-        raise InvalidInput("content", shown(repr(data)), "a JSON object")
-    return data

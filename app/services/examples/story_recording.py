@@ -18,7 +18,7 @@ from app.episodes.replay_clock import LOOK_S, ReplayClock
 from app.episodes.request import EpisodeOrder
 from app.episodes.trajectory import read_trajectory
 from app.services.examples.presets import Preset
-from app.services.examples.stories import STORY_FILE, as_mapping
+from app.services.examples.stories import STORY_FILE
 from app.services.goals.goals import GOAL_SIDE
 from osfcore.control.events import GoalFound, Observed, Stepped
 from osfcore.control.goal import GoalImage
@@ -27,7 +27,7 @@ from osfcore.control.scene_models import load_scene_models
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import Observation
-from osfcore.io.files import read_json, write_atomically, write_json
+from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.objects.asset_library import AssetLibrary
 
 _QUALITY = 82  # of WebP

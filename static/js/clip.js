@@ -1,0 +1,47 @@
+// A clip of an episode that is over: making it, playing it, taking it along, and the link to the episode.
+import { post } from "./api.js";
+import { byId, whileDisabled } from "./dom.js";
+import { LIVE, stateText } from "./jobs.js";
+import { known, set, watch } from "./state.js";
+import { tellFailure, toast } from "./toasts.js";
+
+const FILE = "clip.mp4";
+let shown = null; // the episode whose ending is on view
+
+const mine = () => (known("clip")?.params.episode === shown?.id ? known("clip") : null);
+
+/** Shows what there is of the clip of an episode. */
+export function drawClip(episode = shown) {
+  shown = episode;
+  if (!shown) return;
+  const job = mine();
+  const isLive = LIVE.has(job?.state);
+  const isThere = !isLive && (job?.state === "done" || shown.files.includes(FILE));
+  const url = `api/episodes/${encodeURIComponent(shown.id)}/files/${FILE}`;
+  byId("make-clip").hidden = isLive || isThere;
+  byId("save-clip").hidden = byId("clip").hidden = !isThere;
+  if (isThere && byId("clip").getAttribute("src") !== url) {
+    byId("clip").src = url;
+    byId("save-clip").href = url;
+  }
+  if (!isThere) byId("clip").removeAttribute("src");
+  byId("clip-state").textContent = isLive ? stateText(job) : job?.state === "failed" ? job.error : "";
+}
+
+async function copyLink() {
+  const link = new URL(location.href);
+  link.search = new URLSearchParams({ episode: shown.id });
+  try {
+    await navigator.clipboard.writeText(link.href);
+    toast("The link is copied; it opens this episode.");
+  } catch { // pages that are not secure may not copy
+    toast(`This link opens the episode: ${link.href}`);
+  }
+}
+
+export function setUpClip() {
+  byId("make-clip").addEventListener("click", () => whileDisabled(byId("make-clip"), () => tellFailure(async () =>
+    set("clip", await post(`episodes/${encodeURIComponent(shown.id)}/clip`)))));
+  byId("copy-link").addEventListener("click", copyLink);
+  watch("clip", () => drawClip());
+}
