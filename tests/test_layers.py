@@ -49,7 +49,7 @@ OWNERS = {  # who alone may import a package
     "coacd": ("osfcore.geometry.convex_parts",),
     "viser": ("app.viewer", "app.episodes.recording", "app.api.relay"),
     "websockets": ("app.api.relay", "app.viewer.private_server"),
-    "imageio_ffmpeg": ("app.episodes.frames",),
+    "imageio_ffmpeg": ("app.episodes.frames", "app.episodes.clip.clip"),
     "fastapi": ("app",),
     "uvicorn": ("app",),
     "tyro": ("app",),

@@ -116,7 +116,14 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     assert page.input_value("#timeline") == "3"
     page.click("#watch-video")
     until(lambda: page.eval_on_selector("#shown-video", "video => video.readyState >= 2 && video.videoWidth === 768"))
+    page.click("#make-clip")
+    page.wait_for_selector("#clip-state:not(:empty)", timeout=WAIT_MS)
+    page.wait_for_selector("#clip:not([hidden])", timeout=LONG_MS)
+    until(lambda: page.eval_on_selector("#clip", "video => video.readyState >= 1 && video.videoWidth === 1920"))
+    assert page.get_attribute("#save-clip", "href").endswith("clip.mp4")
+    assert "clip.mp4" in service.episode()["files"]
     page.goto(f"{service.url}/?episode={episode['id']}&step=1")
+    page.wait_for_selector("#clip:not([hidden])", timeout=WAIT_MS)
     page.wait_for_selector("#shown:not([hidden])", timeout=WAIT_MS)
     until(lambda: page.input_value("#timeline") == "1")
     page.click("#tab-drive")

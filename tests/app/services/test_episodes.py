@@ -14,16 +14,18 @@ import pytest
 
 from app.episodes.file_names import (
     ARCHIVE_FILE,
+    CLIP_FILE,
     CSV_FILE,
     FRAMES_FOLDER,
     GOAL_FILE,
     RECORDING_FILE,
     REPORT_FILE,
+    TRAJECTORY_FILE,
     VIDEO_FILE,
 )
 from app.episodes.frames import HEIGHT, TILE_PX, WIDTH, frame, part_of
-from app.services.episode_results import FILES
-from app.services.episodes import AskedEpisode, Episodes, NoGoal, flat, nested
+from app.services.episode_results import FILES, NoTrajectory
+from app.services.episodes import AskedEpisode, EpisodeGoesOn, Episodes, NoGoal, flat, nested
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals.goal_checks import GoalRefused
 from app.services.goals.goals import NoTable
@@ -146,6 +148,24 @@ def test_a_goal_that_shows_something_else_is_refused_unless_doubts_do_not_matter
     assert episodes.start(AskedEpisode(goal="made")).kind == "episode"
 
 
+def test_one_clip_at_a_time_is_made_of_an_episode_that_is_over(episodes, runner):
+    job = episodes.start(AskedEpisode(goal="made"))
+    with pytest.raises(EpisodeGoesOn, match="when it is over"):
+        episodes.make_clip(job)
+    job = runner.jobs.put(job.id, state="done")
+    with pytest.raises(NoTrajectory):
+        episodes.make_clip(job)
+    (runner.jobs.folder(job.id) / TRAJECTORY_FILE).touch()
+    clip = episodes.make_clip(job)
+    assert (clip.kind, clip.params) == ("clip", {"episode": job.id, "title": "Made"})
+    assert episodes.make_clip(job).id == clip.id
+    runner.jobs.put(clip.id, state="failed")
+    assert episodes.make_clip(job).id != clip.id
+    assert CLIP_FILE not in episodes.files(job)
+    (runner.jobs.folder(job.id) / CLIP_FILE).touch()
+    assert CLIP_FILE in episodes.files(job)
+
+
 def test_composing_ends_when_an_episode_takes_the_scene_but_not_when_it_is_refused(episodes, goals):
     with pytest.raises(NoGoal):
         episodes.start(AskedEpisode())
@@ -263,7 +283,7 @@ def broken_off(episodes, runner):
 
 
 def test_video_and_recording_are_made_when_they_are_asked_for(episodes, runner, broken_off):
-    assert episodes.files(broken_off) == FILES
+    assert set(episodes.files(broken_off)) == set(FILES) - {CLIP_FILE}
     folder = runner.jobs.folder(broken_off.id)
     assert not (folder / VIDEO_FILE).exists()
     path = episodes.file(broken_off, VIDEO_FILE)
@@ -371,7 +391,7 @@ def test_an_episode_is_followed_to_its_end(service, services, done):
     assert first["truly_to_goal_mm"][MUSTARD] == pytest.approx(50, abs=0.1)
     assert first["estimate_off_mm"][MUSTARD] < 10
     assert set(first["seconds"]) == {"first", "goal"} or set(first["seconds"]) == {"first"}
-    assert episode["files"] == list(FILES)
+    assert episode["files"] == [name for name in FILES if name != CLIP_FILE]
     now = services.runner.scene(scene["id"])
     assert now.time_s == pytest.approx(0.4)
     assert not np.array_equal(now.state.pusher, scene["pusher"]["position"])

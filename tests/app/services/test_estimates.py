@@ -51,9 +51,10 @@ class Jobs(JobFolders):
         super().__init__(data_dir)
         self._all = []
 
-    def submit(self, kind, params, inputs):
+    def submit(self, kind, params, inputs=None):
         job = Job(f"job{len(self._all)}", kind, params)
-        shutil.copytree(inputs, self.inputs(job.id))
+        if inputs is not None:
+            shutil.copytree(inputs, self.inputs(job.id))
         self._all.insert(0, job)
         return job
 
@@ -63,6 +64,9 @@ class Jobs(JobFolders):
     def page(self, limit, before, kind, fits=lambda _: True):
         shown = [job for job in self._all if job.kind == kind and fits(job)]
         return JobPage(tuple(shown[:limit]), len(shown), None)
+
+    def live(self, kind):
+        return tuple(job for job in self._all if job.kind == kind and not job.is_finished)
 
     def get(self, name, kind=None):
         for job in self._all:
@@ -89,6 +93,9 @@ class Runner:
         self.current = "s"
         self.names = (BOX, MUSTARD)
         self.storage = StorageMeter(data_dir)
+
+    def submit_job(self, kind, params):
+        return self.jobs.submit(kind, params)
 
     def submit_with_inputs(self, kind, params, inputs):
         return self.jobs.submit(kind, params, inputs)
