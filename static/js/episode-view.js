@@ -16,6 +16,7 @@ import { replay, showLive } from "./viewer.js";
 let shown = null; // the episode, as fetched last
 let wanted = null; // {id, step} to be fetched next; no step: stay where one is, at the end if there
 let isFetching = false;
+let closings = 0;
 let timeline = null;
 let followed = ""; // the job that was put on view by itself
 let seen = ""; // how far the job was when it was fetched for
@@ -46,8 +47,9 @@ async function fetchWanted() {
   while (wanted) {
     const { id, step } = wanted;
     wanted = null;
+    const before = closings;
     const found = await tellFailure(() => get(`episodes/${encodeURIComponent(id)}`));
-    if (found) showEpisode(found, step);
+    if (found && before === closings) showEpisode(found, step); // unless it was closed meanwhile
   }
   isFetching = false;
 }
@@ -167,6 +169,8 @@ function follow(job) {
 function close() {
   timeline.pause();
   shown = null;
+  wanted = null;
+  closings += 1;
   note({ episode: null, step: null });
   byId("shown").hidden = true;
   showLive();

@@ -188,6 +188,7 @@ def test_every_kind_that_rest_tells_of_exists():
         "fetch_assets",
         "add_object",
         "train_field",
+        "clip",
         "estimate",
         "episode",
     }
