@@ -28,6 +28,7 @@ STATUS_OF_KIND = {
     "WorkshopInUse": 409,
     "TrainingAlready": 409,
     "ShippedField": 409,
+    "NoTrainedField": 409,
     "ObjectTaken": 409,
     "ObjectNeeded": 409,
     "CatalogueObject": 409,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
+import tempfile
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from app.storage.field_files import uninstall
+from app.storage.field_files import install, uninstall
 from osfcore.errors import OsfError
-from osfcore.fields.field_library import FieldInfo, FieldLibrary
+from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
 
 
 class ShippedField(OsfError):
@@ -16,6 +18,13 @@ class ShippedField(OsfError):
 
     def __init__(self, name: str) -> None:
         super().__init__(f"The field of {name} is shipped with the program and cannot be deleted.")
+
+
+class NoTrainedField(OsfError):
+    """A training that has left no field to use."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"That training has left no field of {name}; train it again.")
 
 
 class MissingFields(OsfError):
@@ -60,6 +69,21 @@ class FieldCatalogue:
     def has_mesh(self, name: str) -> bool:
         """Whether scenes can simulate the object."""
         return name in self._meshes()
+
+    def use(self, name: str, made: Path) -> None:
+        """Put a field that training has left in a folder, as NAME.safetensors and NAME.json, in the place of another.
+
+        Raises:
+            NoTrainedField: if it is not there, or not there any more.
+            CannotWrite: if the disk refuses; then nothing is changed.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                for file in (FIELD_FILE, METRICS_FILE):
+                    shutil.copyfile(made / f"{name}{Path(file).suffix}", Path(folder) / file)
+            except OSError as error:
+                raise NoTrainedField(name) from error
+            install(Path(folder), self._library.folder(name))
 
     def remove(self, name: str) -> None:
         """Delete a field that was trained here; a shipped one of the same name then counts again.

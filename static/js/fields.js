@@ -3,7 +3,7 @@ import { get, getAll, post, remove, upload } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
-import { objects, set, watch } from "./state.js";
+import { known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
 import { tellFailure, toast } from "./toasts.js";
 
@@ -170,7 +170,34 @@ function drawTraining(job) {
   shown = { id: job.id, state: job.state, controls: key, preview };
   if (before.id !== job.id || before.controls !== key) byId("training-actions").replaceChildren(...controls(job));
   if (before.preview !== preview) drawPreview(preview);
+  drawComparison(job, label);
   if (before.id === job.id && before.state !== job.state) tellEnd(job, label);
+}
+
+const used = new Set(); // jobs whose field was put to use by hand
+
+/** How the new field compares with the one that was there. */
+function drawComparison(job, label) {
+  const { before_full: full, before_mask: mask, psnr_mask: now, in_use: inUse } = job.result ?? {};
+  const isCompared = job.state === "done" && Number.isFinite(mask);
+  byId("comparison").hidden = !isCompared;
+  if (!isCompared) return;
+  const both = `On the same unseen images the field of ${label} that was there has ${psnrText({ psnr_full: full, psnr_mask: mask })}`;
+  const isNewUsed = inUse || used.has(job.id);
+  byId("comparison-text").textContent = isNewUsed
+    ? `${both}. The new one${now >= mask ? " is no worse, and" : ""} is in use now.`
+    : `${both}. That is better, so it stays in use.`;
+  byId("comparison-choice").hidden = isNewUsed;
+  const address = `api/jobs/${job.id}/comparison.png`;
+  if (byId("comparison-image").getAttribute("src") !== address) byId("comparison-image").src = address;
+}
+
+async function useNew() {
+  const job = known("training");
+  await post(`fields/${encodeURIComponent(job.params.name)}/use`, { job: job.id });
+  used.add(job.id);
+  drawTraining(job);
+  await refreshFields();
 }
 
 function drawPreview(address) {
@@ -181,7 +208,7 @@ function drawPreview(address) {
 
 function tellEnd(job, label) {
   if (job.state === "done") {
-    toast(`The field of ${label} is ready.`);
+    if (job.result?.in_use !== false) toast(`The field of ${label} is ready.`);
     refreshFields();
   } else if (job.state === "failed") {
     toast(job.error, "error");
@@ -212,6 +239,7 @@ export function setUpFields() {
     if (chosen) whileDisabled(button, () => tellFailure(() => uploadSet(chosen)));
     file.value = "";
   });
+  byId("use-new-field").addEventListener("click", () => whileDisabled(byId("use-new-field"), () => tellFailure(useNew)));
   doubted(byId("delete-set"), "Really delete set", deleteSet);
   byId("training-image").addEventListener("error", () => drawPreview(""));
   watch("objects", () => {

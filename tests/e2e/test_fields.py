@@ -72,12 +72,19 @@ def test_from_a_mesh_to_a_field_with_preview_and_psnr(page, url):
     wait_until(lambda: has_preview(page), 10)
     wait_until(lambda: page.get_attribute("#training", "data-state") == "done", TRAIN_S)
     assert has_preview(page)
-    page.wait_for_selector(f'#field-list [data-field="{GELATIN}"]', timeout=WAIT_MS)
-    listed = page.inner_text(f'#field-list [data-field="{GELATIN}"]')
+    told = page.inner_text("#comparison-text")
+    assert "That is better, so it stays in use." in told  # some seconds against the shipped field's hour
+    assert get(url, f"fields/{GELATIN}")["source"] == "shipped"
+    wait_until(lambda: page.evaluate("document.getElementById('comparison-image').naturalWidth") >= 384)
+    page.click("#use-new-field")
+    page.wait_for_selector("#comparison-choice", state="hidden", timeout=WAIT_MS)
     field = get(url, f"fields/{GELATIN}")
-    assert f"{field['metrics']['psnr_mask']:.1f} dB in the mask" in listed
-    assert "trained here" in listed
-    assert "needs a mesh" not in listed
+    assert field["source"] == "trained"
+    assert f"{get(url, 'jobs')['jobs'][0]['result']['before_mask']:.1f} dB in the mask" in told
+    entry = page.locator(f'#field-list [data-field="{GELATIN}"]')
+    wait_until(lambda: f"{field['metrics']['psnr_mask']:.1f} dB in the mask" in entry.inner_text())
+    assert "trained here" in entry.inner_text()
+    assert "needs a mesh" not in entry.inner_text()
     assert page.problems == []
 
 

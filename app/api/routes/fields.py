@@ -10,9 +10,10 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import PNG, problems
-from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut
+from app.api.schemas.fields import FieldList, FieldOut, SetList, SetOut, UseIn
 from app.api.schemas.limits import FILE_NAME, sized
 from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
+from app.services.fields import NoTrainedField
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
 
@@ -84,6 +85,18 @@ def overlay(services: ServicesDep, set_id: SetId) -> OpenFile:
 def get(services: ServicesDep, name: FieldName) -> FieldOut:
     """Tell what is known of one field."""
     return _out(services, _known_field(services, name))
+
+
+@router.post("/{name}/use", responses=problems(404, 409, 507))
+def use(services: ServicesDep, name: FieldName, body: UseIn) -> FieldOut:
+    """Use a field that was trained here, though it is not as good as the one that is in use."""
+    _known_field(services, name)
+    job = services.runner.jobs.get(body.job, "train_field")
+    if job.params["name"] != name or job.state != "done":
+        raise NoTrainedField(name)
+    services.fields.use(name, services.runner.jobs.folder(job.id))
+    services.runner.storage.outdate()
+    return _out(services, services.fields.get(name))
 
 
 @router.delete("/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507))

@@ -14,7 +14,7 @@ from app.api.routes import FORGOTTEN, PNG, Forget, problems
 from app.api.schemas.jobs import JobIn, JobList, JobOut
 from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.jobs.job import Job, check_file_name
-from app.jobs.kinds.fields import PREVIEW
+from app.jobs.kinds.fields import COMPARISON, PREVIEW
 
 router = APIRouter(prefix="/api/jobs", tags=["jobs"], responses=problems(), route_class=BoundedRoute)
 FileName = Annotated[str, Path(description="One of the job's files.")]
@@ -97,3 +97,12 @@ def preview(services: ServicesDep, job: JobId) -> OpenFile:
 def _known_job(services: Services, job: str) -> Job:
     with named_in_path():
         return services.runner.jobs.get(job)
+
+
+@router.get("/{job}/comparison.png", response_class=FileResponse, responses={**problems(404), **PNG})
+def comparison(services: ServicesDep, job: JobId) -> OpenFile:
+    """Show held-out images beside what the former and the new field make of them."""
+    with named_in_path():
+        folder = services.runner.jobs.folder(services.runner.jobs.get(job).id)
+    gone = f"Job {job} has compared nothing; training a field of which there was one already does, at its end."
+    return OpenFile(folder / COMPARISON, gone, media_type="image/png")

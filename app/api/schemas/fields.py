@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from app.api.schemas.common import Input
+from app.api.schemas.limits import NAME, sized
 from app.api.schemas.paging import PageOut
 from app.services.image_sets import SetRecord
 
@@ -26,6 +28,12 @@ class FieldList(BaseModel):
     """All fields, sorted by name."""
 
     fields: list[FieldOut]
+
+
+class UseIn(Input):
+    """A field that was trained and is not in use, since the one that was there was better."""
+
+    job: str = Field(**sized(NAME), description="Identifier of the job that trained it.")
 
 
 class SetOut(BaseModel):

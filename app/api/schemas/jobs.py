@@ -70,7 +70,7 @@ class FieldSource(Input):
 
 
 class TrainFieldParams(Input):
-    """A field to train. One that was trained under this name before is replaced when the new one is there."""
+    """A field to train. It replaces one of this name only if it is no worse on the same held-out images."""
 
     name: ObjectName = Field(description="Of the field; scenes need a mesh of the same name.")
     source: FieldSource

@@ -1,4 +1,8 @@
-"""The job that trains a field: take images of the mesh if there is no set, train, put the field in place."""
+"""The job that trains a field: take images of the mesh if there is no set, train, put the field in place.
+
+Where there is a field of that name already, both are measured on the same held-out images, and the better one stays.
+The other new one is kept with the job, so that it can be used all the same.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from app.storage.field_files import clear_workshop, install, open_workshop
 from osfcore.errors import CannotWrite
-from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
 from osfcore.io.files import write_atomically
 from osfcore.io.image_file import write_png
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
 
-PREVIEW = "preview.png"
+PREVIEW, COMPARISON = "preview.png", "comparison.png"
+_COMPARE_S = 15  # what measuring two fields counts in the progress, about as long as it takes
 _S_PER_IMAGE = 0.03  # what taking an image counts in the progress, about as long as it takes
 
 
@@ -32,6 +37,9 @@ class TrainingStep:
         psnr_full: on held-out images [dB]; None until measured.
         psnr_mask: the same inside the silhouettes, dilated by 2 px [dB].
         previews: how many preview images were made so far, so that a page knows when to fetch the next.
+        before_full: of the field that was there, on the same images [dB]; None if there was none, or until measured.
+        before_mask: likewise, inside the silhouettes.
+        in_use: whether the new field is; None until it is decided.
     """
 
     done: int
@@ -40,10 +48,13 @@ class TrainingStep:
     psnr_full: float | None = None
     psnr_mask: float | None = None
     previews: int = 0
+    before_full: float | None = None
+    before_mask: float | None = None
+    in_use: bool | None = None
 
 
 def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep]:
-    """Train a field and put it in place.
+    """Train a field, and put it in place unless one that is better is there.
 
     The same order after a kill goes on from the images and the checkpoint that are there.
 
@@ -53,7 +64,8 @@ def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[Train
     name, mesh = params["name"], params["source"]["mesh"]
     train_s = max(1, round(60 * params["minutes"]))
     collect_s = round(_S_PER_IMAGE * params["images"]) if mesh else 0
-    step = TrainingStep(0, collect_s + train_s, "Starting")
+    compare_s = _COMPARE_S if name in FieldLibrary(place.data_dir).names() else 0
+    step = TrainingStep(0, collect_s + train_s + compare_s, "Starting")
     yield step
     shop = open_workshop(place.data_dir, name, _order(params, place))
     if mesh:
@@ -64,18 +76,38 @@ def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[Train
     step = replace(step, done=collect_s)
     if not (shop / METRICS_FILE).is_file():  # it is written last
         begin = step
-        for step in _train(params, data, shop / FIELD_FILE, place.folder / PREVIEW, begin):
+        for step in _train(params, data, shop / FIELD_FILE, place.folder / PREVIEW, begin, train_s):
             yield step
-    install(shop, place.data_dir / "fields" / name)
-    _offer(shop, place.folder, name)
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
+    step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
+    if name in FieldLibrary(place.data_dir).names():
+        yield replace(step, note="Comparing it with the field that is there")
+        step = _compared(step, name, data, shop, place)
+    in_use = step.before_mask is None or step.psnr_mask is None or step.psnr_mask >= step.before_mask
+    if in_use:
+        install(shop, place.data_dir / "fields" / name)
+    _offer(shop, place.folder, name)
     clear_workshop(place.data_dir, name)
-    yield replace(
+    note = "Done" if in_use else "Done; the field that was there is better and stays"
+    yield replace(step, done=step.total, note=note, in_use=in_use)
+
+
+def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobContext) -> TrainingStep:
+    """Both fields on all held-out images; pictures of some, side by side, go to the job's folder."""
+    from osfcore.fields.field_weights import read_field
+    from osfcore.fields.training.validation import Holdout
+    from osfcore.io.image_set import read_image_set
+
+    holdout = Holdout(read_image_set(data, "test"))
+    before, new = FieldLibrary(place.data_dir).load(name), read_field(shop / FIELD_FILE)
+    there, ours = holdout.everything(before), holdout.everything(new)
+    write_png(place.folder / COMPARISON, holdout.beside((before, new)))
+    return replace(
         step,
-        done=step.total,
-        note="Done",
-        psnr_full=metrics.get("psnr_full", step.psnr_full),
-        psnr_mask=metrics.get("psnr_mask", step.psnr_mask),
+        psnr_full=round(ours.psnr_full, 3),
+        psnr_mask=round(ours.psnr_mask, 3),
+        before_full=round(there.psnr_full, 3),
+        before_mask=round(there.psnr_mask, 3),
     )
 
 
@@ -99,7 +131,9 @@ def _collect(
         yield replace(begin, done=round(_S_PER_IMAGE * progress.done), note=progress.note)
 
 
-def _train(params: dict[str, Any], data: Path, out: Path, preview: Path, begin: TrainingStep) -> Iterator[TrainingStep]:
+def _train(
+    params: dict[str, Any], data: Path, out: Path, preview: Path, begin: TrainingStep, train_s: int
+) -> Iterator[TrainingStep]:
     from osfcore.fields.training.kiloosf_training import train_field
     from osfcore.fields.training.recipes import TrainField
 
@@ -112,7 +146,7 @@ def _train(params: dict[str, Any], data: Path, out: Path, preview: Path, begin: 
         share = step.progress.done / max(step.progress.total, 1)
         yield replace(
             begin,
-            done=begin.done + round(share * (begin.total - begin.done)),
+            done=begin.done + round(share * train_s),
             note=step.progress.note,
             psnr_full=step.psnr_full,
             psnr_mask=step.psnr_mask,

@@ -58,6 +58,14 @@ class Holdout:
         """Measure on all images."""
         return self._look(field, range(len(self._images.cameras)))
 
+    def beside(self, fields: Sequence[KiloOSF], count: int = 3) -> UInt8[np.ndarray, "h w 3"]:
+        """A few images under each other: the truth, and beside it what each of the fields makes of it."""
+        rows = []
+        for number in np.unique(np.linspace(0, len(self._images.cameras) - 1, count).astype(int)).tolist():
+            pairs = [self._pair(KiloQuery(field), field, number) for field in fields]
+            rows.append(np.hstack([pairs[0][0], *(ours for _, ours in pairs)]))
+        return to_uint8(np.vstack(rows))
+
     def _look(self, field: KiloOSF, numbers: Sequence[int]) -> Look:
         query = KiloQuery(field)
         full, inside, preview = [], [], None

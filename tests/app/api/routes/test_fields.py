@@ -81,11 +81,24 @@ def test_from_a_mesh_to_a_field_that_can_be_seen_and_deleted(service, services):
     preview = Image.open(io.BytesIO(service.get(f"/api/jobs/{job['id']}/preview.png").content))
     assert preview.width == 3 * preview.height
 
-    assert job["files"] == [f"{GELATIN}.json", f"{GELATIN}.safetensors", "preview.png"]
+    assert job["files"] == [f"{GELATIN}.json", f"{GELATIN}.safetensors", "comparison.png", "preview.png"]
+
+    result = job["result"]
+    assert result["in_use"] is False  # some seconds of training against the shipped field's hour
+    assert result["psnr_mask"] < result["before_mask"]
+    pictures = Image.open(io.BytesIO(service.get(f"/api/jobs/{job['id']}/comparison.png").content))
+    assert pictures.width == pictures.height
+    assert service.get(f"/api/fields/{GELATIN}").json()["source"] == "shipped"
+    assert not (services.settings.data_dir / "fields" / GELATIN).exists()
+    other = service.post("/api/fields/006_mustard_bottle/use", json={"job": job["id"]})
+    assert "no field of 006_mustard_bottle" in is_problem(other, 409)["detail"]
+    is_problem(service.post(f"/api/fields/{GELATIN}/use", json={"job": "nobody"}), 422)
+    used = service.post(f"/api/fields/{GELATIN}/use", json={"job": job["id"]}).json()
 
     field = service.get(f"/api/fields/{GELATIN}").json()
     assert (field["source"], field["has_mesh"], field["note"]) == ("trained", True, None)
     assert field["label"] == "Gelatin box"
+    assert used == field
     file = service.get(f"/api/jobs/{job['id']}/files/{GELATIN}.safetensors")
     assert 1000 < len(file.content) == field["bytes"] < 3_000_000
     assert field["metrics"]["psnr_mask"] == pytest.approx(job["result"]["psnr_mask"], abs=1e-3)
