@@ -1,23 +1,21 @@
 # make demo   build everything and open the page      make test   the quick tests (minutes)
 # make test-all   every test, browser included      make coverage   lines that the quick tests reach
-# Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   DATA_DIR=<where objects and runs live>
+# Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   OSF_DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
 TORCH_INDEX ?=
 PORT ?= 8000
-DATA_DIR ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-DATA := $(if $(DATA_DIR),--data-dir $(DATA_DIR),)
 OFFLINE := echo "make: the packages could not be installed; see the lines above (is there a network connection?)" >&2
 
 .PHONY: demo install dev test test-all test-types coverage lint soak bench clean
 
 demo: install
-	@$(BIN)/osf assets fetch $(DATA)
-	@$(BIN)/osf serve --port $(PORT) $(DATA)
+	@$(BIN)/osf assets fetch
+	@$(BIN)/osf serve --port $(PORT)
 
 install: $(VENV)/.installed
 dev: $(VENV)/.dev-installed

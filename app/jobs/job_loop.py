@@ -156,9 +156,10 @@ class JobLoop:
 
     def _progress(self, run: JobProcess, step: JobStep) -> None:
         with self._changed:
-            eta_s = run.clock.left_s(step.done, step.total)
             job = self._table[run.id]
             result = step.result or None
+            told = step.result.get("left_s")  # by jobs whose parts take their time in different ways
+            eta_s = run.clock.left_s(step.done, step.total) if told is None else told
             job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
             self._table.set_progress(job)
         if step.view is not None:

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from app.jobs.context import JobContext
 
 PREVIEW, COMPARISON = "preview.png", "comparison.png"
-_COMPARE_S = 15  # what measuring two fields counts in the progress, about as long as it takes
-_S_PER_IMAGE = 0.03  # what taking an image counts in the progress, about as long as it takes
+_COMPARING = "Comparing it with the field that is there"
+# What the parts count in the progress: about as long as they take on two cores [s], most of them for each image.
+_START_S, _CARVE_S = 4, 6
+_TAKE_S, _MEASURE_S, _COMPARE_S = 0.08, 0.035, 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class TrainingStep:
         before_full: of the field that was there, on the same images [dB]; None if there was none, or until measured.
         before_mask: likewise, inside the silhouettes.
         in_use: whether the new field is; None until it is decided.
+        left_s: time left, over all parts [s].
     """
 
     done: int
@@ -51,6 +54,12 @@ class TrainingStep:
     before_full: float | None = None
     before_mask: float | None = None
     in_use: bool | None = None
+    left_s: float | None = None
+
+    @property
+    def must_be_told(self) -> bool:
+        """Whether a part begins of which nothing is told before its end."""
+        return self.note == _COMPARING
 
 
 def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep]:
@@ -61,10 +70,16 @@ def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[Train
     Raises:
         OsfError: if the object or the set is gone or unsound, or the disk refuses.
     """
+    for step in _trained(params, place):
+        yield replace(step, left_s=float(step.total - step.done))
+
+
+def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep]:
     name, mesh = params["name"], params["source"]["mesh"]
-    train_s = max(1, round(60 * params["minutes"]))
-    collect_s = round(_S_PER_IMAGE * params["images"]) if mesh else 0
-    compare_s = _COMPARE_S if name in FieldLibrary(place.data_dir).names() else 0
+    images = params["images"]
+    collect_s = _START_S + round(_TAKE_S * images) if mesh else _START_S
+    train_s = _CARVE_S + max(1, round(60 * params["minutes"])) + round(_MEASURE_S * images)
+    compare_s = round(_COMPARE_S * images) if name in FieldLibrary(place.data_dir).names() else 0
     step = TrainingStep(0, collect_s + train_s + compare_s, "Starting")
     yield step
     shop = open_workshop(place.data_dir, name, _order(params, place))
@@ -81,7 +96,7 @@ def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[Train
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
     step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
     if name in FieldLibrary(place.data_dir).names():
-        yield replace(step, note="Comparing it with the field that is there")
+        yield replace(step, note=_COMPARING)
         step = _compared(step, name, data, shop, place)
     in_use = step.before_mask is None or step.psnr_mask is None or step.psnr_mask >= step.before_mask
     if in_use:
@@ -128,7 +143,7 @@ def _collect(
         return
     config = CollectObject(mesh, out, params["images"], seed=params["seed"])
     for progress in collect_object(config, place.library):
-        yield replace(begin, done=round(_S_PER_IMAGE * progress.done), note=progress.note)
+        yield replace(begin, done=_START_S + round(_TAKE_S * progress.done), note=progress.note)
 
 
 def _train(
@@ -143,7 +158,7 @@ def _train(
         if step.preview is not None:
             write_png(preview, step.preview)
             previews += 1
-        share = step.progress.done / max(step.progress.total, 1)
+        share = 0.94 * step.progress.done / max(step.progress.total, 1)  # the rest is measuring
         yield replace(
             begin,
             done=begin.done + round(share * train_s),
