@@ -1,9 +1,9 @@
-// A clip of an episode that is over: making it, playing it, taking it along, and the link to the episode.
+// A clip of an episode that is over: making it, playing it, taking it along.
 import { post } from "./api.js";
 import { byId, whileDisabled } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
 import { known, set, watch } from "./state.js";
-import { tellFailure, toast } from "./toasts.js";
+import { tellFailure } from "./toasts.js";
 
 const FILE = "clip.mp4";
 let shown = null; // the episode whose ending is on view
@@ -28,20 +28,8 @@ export function drawClip(episode = shown) {
   byId("clip-state").textContent = isLive ? stateText(job) : job?.state === "failed" ? job.error : "";
 }
 
-async function copyLink() {
-  const link = new URL(location.href);
-  link.search = new URLSearchParams({ episode: shown.id });
-  try {
-    await navigator.clipboard.writeText(link.href);
-    toast("The link is copied; it opens this episode.");
-  } catch { // pages that are not secure may not copy
-    toast(`This link opens the episode: ${link.href}`);
-  }
-}
-
 export function setUpClip() {
   byId("make-clip").addEventListener("click", () => whileDisabled(byId("make-clip"), () => tellFailure(async () =>
     set("clip", await post(`episodes/${encodeURIComponent(shown.id)}/clip`)))));
-  byId("copy-link").addEventListener("click", copyLink);
   watch("clip", () => drawClip());
 }

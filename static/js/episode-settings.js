@@ -87,6 +87,13 @@ function row(slider) {
   return [caption, range, number];
 }
 
+/** Takes over the settings of another run. */
+export function takeSettings(settings) {
+  if (!offered) return;
+  fill(settings);
+  change();
+}
+
 export async function refreshSettings() {
   const answer = await tellFailure(() => get("settings"));
   if (!answer) return;
@@ -104,9 +111,7 @@ export function setUpEpisodeSettings() {
   form().addEventListener("change", change);
   byId("despite-doubts").addEventListener("change", change); // it stands where doubts are told, outside the form
   byId("settings-defaults").addEventListener("click", () => {
-    if (!offered) return;
-    fill(offered.defaults);
-    change();
+    if (offered) takeSettings(offered.defaults);
   });
   // Another visitor may have chosen or changed them; what the hand does here now counts more.
   watch("report", () => {

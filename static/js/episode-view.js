@@ -1,6 +1,7 @@
 // One episode on view, running or over: its pictures and numbers at a step, its charts, and what was noticed.
 import { asked, note, onTravel } from "./address.js";
 import { get } from "./api.js";
+import { drawBeside } from "./beside.js";
 import { byId, el } from "./dom.js";
 import { LIVE } from "./jobs.js";
 import { drawEnding } from "./ending.js";
@@ -145,6 +146,7 @@ function drawStep(at) {
     return row;
   }));
   drawProgress(shown, step ? step.step : -1);
+  drawBeside(shown, at);
   if (!step) return;
   showFrame(frameUrl(step.step));
   if (timeline.timer && at < timeline.last) preload(frameUrl(at + 1));
@@ -171,7 +173,8 @@ function close() {
   shown = null;
   wanted = null;
   closings += 1;
-  note({ episode: null, step: null });
+  note({ episode: null, step: null, beside: null });
+  drawBeside(null, 0);
   byId("shown").hidden = true;
   showLive();
   const job = known("episode");

@@ -70,7 +70,7 @@ export function timeLeft(seconds) {
 export function stateText(job) {
   if (job.state === "queued") return `waiting, number ${job.position ?? "?"} in line`;
   // What training says of the time left leaves out what comes after it.
-  if (job.state === "running") return `${job.note.replace(/(^|, )[^,]* left$/, "") || "training"}${timeLeft(job.eta_s)}`;
+  if (job.state === "running") return `${job.note.replace(/(^|, )[^,]* left$/, "") || "running"}${timeLeft(job.eta_s)}`;
   if (job.state === "paused") return "paused";
   if (job.kind === "train_field") return `${job.state}${outcome(job)}`;
   return `${job.state}${job.total ? `, ${job.done} of ${job.total}` : ""}${outcome(job)}`;

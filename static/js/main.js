@@ -1,6 +1,7 @@
 // Puts the page together: sets the pieces up, follows the event stream, keeps the status line honest.
 import { setUpAddress } from "./address.js";
 import { VISITOR, get } from "./api.js";
+import { setUpBeside } from "./beside.js";
 import { setUpCameras, showFrames } from "./cameras.js";
 import { setUpClip } from "./clip.js";
 import { setUpCompose } from "./compose.js";
@@ -103,6 +104,7 @@ setUpDrop();
 setUpEpisodeView();
 setUpResults(shownStep);
 setUpEnding();
+setUpBeside();
 setUpClip();
 setUpEpisodeSettings();
 setUpEpisode();

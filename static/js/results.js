@@ -5,7 +5,7 @@ import { LIVE } from "./jobs.js";
 import { tellFailure, toast } from "./toasts.js";
 
 const VIDEO = "video.mp4";
-const FILES = { [VIDEO]: "Video", "report.json": "Report", "steps.csv": "CSV", "episode.viser": "Recording", "goal.png": "Goal", "episode.zip": "All in one" };
+const FILES = { [VIDEO]: "Video", "clip.mp4": "Clip", "report.json": "Report", "steps.csv": "CSV", "episode.viser": "Recording", "goal.png": "Goal", "episode.zip": "All in one" };
 let shown = null;
 let stepOf = () => 0;
 

@@ -225,3 +225,36 @@ def test_one_of_two_visitors_drives(page, browser, service):
     page.get_by_role("button", name="Take over").wait_for(timeout=WAIT_MS)
     other.close()
     page.get_by_role("button", name="Take over").wait_for(state="hidden", timeout=WAIT_MS)
+
+
+def test_two_runs_are_compared_side_by_side_and_one_is_run_again(page, service):
+    scene = service.call("GET", "scenes")["current"]
+    ran = []
+    for samples in (8, 16):
+        objects = service.call("POST", f"scenes/{scene}/reset")["objects"]
+        poses = [{key: entry[key] for key in ("name", "position", "quaternion")} for entry in objects]
+        poses[0]["position"][0] += 0.08 if poses[0]["position"][0] < 0 else -0.08
+        order = {"scene": scene, "poses": poses, "settings": {**SHORT, "steps": 1, "samples": samples}}
+        ran.append(service.call("POST", "episodes", order)["id"])
+        until(lambda: service.episode()["status"] == "done", LONG_MS / 1000)
+    page.goto(f"{service.url}/?episode={ran[0]}")
+    page.wait_for_selector("#beside-card:not([hidden])", timeout=WAIT_MS)
+    page.click("#beside-card summary")
+    page.wait_for_selector(f'#beside-select option[value="{ran[1]}"]', state="attached", timeout=WAIT_MS)
+    page.select_option("#beside-select", ran[1])
+    page.wait_for_selector("#beside:not([hidden])", timeout=WAIT_MS)
+    rows = page.eval_on_selector_all(
+        "#beside-rows tr", "rows => rows.map((row) => [...row.children].map((c) => c.textContent))"
+    )
+    assert ["Samples", "8", "16"] in rows
+    assert [row[0] for row in rows] == ["Came to", "Ended", "Samples"]  # in nothing else do they differ
+    assert page.locator("#beside-chart canvas").count() == 1
+    until(lambda: page.eval_on_selector("#beside-other", "image => image.complete && image.naturalWidth > 0"))
+    assert f"beside={ran[1]}" in page.url
+    page.reload()
+    page.wait_for_selector("#beside:not([hidden])", timeout=WAIT_MS)
+    page.click("#run-again")
+    until(lambda: page.input_value("#setting-samples") == "8")
+    assert page.is_visible("#episode-settings")
+    page.click("#close-shown")
+    until(lambda: "beside=" not in page.url)
