@@ -8,7 +8,7 @@ import { byId, el, whileDisabled } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { takeSettings } from "./episode-settings.js";
 import { LIVE } from "./jobs.js";
-import { farthest, summary } from "./run-summary.js";
+import { farthest, parts } from "./run-summary.js";
 import { resetScene } from "./scenes.js";
 import { current, known, set } from "./state.js";
 import { scrollTo } from "./tabs.js";
@@ -54,10 +54,9 @@ async function choose(id) {
 
 function rows() {
   const both = [mine, other];
-  const result = [
-    ["Came to", both.map(summary)],
-    ["Ended", both.map(({ outcome, status }) => outcome ?? status)],
-  ];
+  const came = both.map(parts);
+  const result = ["Distance", "Pushes", "Time"].map((label, i) => [label, came.map((one) => one[i])]);
+  result.push(["Ended", both.map(({ outcome, status }) => outcome ?? status)]);
   for (const [key, label] of Object.entries(SETTINGS)) {
     const values = both.map(({ settings }) => settings[key]);
     if (values[0] !== values[1]) result.push([label, values.map(told)]);
