@@ -51,7 +51,6 @@ def test_objects_that_are_there_are_found_and_others_are_missed(models, checker,
     missed = checker.check(photo(seen.images[0], absent), at_rest(models, absent))
     assert missed.verdict in ("others", "doubtful")
     assert missed.colours < found.colours
-    assert missed.template < 0.3
 
 
 def test_where_the_objects_lie_now_plays_no_part(models, checker):
