@@ -38,8 +38,22 @@
     window.cancelAnimationFrame = (number) => waiting.delete(number);
   }
 
+  /** The client's notice of this covers a corner of the table; what it warns of is seen to here. */
+  function closeNotice() {
+    const observer = new MutationObserver(() => {
+      const titles = [...document.querySelectorAll("[class*=Notification-title]")];
+      const notice = titles.find((title) => title.textContent.startsWith("Software WebGL"))?.closest("[class*=Notification-root]");
+      if (!notice) return;
+      notice.querySelector("button")?.click();
+      observer.disconnect();
+    });
+    observer.observe(document, { childList: true, subtree: true });
+    setTimeout(() => observer.disconnect(), 60_000);
+  }
+
   window.framesPerSecond = 12;
   if (!SOFTWARE.test(rendererName())) return;
   dropSmoothing();
   limitFrameRate();
+  closeNotice();
 })();
