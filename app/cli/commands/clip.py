@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from app.cli.progress_bar import follow
 from app.storage.paths import default_data_dir
 
@@ -15,7 +17,7 @@ from app.storage.paths import default_data_dir
 class Clip:
     """Draw an episode in 1080p: 3D view, goal, table, distance, and what it came to; half a minute of work."""
 
-    episode: Path
+    episode: tyro.conf.Positional[Path]
     """Folder that `osf episode` has left."""
     out: Path
     """The MP4."""
