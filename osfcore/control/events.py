@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import Camera
@@ -42,11 +42,15 @@ class Looking:
         number: actions executed so far.
         look: at the first frame, at the goal image, at a later frame, or for something that was lost.
         step: of the estimator.
+        rendered: the best scene so far as each camera would see it, by camera; empty until something renders it.
+        difference: of that from the images, root of the mean square over all pixels and colours, 0 to 1.
     """
 
     number: int
     look: Look
     step: EstimateStep
+    rendered: Mapping[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
+    difference: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -13,6 +13,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.progress import Progress
 
+UNPLACED_BELOW_M = -0.5  # an object that was not looked at yet is put far below the table
 Stage = Literal["orientations", "light", "objects", "together", "polish", "done"]
 
 

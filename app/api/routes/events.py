@@ -30,6 +30,7 @@ from app.services.visitors.driver import DriverChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError, UnknownName
+from osfcore.io.image_file import encode_jpeg
 
 router = APIRouter(prefix="/api", tags=["events"], responses=problems())
 SCENE_INTERVAL_S = 0.1
@@ -259,9 +260,16 @@ def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
 
 
 def _look(services: Services, look: Looking) -> LookEvent:
-    return LookEvent.model_validate(services.outliner.outlines(look), from_attributes=True)
+    outlines = LookEvent.model_validate(services.outliner.outlines(look), from_attributes=True)
+    return outlines.model_copy(
+        update={"pictures": {name: _jpeg_url(encode_jpeg(image)) for name, image in look.rendered.items()}}
+    )
+
+
+def _jpeg_url(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
 
 
 def _frame(taken: FramesTaken) -> FrameEvent:
-    urls = ("data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii") for jpeg in taken.jpegs)
+    urls = map(_jpeg_url, taken.jpegs)
     return FrameEvent(scene=taken.scene, revision=taken.revision, cameras=dict(zip(taken.names, urls, strict=True)))

@@ -279,10 +279,16 @@ class LookEvent(BaseModel):
     look: Literal["first", "goal", "next", "search"] = Field(description="At what: first frame, goal image, ...")
     share: float = Field(description="Of the work that is done.")
     loss: float | None = Field(description="Of the whole, in units of its stage.")
+    difference: float | None = Field(
+        description="Of the rendered scene from the images: root of the mean square over all pixels, 0 to 1."
+    )
     stage: str = Field(description="Of the method; losses of one stage can be compared.")
     is_over: bool = Field(description="Whether this is the result.")
     light_deg: tuple[float, float] = Field(description="Azimuth and elevation of the light so far.")
     cameras: dict[str, list[ObjectOutlinesOut]] = Field(description='By camera; "goal" is the goal image.')
+    pictures: dict[str, str] = Field(
+        default_factory=dict, description="The best scene so far as each camera would see it: JPEG data URLs."
+    )
 
 
 class ForgottenEvent(BaseModel):

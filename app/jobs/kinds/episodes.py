@@ -83,6 +83,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     Raises:
         OsfError: if an object has no field, the goal does not fit, the simulation is gone, or the disk refuses.
     """
+    from app.episodes.look_pictures import LookPictures
     from app.episodes.record import About, EpisodeRecord
     from app.episodes.recording import write_recording
     from app.episodes.time_left import TimeLeft
@@ -103,16 +104,17 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     rng = np.random.default_rng([params["seed"], 1])
     inputs = place.folder / INPUTS
     prepared = _prepared(inputs / PREPARED_FILE)
-    episode = Episode(world, models, _goal(goal, names, inputs), settings, rng, prepared=prepared)
+    wanted = _goal(goal, names, inputs)
+    episode = Episode(world, models, wanted, settings, rng, prepared=prepared)
     progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft()
+    pictures = LookPictures(models.appearance.together, wanted)
     for event in episode.run():
         for change in place.orders.changes():
             episode.settings = settings_of(change["settings"])
         record.take(event)
         share, left_s = timer.take(event, episode.settings.steps)
-        progress = replace(
-            _progress_after(progress, event, episode.settings.steps), share=share, left_s=round(left_s, 1)
-        )
+        then = _progress_after(progress, pictures.drawn(event), episode.settings.steps)
+        progress = replace(then, share=share, left_s=round(left_s, 1))
         yield progress
         timer.go_on()  # not before a pause is over
     yield replace(progress, note="Writing video and recording", view=None)

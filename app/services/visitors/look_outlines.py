@@ -11,12 +11,12 @@ from scipy.spatial import ConvexHull, QhullError
 
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError
+from osfcore.estimation.steps import UNPLACED_BELOW_M
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.objects.asset_library import AssetLibrary
 
 TRIED = 6  # candidates of each object that are outlined
-_AWAY_M = -0.5  # an object that was not looked at yet is put far below the table
 _UNKNOWN_M = 0.05
 Polygon = tuple[tuple[float, float], ...]
 
@@ -44,6 +44,7 @@ class LookOutlines:
         look: "first", "goal", "next" or "search".
         share: of the work that is done.
         loss: of the whole, in units of its stage; None where there is none.
+        difference: of the rendered scene from the images, see `Looking`; None until there is one.
         stage: of the method; losses of one stage can be compared.
         is_over: whether this is the result.
         light_deg: azimuth from +x toward +y, and elevation, of the light so far.
@@ -53,6 +54,7 @@ class LookOutlines:
     look: str
     share: float
     loss: float | None
+    difference: float | None
     stage: str
     is_over: bool
     light_deg: tuple[float, float]
@@ -79,6 +81,7 @@ class Outliner:
             looking.look,
             min(step.progress.done / max(step.progress.total, 1), 1.0),
             float(step.loss) if np.isfinite(step.loss) else None,
+            looking.difference if np.isfinite(looking.difference) else None,
             step.stage,
             step.estimate is not None,
             (float(np.rad2deg(np.arctan2(y, x))), float(np.rad2deg(np.arcsin(np.clip(z, -1, 1))))),
@@ -103,7 +106,7 @@ class Outliner:
     def _outline(self, camera: Camera, name: str, pose: Pose) -> Polygon:
         """Empty for what was not looked at yet, or lies behind the camera."""
         corners = pose.apply(self._hull(name))
-        if pose.position[2] < _AWAY_M or camera.T_world_camera.inverse().apply(corners)[:, 2].min() < 1e-3:
+        if pose.position[2] < UNPLACED_BELOW_M or camera.T_world_camera.inverse().apply(corners)[:, 2].min() < 1e-3:
             return ()
         pixels = camera.project(corners) / (camera.width, camera.height)
         outline = cv2.convexHull(pixels.astype(np.float32))[:, 0]

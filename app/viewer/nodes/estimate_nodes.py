@@ -25,7 +25,7 @@ from app.viewer.nodes.ghosts import (
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.scene_nodes import LIGHT_COLOUR
 from osfcore.errors import OsfError
-from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.steps import UNPLACED_BELOW_M, EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -44,7 +44,6 @@ _TABLE_M = 0.0015  # above it, so that it does not flicker
 _LABEL_M = 0.045
 _WIRES, _FAINT_WIRES = 0.9, 0.35  # opacity; things on their way are to be seen through them
 _WIRE_SCALE = 1.01  # or wires and the surface below them would flicker
-_AWAY_M = -0.5  # an object that was not looked at yet is put far below the table
 Colour = tuple[int, int, int]
 
 
@@ -173,7 +172,7 @@ class EstimateNodes:
         shown, hidden = (self._tracked, self._guesses) if is_tracked else (self._guesses, self._tracked)
         hidden[name].visible = False
         move_ghosts(shown[name], Pose(pose.position[None], pose.quaternion[None]))
-        shown[name].visible = bool(pose.position[2] > _AWAY_M)
+        shown[name].visible = bool(pose.position[2] > UNPLACED_BELOW_M)
 
     def _show_tried(self, name: str, candidates: Pose | None) -> None:
         node = self._tried[name]
