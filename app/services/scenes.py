@@ -136,8 +136,10 @@ class Scenes:
         light: Light | None = None,
         poses: tuple[tuple[str, Pose], ...] | None = None,
         image_size: int = DEFAULT_IMAGE_SIDE,
+        *,
+        is_shown: bool = True,
     ) -> SceneRecord:
-        """Make a scene and show it; raises TooManyScenes, or an OsfError if it cannot be made: then nothing changes.
+        """Make a scene; raises TooManyScenes, or an OsfError if it cannot be made: then nothing changes.
 
         Args:
             names: its objects; None for those of the poses, or random ones.
@@ -146,6 +148,7 @@ class Scenes:
             light: None for a random one.
             poses: T_world_object [m] by name; None for random ones at rest.
             image_size: side of its camera images [px].
+            is_shown: at once, in viewer and pages.
         """
         image_side(image_size)
         if poses is not None:
@@ -172,7 +175,8 @@ class Scenes:
         finally:
             with self._lock:
                 self._scenes_in_the_making -= 1
-        self.activate(record.id)
+        if is_shown:
+            self.activate(record.id)
         return record
 
     def delete_scene(self, scene: str) -> None:

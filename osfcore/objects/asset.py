@@ -70,6 +70,21 @@ class TexturedMesh:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class ObjectGeometry:
+    """The shape of an object, in its frame.
+
+    Attributes:
+        vertices: of its mesh [m].
+        faces: vertex indices, counter-clockwise from outside.
+        parts: vertices of each convex collision part [m].
+    """
+
+    vertices: Float[np.ndarray, "P 3"]
+    faces: Int[np.ndarray, "F 3"]
+    parts: tuple[Float[np.ndarray, "_ 3"], ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class RestingPoses:
     """Orientations in which the object rests on a plane.
 

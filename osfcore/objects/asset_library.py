@@ -27,7 +27,7 @@ from jaxtyping import Float
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, MissingAssets, UnknownName
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
-from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, TexturedMesh
+from osfcore.objects.asset import ObjectAsset, ObjectGeometry, ObjectInfo, RestingPoses, TexturedMesh
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.download import raising_fetch_failed, remove_old
 
@@ -103,16 +103,27 @@ class AssetLibrary:
 
         facts = self._known_facts(name)
         with self._as_corrupt(name):
-            with np.load(io.BytesIO(self._checked(name, _ARRAYS, facts)), allow_pickle=False) as stored:
-                arrays = {key: stored[key] for key in stored.files}
+            arrays = self._arrays(name, facts)
             png = np.frombuffer(self._checked(name, _TEXTURE, facts), np.uint8)
             texture = cv2.imdecode(png, cv2.IMREAD_COLOR_RGB)
             if texture is None:
                 raise CorruptFile(self.root / name / _TEXTURE, "it is not an image")
             mesh = TexturedMesh(arrays["vertices"], arrays["normals"], arrays["faces"], arrays["uv"], texture)
-            parts = tuple(np.split(arrays["parts"], np.cumsum(arrays["part_sizes"])[:-1]))
             resting = RestingPoses(arrays["resting_quaternions"], arrays["resting_probabilities"])
-            return ObjectAsset(self.info(name), mesh, parts, resting)
+            return ObjectAsset(self.info(name), mesh, _parts(arrays), resting)
+
+    def load_geometry(self, name: str) -> ObjectGeometry:
+        """An object's shape alone, without decoding its texture, which takes most of the time of `load`.
+
+        Raises:
+            MissingAssets: if the object is in the catalogue but not on this machine.
+            UnknownName: if there is no such object.
+            CorruptFile: if its files are damaged.
+        """
+        facts = self._known_facts(name)
+        with self._as_corrupt(name):
+            arrays = self._arrays(name, facts)
+            return ObjectGeometry(arrays["vertices"], arrays["faces"], _parts(arrays))
 
     def digest(self, name: str) -> str:
         """Tells an object from any other and from any earlier one of its name, without loading it.
@@ -212,6 +223,10 @@ class AssetLibrary:
             raise CorruptFile(self.root / name, reason)
         return facts
 
+    def _arrays(self, name: str, facts: dict[str, Any]) -> dict[str, np.ndarray]:
+        with np.load(io.BytesIO(self._checked(name, _ARRAYS, facts)), allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+
     def _checked(self, name: str, file: str, facts: dict[str, Any]) -> bytes:
         data = (self.root / name / file).read_bytes()
         if zlib.crc32(data) != facts["crc32"][file]:
@@ -246,6 +261,10 @@ class AssetLibrary:
         else:
             os.rename(folder, place)
         _sync(self.root)
+
+
+def _parts(arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    return tuple(np.split(arrays["parts"], np.cumsum(arrays["part_sizes"])[:-1]))
 
 
 def _is_plain(name: str) -> bool:

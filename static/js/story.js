@@ -134,7 +134,7 @@ async function layTable() {
   const { scene, goal } = await post(`presets/${encodeURIComponent(story().name)}`);
   set("scene", { ...scene, is_current: true });
   takeGoal(goal);
-  await refreshScenes();
+  refreshScenes();
 }
 
 async function runLive() {

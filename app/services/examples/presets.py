@@ -83,7 +83,7 @@ def preset(name: str) -> Preset:
 
 
 def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, GoalRecord]:
-    """Make a preset's table, which is then shown, and its goal.
+    """Make a preset's table and its goal, and show them.
 
     Args:
         chosen: the preset.
@@ -93,13 +93,14 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     Raises:
         OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
     """
-    scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light)
+    # Shown when all is there: the pages ask for its images then, and the goal's would wait behind them.
+    scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
     try:
         goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light, chosen.id)
     except BaseException:
         runner.delete_scene(scene.id)
         raise
-    return scene, goal
+    return runner.activate(scene.id), goal
 
 
 def _light(azimuth_deg: float, elevation_deg: float) -> Light:

@@ -115,7 +115,7 @@ class Outliner:
     def _hull(self, name: str) -> Float[np.ndarray, "P 3"]:
         if name not in self._hulls:
             try:
-                parts = np.concatenate(self._library.load(name).parts).astype(float)
+                parts = np.concatenate(self._library.load_geometry(name).parts).astype(float)
                 self._hulls[name] = parts[ConvexHull(parts).vertices]
             except (OsfError, QhullError):  # recognised by its field, but its mesh is not on this machine
                 signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T

@@ -69,7 +69,7 @@ def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
         cells: along its longest side.
     """
     try:
-        mesh = library.load(name).mesh
+        mesh = library.load_geometry(name)
     except OsfError as error:
         _log.info("%s is drawn as a cube: %s", name, error)
         return box(_UNKNOWN_M)

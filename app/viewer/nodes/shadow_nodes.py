@@ -74,7 +74,7 @@ class ShadowNodes:
     def _parts_of(self, name: str) -> list[np.ndarray]:
         if name not in self._parts:
             try:
-                self._parts[name] = [part.astype(float) for part in self._library.load(name).parts]
+                self._parts[name] = [part.astype(float) for part in self._library.load_geometry(name).parts]
             except OsfError as error:
                 _log.info("%s casts the shadow of a cube: %s", name, error)
                 return [box(_UNKNOWN_M)[0].astype(float)]

@@ -51,6 +51,14 @@ def test_what_is_written_comes_back(shelf, asset):
     assert shelf.names() == ("toy",)
 
 
+def test_its_shape_comes_back_alone_even_without_its_texture(shelf, asset):
+    (shelf.root / "toy" / "texture.png").unlink()
+    shape = shelf.load_geometry("toy")
+    np.testing.assert_array_equal(shape.vertices, asset.mesh.vertices.astype(np.float32))
+    np.testing.assert_array_equal(shape.faces, asset.mesh.faces)
+    assert all(np.array_equal(a, b) for a, b in zip(shape.parts, asset.parts, strict=True))
+
+
 def test_info_of_the_catalogue_needs_no_files(tmp_path):
     library = AssetLibrary(tmp_path / "none")
     assert library.names() == ()
@@ -58,7 +66,7 @@ def test_info_of_the_catalogue_needs_no_files(tmp_path):
 
 
 def test_missing_and_unknown_are_told_apart(shelf):
-    for method in (shelf.load, shelf.size_m, shelf.viewer_glb, shelf.source, shelf.digest):
+    for method in (shelf.load, shelf.load_geometry, shelf.size_m, shelf.viewer_glb, shelf.source, shelf.digest):
         with pytest.raises(MissingAssets, match=r"024_bowl.*osf assets fetch"):
             method("024_bowl")
         with pytest.raises(UnknownName, match="toy"):
@@ -95,7 +103,7 @@ def test_damage_is_told(shelf, file, damage):
 @pytest.mark.parametrize("facts", [[], {}, {"format_version": 1}, {"format_version": 1, "info": {}, "crc32": 3}])
 def test_facts_of_another_shape_are_told(shelf, facts):
     (shelf.root / "toy" / "object.json").write_text(json.dumps(facts))
-    for method in (shelf.load, shelf.info, shelf.size_m, shelf.digest):
+    for method in (shelf.load, shelf.load_geometry, shelf.info, shelf.size_m, shelf.digest):
         with pytest.raises(CorruptFile):
             method("toy")
 

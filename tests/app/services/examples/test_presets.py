@@ -71,11 +71,16 @@ class Service:
     """A runner and goals in one, of which one thing may fail."""
 
     def __init__(self, error=None):
-        self.error, self.scenes, self.goals = error, [], []
+        self.error, self.scenes, self.goals, self.shown = error, [], [], None
 
     def create_scene(self, **asked):
         self.scenes.append(asked)
         return record("s")
+
+    def activate(self, scene):
+        assert self.goals, "pages would ask for images while the goal is still being drawn"
+        self.shown = scene
+        return record(scene)
 
     def delete_scene(self, scene):
         assert scene == "s"
@@ -93,7 +98,9 @@ def test_a_preset_is_asked_for_as_it_is_described(one):
     service = Service()
     scene, goal = set_up(one, service, service)
     assert (scene.id, goal) == ("s", "goal")
+    assert service.shown == "s"
     (asked,) = service.scenes
+    assert not asked["is_shown"]
     assert (asked["names"], asked["seed"]) == (one.objects, one.seed)
     np.testing.assert_array_equal(asked["light"].direction, one.light.direction)
     (drawn,) = service.goals
@@ -114,3 +121,4 @@ def test_without_its_goal_no_table_is_left(error):
     with pytest.raises(type(error)):
         set_up(PRESETS[0], service, service)
     assert service.scenes == []
+    assert service.shown is None
