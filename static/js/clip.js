@@ -2,7 +2,7 @@
 import { post } from "./api.js";
 import { byId, whileDisabled } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
-import { known, set, watch } from "./state.js";
+import { inWords, known, set, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
 const FILE = "clip.mp4";
@@ -25,7 +25,7 @@ export function drawClip(episode = shown) {
     byId("save-clip").href = url;
   }
   if (!isThere) byId("clip").removeAttribute("src");
-  byId("clip-state").textContent = isLive ? stateText(job) : job?.state === "failed" ? job.error : "";
+  byId("clip-state").textContent = isLive ? stateText(job) : job?.state === "failed" ? inWords(job.error) : "";
 }
 
 export function setUpClip() {

@@ -5,7 +5,7 @@ import { LatestImage } from "./cameras.js";
 import { drawCurves, drawKey } from "./curves.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
-import { labelOf, watch } from "./state.js";
+import { inWords, labelOf, watch } from "./state.js";
 import { tellFailure, toast } from "./toasts.js";
 
 const PICTURE_MS = 700; // rendering takes time from the estimator
@@ -64,7 +64,7 @@ function draw(job) {
   byId("estimating-bar").hidden = !isLive;
   byId("estimating-bar").value = job.total ? job.done / job.total : 0;
   byId("estimating-state").textContent = isLive ? stateText(job) : job.state;
-  byId("estimating-error").textContent = job.error ?? "";
+  byId("estimating-error").textContent = inWords(job.error ?? "");
   byId("estimating-error").hidden = !job.error;
   byId("cancel-estimate").hidden = !isLive;
   if (before.id !== job.id) begin(job);

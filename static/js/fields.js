@@ -3,7 +3,7 @@ import { get, getAll, post, remove, upload } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
-import { known, objects, set, watch } from "./state.js";
+import { inWords, known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
 import { tellFailure, toast } from "./toasts.js";
 
@@ -162,7 +162,7 @@ function drawTraining(job) {
   byId("training-bar").value = job.total ? job.done / job.total : 0;
   // PSNR stands in the head already.
   byId("training-state").textContent = job.state === "done" ? "done" : stateText(job).replace(/^.*dB.*, (?=.* left$)/, "");
-  byId("training-error").textContent = job.error ?? "";
+  byId("training-error").textContent = inWords(job.error ?? "");
   byId("training-error").hidden = !job.error;
   const preview = result.previews && job.state !== "failed" && job.state !== "cancelled"
     ? `api/jobs/${job.id}/preview.png?v=${result.previews}` : "";

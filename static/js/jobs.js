@@ -2,7 +2,7 @@
 import { get, post, remove } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
-import { labelOf, objects, set, watch } from "./state.js";
+import { inWords, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { tellFailure } from "./toasts.js";
 
@@ -70,7 +70,7 @@ export function timeLeft(seconds) {
 export function stateText(job) {
   if (job.state === "queued") return `waiting, number ${job.position ?? "?"} in line`;
   // What training says of the time left leaves out what comes after it.
-  if (job.state === "running") return `${job.note.replace(/(^|, )[^,]* left$/, "") || "running"}${timeLeft(job.eta_s)}`;
+  if (job.state === "running") return `${inWords(job.note).replace(/(^|, )[^,]* left$/, "") || "running"}${timeLeft(job.eta_s)}`;
   if (job.state === "paused") return "paused";
   if (job.kind === "train_field") return `${job.state}${outcome(job)}`;
   return `${job.state}${job.total ? `, ${job.done} of ${job.total}` : ""}${outcome(job)}`;
@@ -165,7 +165,7 @@ function draw(job, isOlder) {
   node.bar.value = job.total ? job.done / job.total : 0;
   node.bar.setAttribute("aria-label", `${titleText(job)}, ${job.done} of ${job.total}`);
   node.text.textContent = stateText(job);
-  node.error.textContent = job.error ?? "";
+  node.error.textContent = inWords(job.error ?? "");
   node.error.hidden = !job.error;
   if (node.key !== controlsKey(job)) {
     node.actions.replaceChildren(...controls(job), LIVE.has(job.state) ? "" : deleteButton(job));

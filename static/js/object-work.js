@@ -3,7 +3,7 @@ import { byId } from "./dom.js";
 import { LIVE, controls, stateText, titleText } from "./jobs.js";
 import { refreshObjects, sizeText } from "./objects.js";
 import { clearMesh } from "./own-object.js";
-import { watch } from "./state.js";
+import { inWords, watch } from "./state.js";
 
 let followed = ""; // the job that was seen at work, whose end is told, too
 let drawn = "";
@@ -28,7 +28,7 @@ function draw(job) {
   byId("object-work-bar").hidden = !isLive;
   byId("object-work-bar").value = job.total ? job.done / job.total : 0;
   byId("object-work-state").textContent = endText(job);
-  byId("object-work-error").textContent = job.error ?? "";
+  byId("object-work-error").textContent = inWords(job.error ?? "");
   byId("object-work-error").hidden = !job.error;
   const key = `${job.id} ${job.state}`;
   if (drawn === key) return;

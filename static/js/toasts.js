@@ -1,10 +1,12 @@
 // Messages in the corner. Errors stay until closed, others leave by themselves.
 import { byId, el } from "./dom.js";
+import { inWords } from "./state.js";
 
 const LIFE_MS = 6000;
 const MOST = 4;
 
-export function toast(text, level = "info") {
+export function toast(sentence, level = "info") {
+  const text = inWords(sentence);
   const box = byId("toasts");
   for (const old of box.children) if (old.firstChild.textContent === text) old.remove();
   while (box.children.length >= MOST) box.firstChild.remove();

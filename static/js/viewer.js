@@ -3,7 +3,7 @@ import { VISITOR, put } from "./api.js";
 import { byId } from "./dom.js";
 import { LIVE } from "./jobs.js";
 import { Newest } from "./newest.js";
-import { known, watch } from "./state.js";
+import { current, known, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
 const [FRAMES_PER_S, FRAMES_WHILE_BUSY] = [12, 2]; // of a view that no graphics card draws
@@ -11,6 +11,14 @@ const [FRAMES_PER_S, FRAMES_WHILE_BUSY] = [12, 2]; // of a view that no graphics
 let replayed = null; // what is replayed, as the service was told last
 let shows = "meshes";
 let onLive = () => {};
+
+/** Whether an episode or estimate has been drawn on the table that is shown. */
+const drawsHere = (job) => Boolean(job) && job.state !== "queued" && job.params.scene === current()?.id;
+
+function tellNothing() {
+  const isEmpty = shows === "beliefs" && !replayed && !["episode", "estimate"].some((what) => drawsHere(known(what)));
+  byId("nothing-believed").hidden = !isEmpty;
+}
 
 /** Loads the frame, again after the service was lost; what this page replays there is shown again by itself. */
 export function showViewer() {
@@ -27,6 +35,7 @@ const wish = new Newest(show);
 
 function ask(what) {
   replayed = what;
+  tellNothing();
   wish.ask();
 }
 
@@ -45,6 +54,7 @@ export function replay(what, told) {
 export async function replayStory(what) {
   draw("");
   replayed = what;
+  tellNothing();
   const answer = await tellFailure(show);
   return answer?.is_open;
 }
@@ -65,9 +75,11 @@ export function setUpViewer(listener) {
   onLive = listener;
   watch("episode", (job) => pace(LIVE.has(job?.state)));
   byId("viewer").addEventListener("load", () => pace(LIVE.has(known("episode")?.state)));
+  for (const what of ["episode", "estimate", "scene"]) watch(what, tellNothing);
   for (const radio of document.getElementsByName("shows")) {
     radio.addEventListener("change", () => {
       shows = radio.value;
+      tellNothing();
       wish.ask();
     });
   }

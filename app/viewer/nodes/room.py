@@ -10,7 +10,7 @@ from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.world.imaging.optics import TABLE_ALBEDO
 
 # From where the goal camera is, further back: the whole table is in view, and left is left as in the goal image.
-VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.0, -1.24, 0.92), (0.0, 0.02, 0.0), 0.7
+VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.0, -1.31, 0.97), (0.0, 0.02, 0.0), 0.7
 TABLE_THICKNESS_M = 0.04
 AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
 

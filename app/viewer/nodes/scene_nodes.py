@@ -8,9 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 import viser
+from jaxtyping import Float
 
 from app.processes.messages.scene_messages import SceneRecord
 from app.viewer.nodes.atomic import Target, atomic
+from app.viewer.nodes.label_layout import separated
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.room import colour_of
 from app.viewer.nodes.shadow_nodes import ShadowNodes
@@ -66,7 +68,7 @@ class SceneNodes:
         self._on_change: Callable[[], None] = _nothing
         self._lock = threading.RLock()
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
-        self._labels: dict[str, viser.SceneNodeHandle] = {}
+        self._labels: dict[str, viser.LabelHandle] = {}
         self._gizmos: dict[str, viser.SceneNodeHandle] = {}
         self._sizes_m: dict[str, np.ndarray] = {}
         # What someone is dragging follows the hand, not the scene.
@@ -126,6 +128,7 @@ class SceneNodes:
             for name in state.names:
                 if name in self._bodies and name not in self._grabbed:
                     self._place_object(name, state.pose(name))
+            self._place_labels()
             if state.pusher is not None:
                 _put(self._pusher, state.pusher)
             if not self._is_light_held:
@@ -276,6 +279,7 @@ class SceneNodes:
             turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
             pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
             self._follow(name, pose)
+            self._place_labels()
             self._draw_shadows()
             self._on_change()
             if event.phase == "end":
@@ -286,12 +290,23 @@ class SceneNodes:
         return gizmo
 
     def _follow(self, name: str, pose: Pose) -> None:
-        body, label = self._bodies.get(name), self._labels.get(name)
-        if body is not None and label is not None:
+        body = self._bodies.get(name)
+        if body is not None:
             _put(body, pose.position, pose.quaternion)
-            size_m = self._sizes_m.get(name, np.zeros(3))
-            top_m = float(np.abs(quaternion_to_matrix(pose.quaternion)[2]) @ size_m / 2)
-            _put(label, pose.position + np.array([0.0, 0.0, top_m + LABEL_GAP_M]))
+
+    def _place_labels(self) -> None:
+        anchors = [self._anchor(name) for name in self._labels]
+        if not anchors:
+            return
+        texts = [label.text for label in self._labels.values()]
+        for label, anchor in zip(self._labels.values(), separated(np.array(anchors), texts), strict=True):
+            _put(label, anchor)
+
+    def _anchor(self, name: str) -> Float[np.ndarray, "3"]:
+        """Above the top of an object [m]."""
+        body, size_m = self._bodies[name], self._sizes_m.get(name, np.zeros(3))
+        top_m = float(np.abs(quaternion_to_matrix(np.asarray(body.wxyz))[2]) @ size_m / 2)
+        return np.asarray(body.position, float) + np.array([0.0, 0.0, top_m + LABEL_GAP_M])
 
     def _place_object(self, name: str, pose: Pose) -> None:
         self._follow(name, pose)
