@@ -103,6 +103,11 @@ class Services:
     lanes: Lanes = field(default_factory=Lanes)
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
 
+    def begin_closing(self) -> None:
+        """End what would keep requests waiting: event streams, and thumbnails that are being drawn. Does not block."""
+        self.closing.set()
+        threading.Thread(target=self.thumbnails.stop, name="closing", daemon=True).start()
+
     def scene_out(self, record: SceneRecord) -> SceneOut:
         """A scene as JSON."""
         return SceneOut.of(record, self.objects.labels(), is_current=record.id == self.runner.current)

@@ -120,7 +120,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _server(settings: Settings, url: str) -> uvicorn.Server:
-    """A server that tells its address once it is ready, and ends event streams before it waits for them."""
+    """A server that tells its address once it is ready, and ends what keeps requests before it waits for them."""
     import uvicorn
 
     from app.api.app_factory import create_app
@@ -137,7 +137,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             services = getattr(app.state, "services", None)
             if services is not None:
-                services.closing.set()
+                services.begin_closing()
             super().handle_exit(sig, frame)
 
     return Server(

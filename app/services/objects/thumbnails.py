@@ -6,12 +6,13 @@ import contextlib
 import threading
 from pathlib import Path
 
-from app.processes.process_client import ProcessClient
+from app.processes.process_client import ProcessClient, ProcessUnavailable
 from app.processes.thumbnail_process import thumbnails_main
 from osfcore.io.files import write_atomically
 from osfcore.objects.asset_library import AssetLibrary
 
 VERSION = 1  # of the picture; another one makes all anew
+_NAME = "drawer of thumbnails"
 _IDLE_S = 20.0
 _ANSWER_S = 60.0
 
@@ -60,11 +61,13 @@ class Thumbnails:
 
     def _draw(self, name: str) -> bytes:
         with self._lock:
+            if self._is_stopped:  # requests that wait must not begin another process each
+                raise ProcessUnavailable(_NAME, "has been stopped")
             if self._timer is not None:
                 self._timer.cancel()
             if self._process is None:
                 root = self._library.root
-                self._process = ProcessClient(thumbnails_main, (root,), "drawer of thumbnails", answer_s=_ANSWER_S)
+                self._process = ProcessClient(thumbnails_main, (root,), _NAME, answer_s=_ANSWER_S)
             process = self._process
         try:
             return process.call(name)
