@@ -12,6 +12,7 @@ from tests.live import free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
 WAIT_MS = 20_000
+LOOKING = {"copy-scene", "estimate-camera", "more-jobs"}  # controls that change nothing
 LONG_MS = 300_000  # both looks take half a minute of an idle machine
 NAMES = ["005_tomato_soup_can", "006_mustard_bottle"]
 SHORT = {"steps": 3, "samples": 16, "horizon": 6}
@@ -220,6 +221,10 @@ def test_one_of_two_visitors_drives(page, browser, service):
     other.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
     take = other.get_by_role("button", name="Take over")
     take.wait_for(timeout=WAIT_MS)
+    for tab in ("drive", "scenes", "estimate", "objects", "fields", "jobs"):
+        controls = other.locator(f"#panel-{tab}").locator("button, input, select")
+        assert controls.count() > 0
+        assert set(controls.and_(other.locator(":enabled")).evaluate_all("found => found.map(e => e.id)")) <= LOOKING
     assert service.call("GET", "driver")["visitors"] == 2
     take.click()
     page.get_by_role("button", name="Take over").wait_for(timeout=WAIT_MS)
