@@ -414,7 +414,8 @@ from app.storage.database import Store
 store = Store(Path(sys.argv[1]))
 for number in range(1_000_000):
     store.save_job(f"j{number}", number, {"text": "x" * (number * 37 % 3000)})
-    print(number, flush=True)
+    sys.stdout.write(f"{number}\\n")  # one write: the process may be stopped at any moment, and print makes two
+    sys.stdout.flush()
 """
 
 
