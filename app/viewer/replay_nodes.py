@@ -34,7 +34,7 @@ class ReplayNodes:
         self._root = client.scene.add_frame(ROOT, show_axes=False)
         self._table = SceneNodes(client, library, root=ROOT)
         self._table.show_names(is_on=False)
-        self._episode = EpisodeNodes(client, library, self._table.has, root=f"{ROOT}/episode")
+        self._episode = EpisodeNodes(client, library, self._table.names, root=f"{ROOT}/episode")
         self._table.begin(trajectory.states[0])
         self.follow(trajectory)
 

@@ -127,9 +127,9 @@ class Viewer:
         """The panels, in the order of their folders."""
         library, table = self._runner.library, self._drawing
         table.watch(self.pages.neural.scene_moved)
-        estimate = EstimatePanel(server, (table, EstimateNodes(server, library, table.has)))
+        estimate = EstimatePanel(server, (table, EstimateNodes(server, library, table.names)))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
-        drawings = table, EpisodeNodes(server, library, table.has)
+        drawings = table, EpisodeNodes(server, library, table.names)
         episode = EpisodePanel(server, drawings, estimate.forget)
         push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
         return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push

@@ -68,6 +68,7 @@ export function showEpisode(episode, step) {
   set("report", episode);
   byId("shown").hidden = false;
   byId("shown").dataset.episode = episode.id;
+  byId("shown").classList.toggle("before-steps", LIVE.has(episode.status) && !episode.steps.length);
   if (isOther) {
     timeline.pause();
     note({ episode: episode.id, step: step ?? null });

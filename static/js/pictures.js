@@ -67,7 +67,7 @@ export function setUpPictures() {
   for (const [set, parts] of Object.entries({ four: PARTS, cameras: CAMERAS })) {
     for (const part of parts) {
       const figure = el("figure", {}, crop(part, "tile"), el("figcaption", { textContent: part.label }));
-      figure.dataset.set = set;
+      Object.assign(figure.dataset, { set, part: part.part });
       byId("tiles").append(figure);
     }
   }

@@ -15,6 +15,7 @@ from app.viewer.nodes.atomic import Target, atomic
 from app.viewer.nodes.estimate_nodes import Colour, EstimateNodes
 from app.viewer.nodes.future_nodes import FutureNodes
 from app.viewer.nodes.ghosts import mesh_of
+from app.viewer.nodes.label_layout import Label
 from app.viewer.nodes.push_nodes import PREDICTED
 from osfcore.control.events import Looking
 from osfcore.geometry.estimated_state import EstimatedState
@@ -41,7 +42,7 @@ class EpisodeNodes:
     Args:
         server: to draw in.
         library: meshes of the objects.
-        is_named: whether an object is labelled already, since it is on the table.
+        names: the objects' names that are on view already, by object.
         root: below which everything is drawn.
     """
 
@@ -49,7 +50,7 @@ class EpisodeNodes:
         self,
         server: Target,
         library: AssetLibrary,
-        is_named: Callable[[str], bool] = lambda _: True,
+        names: Callable[[], Mapping[str, Label]] = dict,
         *,
         root: str = "/episode",
     ) -> None:
@@ -60,9 +61,9 @@ class EpisodeNodes:
         self._lock = threading.RLock()
         # What is below a hidden node is hidden with it.
         self._roots = {part: self._scene.add_frame(f"{root}/{part}", show_axes=False) for part in PARTS}
-        self._now = EstimateNodes(server, library, is_named, root=f"{root}/estimate")
+        self._now = EstimateNodes(server, library, names, root=f"{root}/estimate")
         self._goal_look = EstimateNodes(
-            server, library, is_named, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
+            server, library, names, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
         self._future = FutureNodes(server.scene, library, f"{root}/plan/future", _linear(PREDICTED))

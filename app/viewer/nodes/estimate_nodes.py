@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import viser
@@ -22,6 +22,7 @@ from app.viewer.nodes.ghosts import (
     spread,
     top_m,
 )
+from app.viewer.nodes.label_layout import Label, separated
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.scene_nodes import LIGHT_COLOUR
 from osfcore.errors import OsfError
@@ -53,7 +54,7 @@ class EstimateNodes:
     Args:
         server: to draw in.
         library: meshes of the objects.
-        is_named: whether an object is labelled already, since it is on the table.
+        names: the objects' names that are on view already, by object.
         root: the node.
         colour: of the guess.
         has_light: whether the light is drawn, too.
@@ -63,7 +64,7 @@ class EstimateNodes:
         self,
         server: Target,
         library: AssetLibrary,
-        is_named: Callable[[str], bool] = lambda _: True,
+        names: Callable[[], Mapping[str, Label]] = dict,
         *,
         root: str = "/estimate",
         colour: Colour = GUESS,
@@ -71,7 +72,7 @@ class EstimateNodes:
     ) -> None:
         self._root, self._colour, self._has_light = root, colour, has_light
         self._server = server
-        self._is_named = is_named
+        self._named = names
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
@@ -197,7 +198,8 @@ class EstimateNodes:
         for n, name in enumerate(estimate.state.names):
             pose, doubt = estimate.state.poses[n], estimate.doubts[n]
             self._mark(name, doubt)
-            self._add_verdict(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
+            self._add_bounds(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
+        self._add_words(estimate)
         within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}°"
         self._show_light(estimate.state.light, None, f"estimated light {within}")
 
@@ -206,8 +208,30 @@ class EstimateNodes:
             _DOUBTED if doubt else _SURE, np.uint8
         )
 
-    def _add_verdict(self, name: str, pose: Pose, position_std: float, rotation_std: float, doubt: str) -> None:
-        """A ball of two standard deviations on the object's top, a sector of two around its heading, and words."""
+    def _add_words(self, estimate: EstimatedState) -> None:
+        """How sure each pose is, or why it is doubted, above the object and clear of all names."""
+        standing, texts, anchors = self._named(), [], []
+        for n, name in enumerate(estimate.state.names):
+            pose = estimate.state.poses[n]
+            far_mm, turn_deg = 1000 * _SIGMAS * estimate.position_std[n], np.rad2deg(_SIGMAS * estimate.rotation_std[n])
+            text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}°"
+            text = f"DOUBTFUL: {estimate.doubts[n]}" if estimate.doubts[n] else text
+            texts.append(text if name in standing else f"{self._label(name)}: {text}")
+            anchors.append(pose.position + np.array([0, 0, top_m(self._meshes[name][0], pose.quaternion) + _LABEL_M]))
+        places = separated(np.array(anchors).reshape(-1, 3), texts, tuple(standing.values()))
+        self._verdicts += [
+            self._scene.add_label(
+                f"{self._root}/verdict/{name}/words",
+                text,
+                position=place,
+                font_screen_scale=0.75,
+                anchor="bottom-center",
+            )
+            for name, text, place in zip(estimate.state.names, texts, places, strict=True)
+        ]
+
+    def _add_bounds(self, name: str, pose: Pose, position_std: float, rotation_std: float, doubt: str) -> None:
+        """A ball of two standard deviations on the object's top, and a sector of two around its heading."""
         scene, (vertices, _) = self._scene, self._meshes[name]
         colour = _DOUBTED if doubt else _SURE
         top = pose.position + np.array([0.0, 0.0, top_m(vertices, pose.quaternion)])
@@ -215,11 +239,6 @@ class EstimateNodes:
         turn_rad = float(np.clip(_SIGMAS * rotation_std, _LEAST_TURN_RAD, _MOST_TURN_RAD))
         reach_m = footprint_m(vertices, pose.quaternion)
         flat = sector(heading_rad(pose.quaternion), turn_rad, reach_m + _RING_M[0], reach_m + _RING_M[1])
-        text = (
-            f"± {_two_digits(1000 * _SIGMAS * position_std)} mm, ± {_two_digits(np.rad2deg(_SIGMAS * rotation_std))}°"
-        )
-        text = f"DOUBTFUL: {doubt}" if doubt else text
-        text = text if self._is_named(name) else f"{self._label(name)}: {text}"
         self._verdicts += [
             scene.add_icosphere(
                 f"{self._root}/verdict/{name}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False
@@ -233,13 +252,6 @@ class EstimateNodes:
                 cast_shadow=False,
                 receive_shadow=False,
                 position=(pose.position[0], pose.position[1], _TABLE_M),
-            ),
-            scene.add_label(
-                f"{self._root}/verdict/{name}/words",
-                text,
-                position=top + np.array([0.0, 0.0, _LABEL_M + ball_m]),
-                font_screen_scale=0.75,
-                anchor="bottom-center",
             ),
         ]
 

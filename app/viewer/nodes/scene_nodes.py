@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from app.processes.messages.scene_messages import SceneRecord
 from app.viewer.nodes.atomic import Target, atomic
-from app.viewer.nodes.label_layout import separated
+from app.viewer.nodes.label_layout import Label, separated
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.room import colour_of
 from app.viewer.nodes.shadow_nodes import ShadowNodes
@@ -145,9 +145,11 @@ class SceneNodes:
                 if name in self._frustums:
                     self._frustums[name].image = image
 
-    def has(self, name: str) -> bool:
-        """Whether an object is on the table."""
-        return name in self._bodies
+    def names(self) -> dict[str, Label]:
+        """The names of objects that are on view, by object."""
+        with self._lock:
+            shown = {name: label for name, label in self._labels.items() if label.visible}
+            return {name: Label(label.text, np.asarray(label.position, float)) for name, label in shown.items()}
 
     def show_cameras(self, is_on: bool) -> None:
         """Show or hide the cameras."""

@@ -2,8 +2,11 @@ import numpy as np
 import pytest
 
 from app.viewer.nodes.estimate_nodes import GHOSTS, EstimateNodes
+from app.viewer.nodes.label_layout import LINE, Label
 from app.viewer.nodes.light_marker import AT
+from app.viewer.nodes.room import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
 from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.cameras import Camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -13,11 +16,12 @@ from osfcore.progress import Progress
 BOX, UNKNOWN = "003_cracker_box", "055_baseball"  # the second has no mesh here
 LIGHT = Light(np.array([0.6, 0, 0.8]))
 UPRIGHT = np.array([1.0, 0, 0, 0])
+NAMES = {name: Label(name, np.array([0.1, -0.05, 0.25])) for name in (BOX, UNKNOWN)}
 
 
 @pytest.fixture
 def drawing(server, library):
-    return EstimateNodes(server, library)
+    return EstimateNodes(server, library, lambda: NAMES)
 
 
 def state(names=(BOX, UNKNOWN), z=0.1):
@@ -128,8 +132,16 @@ def test_doubted_objects_are_drawn_in_another_colour_with_the_reason(drawing, dr
     np.testing.assert_array_equal(guess(driver).batched_colors, guess(driver, UNKNOWN).batched_colors)
 
 
+def test_words_cover_neither_names_nor_each_other(drawing, driver):
+    drawing.show(step(estimate=judged()))
+    view = Camera.look_at("view", VIEW_FROM, VIEW_AT, fov_y_deg=float(np.rad2deg(VIEW_FOV_RAD)))
+    feet = [node.position for node in verdicts(driver, "words")] + [NAMES[BOX].anchor_m]
+    heights = np.sort(view.project(np.array(feet))[:, 1] / view.height)
+    assert np.diff(heights).min() > 0.8 * LINE
+
+
 def test_what_is_not_on_the_table_is_named(server, driver, library):
-    drawing = EstimateNodes(server, library, lambda name: name != BOX)
+    drawing = EstimateNodes(server, library, lambda: {UNKNOWN: NAMES[UNKNOWN]})
     drawing.show(step(estimate=judged("it is hardly visible")))
     texts = [node.text for node in verdicts(driver, "words")]
     assert texts[0] == "Cracker box: DOUBTFUL: it is hardly visible"
