@@ -1,6 +1,7 @@
 // What this is, shown before anybody clicks: a recorded episode in the 3D view, its goal, its table, and how far it is.
 import { asked } from "./address.js";
 import { get, post } from "./api.js";
+import { drawLegend } from "./charts.js";
 import { COLOURS, svg } from "./curves.js";
 import { byId, whileDisabled } from "./dom.js";
 import { startEpisode } from "./episode.js";
@@ -56,6 +57,8 @@ function drawCurve(at) {
     return line;
   });
   byId("story-curve").replaceChildren(svg("path", { d: `M0,${HEIGHT} H${WIDTH}`, class: "axis" }), ...lines);
+  const now = left[Math.max(shown - 1, 0)];
+  drawLegend(byId("story-key"), objects.map((name, i) => ({ label: `${labelOf(name)} ${distance(now[name])}`, colour: COLOURS[i % COLOURS.length] })));
 }
 
 function draw(at) {
