@@ -4,7 +4,7 @@ import { asked, note } from "./address.js";
 import { get, post } from "./api.js";
 import { drawLegend, drawLines } from "./charts.js";
 import { COLOURS } from "./curves.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { takeSettings } from "./episode-settings.js";
 import { LIVE } from "./jobs.js";
@@ -12,7 +12,7 @@ import { farthest, parts } from "./run-summary.js";
 import { resetScene } from "./scenes.js";
 import { current, known, set } from "./state.js";
 import { scrollTo } from "./tabs.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const MOST = 100; // that are offered
 const SETTINGS = {
@@ -116,5 +116,5 @@ async function runAgain() {
 export function setUpBeside() {
   byId("beside-card").addEventListener("toggle", () => { if (byId("beside-card").open) tellFailure(offer); });
   byId("beside-select").addEventListener("change", ({ target }) => tellFailure(() => choose(target.value)));
-  byId("run-again").addEventListener("click", () => whileDisabled(byId("run-again"), () => tellFailure(runAgain)));
+  byId("run-again").addEventListener("click", () => act(byId("run-again"), runAgain));
 }

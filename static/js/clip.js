@@ -1,9 +1,9 @@
 // A clip of an episode that is over: making it, playing it, taking it along.
 import { post } from "./api.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
 import { inWords, known, set, watch } from "./state.js";
-import { tellFailure } from "./toasts.js";
+import { act } from "./toasts.js";
 
 const FILE = "clip.mp4";
 let shown = null; // the episode whose ending is on view
@@ -29,7 +29,7 @@ export function drawClip(episode = shown) {
 }
 
 export function setUpClip() {
-  byId("make-clip").addEventListener("click", () => whileDisabled(byId("make-clip"), () => tellFailure(async () =>
-    set("clip", await post(`episodes/${encodeURIComponent(shown.id)}/clip`)))));
+  byId("make-clip").addEventListener("click", () => act(byId("make-clip"), async () =>
+    set("clip", await post(`episodes/${encodeURIComponent(shown.id)}/clip`))));
   watch("clip", () => drawClip());
 }

@@ -1,14 +1,14 @@
 // Composing a goal: golden objects are dragged in the 3D view or on a map, and the goal image follows.
 import { patch, post, remove } from "./api.js";
 import { LatestImage } from "./cameras.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId } from "./dom.js";
 import { isDriving, mayDrive } from "./driver.js";
 import { takeGoal } from "./goals.js";
 import { TableMap } from "./map.js";
 import { Newest } from "./newest.js";
 import { current, inWords, known, labelOf, set, watch } from "./state.js";
 import { scrollTo } from "./tabs.js";
-import { tellFailure, tellMissingScene } from "./toasts.js";
+import { act, tellMissingScene } from "./toasts.js";
 
 const picture = new LatestImage(byId("draft-image"));
 const moves = new Newest(async (objects) => {
@@ -23,11 +23,11 @@ export function compose() {
   const scene = current();
   if (!scene) return tellMissingScene();
   if (!mayDrive()) return undefined;
-  return whileDisabled(byId("compose"), () => tellFailure(async () => {
+  return act(byId("compose"), async () => {
     const draft = await post("goals/draft", { scene: scene.id });
     set("draft", null); // it may count from the beginning again
     set("draft", draft);
-  }));
+  });
 }
 
 async function save() {
@@ -75,7 +75,7 @@ export function setUpCompose() {
   byId("turn-left").addEventListener("click", () => map.turn(1));
   byId("turn-right").addEventListener("click", () => map.turn(-1));
   for (const [id, action] of [["save-draft", save], ["stop-draft", stop]]) {
-    byId(id).addEventListener("click", () => whileDisabled(byId(id), () => tellFailure(action)));
+    byId(id).addEventListener("click", () => act(byId(id), action));
   }
   byId("draft-name").addEventListener("keydown", (event) => { if (event.key === "Enter") byId("save-draft").click(); });
   watch("draft", draw);

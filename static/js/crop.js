@@ -1,11 +1,11 @@
 // Cutting the goal image out of a photo: the photo is moved, zoomed and turned under a frame that is what the goal
 // camera would see, with the table as it is now over it, faint. All numbers are pixels of the photo as it was sent.
 import { patch } from "./api.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { current, known, set, watch } from "./state.js";
 import { scrollTo } from "./tabs.js";
-import { tellFailure } from "./toasts.js";
+import { act } from "./toasts.js";
 
 const LEAST = 64; // of the side that may be cut out, if the photo has as many
 const WHEEL = 0.0015;
@@ -95,6 +95,7 @@ function setUpDrag(frame) {
   frame.addEventListener("keydown", (event) => {
     if (!(event.key in NUDGE)) return;
     event.preventDefault();
+    event.stopPropagation(); // or they would push what is on the table
     const by = event.shiftKey ? 10 : 2;
     pan(...NUDGE[event.key].map((sign) => sign * by));
   });
@@ -108,7 +109,7 @@ export function setUpCrop() {
   });
   byId("crop-turn").addEventListener("input", (event) => show({ turn: Number(event.target.value) }));
   byId("crop-faint").addEventListener("change", (event) => byId("crop-frame").classList.toggle("alone", !event.target.checked));
-  byId("crop-use").addEventListener("click", () => whileDisabled(byId("crop-use"), () => tellFailure(use)));
+  byId("crop-use").addEventListener("click", () => act(byId("crop-use"), use));
   byId("crop-stop").addEventListener("click", close);
   byId("crop-goal").addEventListener("click", openCrop);
   watch("goal", (chosen) => {

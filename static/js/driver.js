@@ -1,8 +1,8 @@
 // Who drives: of several visitors one page changes things; the others watch until they take over.
 import { VISITOR, post } from "./api.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { known, set, watch } from "./state.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, toast } from "./toasts.js";
 
 export function isDriving() {
   const driver = known("driver")?.driver;
@@ -15,6 +15,9 @@ export function mayDrive() {
   return isDriving();
 }
 
+/** Controls that a page which only watches cannot use. */
+export const forDrivers = (...controls) => el("fieldset", { className: "drives wraps", disabled: !isDriving() }, ...controls);
+
 function draw(driver) {
   const visitors = driver?.visitors ?? 1;
   byId("watching").hidden = visitors < 2;
@@ -25,7 +28,6 @@ function draw(driver) {
 
 export function setUpDriver() {
   const button = byId("take-over");
-  button.addEventListener("click", () => whileDisabled(button, () =>
-    tellFailure(async () => set("driver", await post("driver", { visitor: VISITOR })))));
+  button.addEventListener("click", () => act(button, async () => set("driver", await post("driver", { visitor: VISITOR }))));
   watch("driver", draw);
 }

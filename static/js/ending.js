@@ -4,7 +4,7 @@ import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
 import { LIVE } from "./jobs.js";
 import { length, offsets, summary } from "./run-summary.js";
-import { current, known, labelOf, set } from "./state.js";
+import { current, known, labelOf, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { toast } from "./toasts.js";
 
@@ -54,6 +54,7 @@ export function drawEnding(episode) {
 }
 
 function goOn(changes) {
+  if (!canGoOn(shown)) return toast("Another table is on view; show that of this run first.", "warning");
   const goal = known("goals").find(({ id }) => id === shown.goal);
   if (!goal) return toast("The goal of this episode has been deleted; choose another one.", "warning");
   set("goal", goal);
@@ -65,6 +66,7 @@ export function setUpEnding() {
   const wipe = () => { after.style.clipPath = `inset(0 0 0 ${100 - byId("ending-at").value}%)`; };
   byId("ending-at").addEventListener("input", wipe);
   wipe();
+  watch("scene", () => { if (shown) drawEnding(shown); });
   byId("more-pushes").addEventListener("click", () => goOn({ steps: MORE }));
   byId("go-on-anyway").addEventListener("click", () => goOn({ despite_doubts: true }));
   byId("another-photo").addEventListener("click", () => {

@@ -21,6 +21,7 @@ const COSTS = {
 };
 const FINE = 1000; // places of a slider
 
+let lent = null; // what the form said before a run with other settings
 let offered = null; // {defaults, bounds} once the service has told them
 const form = () => byId("episode-settings");
 const live = () => (LIVE.has(known("episode")?.state) ? known("episode") : null);
@@ -87,11 +88,30 @@ function row(slider) {
   return [caption, range, number];
 }
 
-/** Takes over the settings of another run. */
+/** Takes over the settings of another run; one that runs keeps its own. */
 export function takeSettings(settings) {
   if (!offered) return;
   fill(settings);
-  change();
+  set("settings", chosenSettings());
+}
+
+/** Another goal or table: what was overruled for the one before does not count for it. */
+export function forgetDoubts() {
+  form().elements.despite_doubts.checked = false;
+  if (offered) set("settings", chosenSettings());
+}
+
+/** Settings for one run alone: the form says again afterwards what it says now. */
+export function lend(changes) {
+  if (Object.keys(changes).length) lent = chosenSettings();
+  return { ...chosenSettings(), ...changes };
+}
+
+function takeBack() {
+  if (!lent || live()) return;
+  const settings = lent;
+  lent = null;
+  takeSettings(settings);
 }
 
 export async function refreshSettings() {
@@ -111,9 +131,16 @@ export function setUpEpisodeSettings() {
   form().addEventListener("change", change);
   byId("despite-doubts").addEventListener("change", change); // it stands where doubts are told, outside the form
   byId("settings-defaults").addEventListener("click", () => {
-    if (offered) takeSettings(offered.defaults);
+    if (!offered) return;
+    fill(offered.defaults);
+    change();
   });
   // Another visitor may have chosen or changed them; what the hand does here now counts more.
+  let before;
+  watch("episode", (job) => {
+    if (LIVE.has(before) && !LIVE.has(job?.state)) takeBack();
+    before = job?.state;
+  });
   watch("report", () => {
     if (offered && running() && !changes.isBusy && !form().contains(document.activeElement)) fill(running().settings);
   });

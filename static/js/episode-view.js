@@ -21,8 +21,10 @@ let closings = 0;
 let timeline = null;
 let followed = ""; // the job that was put on view by itself
 let seen = ""; // how far the job was when it was fetched for
+let noting = 0;
 let isLive = true; // whether the 3D view is left on the live table
 
+const NOTE_MS = 300;
 const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
 const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
 const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
@@ -117,9 +119,18 @@ function drawHead(episode) {
   )));
 }
 
+/** Once the slider rests: browsers refuse an address that changes with each pixel. */
+function noteStep() {
+  clearTimeout(noting);
+  const { id } = shown;
+  noting = setTimeout(() => {
+    if (shown?.id === id) note({ step: timeline.step < timeline.last ? timeline.step : null });
+  }, NOTE_MS);
+}
+
 /** Shows a moment of the episode in the 3D view, or the live table for null. */
 function show3D(moment) {
-  if (moment && !moment.plays) note({ step: timeline.step < timeline.last ? timeline.step : null });
+  if (moment && !moment.plays) noteStep();
   const isAtEnd = !moment || (!moment.plays && moment.at_s >= timeline.at(timeline.last));
   isLive = !moment || (isAtEnd && LIVE.has(shown.status));
   if (isLive) showLive();
@@ -169,7 +180,9 @@ function follow(job) {
   if (wanted) fetchWanted();
 }
 
-function close() {
+/** Takes the episode on view off it; one that runs comes back on view. */
+export function closeShown() {
+  if (!shown) return;
   timeline.pause();
   shown = null;
   wanted = null;
@@ -184,7 +197,7 @@ function close() {
 
 /** Takes an episode off view that was removed for good. */
 export function dropShown(id) {
-  if (shown?.id === id) close();
+  if (shown?.id === id) closeShown();
 }
 
 /** The step that is on view, for links. */
@@ -198,7 +211,7 @@ export function refreshShown() {
 /** Back or forward: the episode and step of the address, or none. */
 function travel({ episode, step }) {
   const at = step === undefined ? undefined : Number(step);
-  if (!episode && shown && !LIVE.has(shown.status)) close();
+  if (!episode && shown && !LIVE.has(shown.status)) closeShown();
   else if (episode && shown?.id !== episode) openEpisode(episode, at);
   else if (episode && Number.isInteger(at)) timeline.go(Math.min(at, timeline.last));
 }
@@ -208,7 +221,7 @@ export function setUpEpisodeView() {
   setUpPictures();
   timeline = new Timeline(drawStep, show3D);
   setUpProgress(() => timeline.last, (step) => timeline.go(step));
-  byId("close-shown").addEventListener("click", close);
+  byId("close-shown").addEventListener("click", closeShown);
   watch("objects", () => {
     if (!shown) return;
     drawHead(shown);

@@ -1,12 +1,12 @@
 // Starting an episode, and the controls of the one that runs.
 import { post, remove } from "./api.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { isDriving, mayDrive } from "./driver.js";
-import { chosenSettings } from "./episode-settings.js";
+import { chosenSettings, lend } from "./episode-settings.js";
 import { LIVE, stateText, timeLeft } from "./jobs.js";
 import { resetScene } from "./scenes.js";
 import { current, inWords, known, set, watch } from "./state.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const STAGES = {
   first: "Looking at the table", goal: "Looking at the goal image", plan: "Planning pushes", act: "Pushing",
@@ -17,6 +17,7 @@ const LOOP = [["Look", ["first", "next", "search"]], ["Goal", ["goal"]], ["Plan"
 const OVER_MS = 10_000; // a cancel takes about a second
 const LOOK_MS = 100;
 let before = { id: "", state: "" };
+let isStarting = false; // until the service has answered
 
 const live = () => (LIVE.has(known("episode")?.state) ? known("episode") : null);
 const path = (what = "") => `episodes/${live().id}${what}`;
@@ -27,6 +28,7 @@ const path = (what = "") => `episodes/${live().id}${what}`;
 function reason(changes = {}) {
   const scene = current();
   if (!isDriving()) return "Someone else is driving; take over to start.";
+  if (isStarting) return "One moment.";
   if (scene === undefined) return "The simulation is starting.";
   if (!scene) return "Choose a table first.";
   if (known("draft")) return "Save the goal that is being composed, or stop composing.";
@@ -41,12 +43,16 @@ function reason(changes = {}) {
 
 /** Starts an episode as the page's settings say, or with some of them changed. */
 export function startEpisode(changes = {}) {
-  if (live() || byId("run-idle").hidden) return undefined;
+  if (live() || isStarting || byId("run-idle").hidden) return undefined;
   const why = reason(changes);
   if (why) return toast(why, "warning");
-  const body = { scene: current().id, goal: known("goal").id, seed: 0, settings: { ...chosenSettings(), ...changes } };
-  return whileDisabled(byId("start-episode"), () => tellFailure(async () =>
-    set("opened", { id: (await post("episodes", body)).id }))).then(drawStart);
+  const body = { scene: current().id, goal: known("goal").id, seed: 0, settings: lend(changes) };
+  isStarting = true;
+  drawStart();
+  return tellFailure(async () => set("opened", { id: (await post("episodes", body)).id }), byId("start-reason")).finally(() => {
+    isStarting = false;
+    drawStart();
+  });
 }
 
 function drawStart() {
@@ -57,7 +63,7 @@ function drawStart() {
 
 // Controls
 
-const does = (button, action) => whileDisabled(button, () => tellFailure(action)).then(() => drawLive(live()));
+const does = (button, action) => act(button, action).then(() => drawLive(live()));
 
 export function togglePause() {
   if (!live() || live().state === "queued" || !mayDrive()) return;

@@ -1,12 +1,13 @@
 // All episodes, newest first, and links to a moment of one: ?episode=ID&step=N.
 import { asked } from "./address.js";
 import { get, patch, remove } from "./api.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
+import { forDrivers } from "./driver.js";
 import { dropShown, openEpisode, outcomeOf, showEpisode } from "./episode-view.js";
 import { LIVE } from "./jobs.js";
 import { labelOf, watch } from "./state.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const FEW = 6;
 const PAGE = 50;
@@ -64,9 +65,9 @@ function entry(episode) {
   const buttons = [
     el("button", { type: "button", className: "plain", textContent: "Show", on: { click: () => openEpisode(episode.id) } }),
     ...(LIVE.has(episode.status) ? [] : [
-      renameButton(episode, item),
+      forDrivers(renameButton(episode, item)),
       episode.files.includes(ARCHIVE) ? el("a", { href: `api/episodes/${encodeURIComponent(episode.id)}/files/${ARCHIVE}`, textContent: "Download", download: `${episode.name}.zip` }) : null,
-      deleteButton(episode),
+      forDrivers(deleteButton(episode)),
     ]),
   ];
   item.append(
@@ -144,7 +145,7 @@ export function setUpEpisodes() {
     draw();
   });
   const more = byId("more-episodes");
-  more.addEventListener("click", () => whileDisabled(more, () => tellFailure(showOlder)));
+  more.addEventListener("click", () => act(more, showOlder));
   byId("episode-search").addEventListener("input", () => refreshEpisodes());
   byId("episode-outcome").addEventListener("change", () => refreshEpisodes());
   watch("objects", draw);

@@ -3,10 +3,10 @@ import { zipSync } from "../vendor/fflate-0.8.3.js";
 import { get, post, remove, upload } from "./api.js";
 import { LatestImage } from "./cameras.js";
 import { drawCurves, drawKey } from "./curves.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { LIVE, stateText } from "./jobs.js";
 import { inWords, labelOf, watch } from "./state.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const PICTURE_MS = 700; // rendering takes time from the estimator
 const form = () => byId("new-estimate");
@@ -166,7 +166,7 @@ function drawResult({ id, estimate, simulation, files }) {
 export function setUpEstimate() {
   form().addEventListener("submit", (event) => {
     event.preventDefault();
-    whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(start));
+    act(form().querySelector("[type=submit]"), start);
   });
   for (const [button, input, action] of [
     ["upload-observation", "observation-file", (files) => send(files[0], files[0].name)],
@@ -176,11 +176,11 @@ export function setUpEstimate() {
     byId(input).addEventListener("change", () => {
       const files = [...byId(input).files];
       byId(input).value = "";
-      if (files.length) whileDisabled(byId(button), () => tellFailure(() => action(files)));
+      if (files.length) act(byId(button), () => action(files));
     });
   }
   const cancel = byId("cancel-estimate");
-  cancel.addEventListener("click", () => whileDisabled(cancel, () => tellFailure(() => remove(`estimates/${shown.id}`))));
+  cancel.addEventListener("click", () => act(cancel, () => remove(`estimates/${shown.id}`)));
   byId("estimate-camera").addEventListener("change", () => drawPicture({ isUrgent: true }));
   byId("tab-estimate").addEventListener("click", () => drawPicture({ isUrgent: true }));
   watch("objects", () => {

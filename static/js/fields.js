@@ -1,11 +1,11 @@
 // Fields: what there is and how good it is, training new ones from a mesh or an uploaded image set, watching it.
 import { get, getAll, post, remove, upload } from "./api.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
 import { inWords, known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const [S_PER_IMAGE, S_PER_IMAGE_OF_SET] = [0.2, 0.115]; // taken, measured and compared, as the service reckons
 const PREPARING_MIN = 0.2; // loading
@@ -227,7 +227,7 @@ export function setUpFields() {
   const button = byId("upload-set");
   form().addEventListener("submit", (event) => {
     event.preventDefault();
-    whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(train));
+    act(form().querySelector("[type=submit]"), train);
   });
   form().addEventListener("change", drawSource);
   form().addEventListener("input", drawTime);
@@ -236,10 +236,10 @@ export function setUpFields() {
   button.addEventListener("click", () => file.click());
   file.addEventListener("change", () => {
     const [chosen] = file.files;
-    if (chosen) whileDisabled(button, () => tellFailure(() => uploadSet(chosen)));
+    if (chosen) act(button, () => uploadSet(chosen));
     file.value = "";
   });
-  byId("use-new-field").addEventListener("click", () => whileDisabled(byId("use-new-field"), () => tellFailure(useNew)));
+  byId("use-new-field").addEventListener("click", () => act(byId("use-new-field"), useNew));
   doubted(byId("delete-set"), "Really delete set", deleteSet);
   byId("training-image").addEventListener("error", () => drawPreview(""));
   watch("objects", () => {

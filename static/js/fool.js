@@ -27,10 +27,10 @@ function tell(text, isNoticed) {
   timer = setTimeout(() => { box.hidden = true; }, SHOWN_MS);
 }
 
-async function disturb(kind) {
+async function disturb(kind, button) {
   const scene = current();
   if (!scene || !mayDrive()) return;
-  const done = await tellFailure(() => post(`scenes/${scene.id}/disturbances`, { kind }));
+  const done = await tellFailure(() => post(`scenes/${scene.id}/disturbances`, { kind }), button);
   if (!done) return;
   set("scene", { ...done.scene, is_current: true });
   tell(`You: ${inWords(done.text)}`, false);
@@ -48,7 +48,7 @@ function follow(report) {
 
 export function setUpFool() {
   for (const [id, kind] of Object.entries(KINDS)) {
-    byId(id).addEventListener("click", () => whileDisabled(byId(id), () => disturb(kind)));
+    byId(id).addEventListener("click", () => whileDisabled(byId(id), () => disturb(kind, byId(id))));
   }
   const draw = () => { byId("fool").hidden = !isRunning(); };
   watch("episode", draw);

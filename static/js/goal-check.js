@@ -1,9 +1,10 @@
 // Whether the chosen goal suits the table, asked as soon as either changes; what is wrong stands beside what mends it.
 import { get, post } from "./api.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId } from "./dom.js";
 import { openCrop } from "./crop.js";
 import { current, known, set, watch } from "./state.js";
-import { tellFailure } from "./toasts.js";
+import { forgetDoubts } from "./episode-settings.js";
+import { act } from "./toasts.js";
 
 let asked = ""; // which goal, crop and table the answer is of, or will be
 
@@ -12,8 +13,7 @@ async function look() {
   const key = goal && scene ? JSON.stringify([goal.id, goal.photo, scene.id]) : "";
   if (key === asked) return;
   asked = key;
-  byId("despite-doubts").checked = false;
-  byId("despite-doubts").dispatchEvent(new Event("change"));
+  forgetDoubts();
   if (!key || goal.scene === scene.id) {
     set("check", null);
     return;
@@ -43,9 +43,9 @@ function draw(check) {
 export function setUpGoalCheck() {
   byId("check-crop").addEventListener("click", openCrop);
   byId("check-photo").addEventListener("click", () => byId("goal-file").click());
-  byId("check-table").addEventListener("click", () => whileDisabled(byId("check-table"), () => tellFailure(async () => {
+  byId("check-table").addEventListener("click", () => act(byId("check-table"), async () => {
     set("scene", await post(`scenes/${known("check").scene}/activate`));
-  })));
+  }));
   watch("goal", look);
   watch("scene", look);
   watch("check", draw);

@@ -5,7 +5,7 @@ import { byId, el, whileDisabled } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { mayDrive } from "./driver.js";
 import { current, known, set, watch } from "./state.js";
-import { tellFailure, tellMissingScene } from "./toasts.js";
+import { act, tellFailure, tellMissingScene } from "./toasts.js";
 
 const DRAWN_SEEDS = 1_000_000; // short to read, and far fewer than may be asked for
 const NAME_MAX = 100;
@@ -46,8 +46,8 @@ export function randomGoal() {
   if (!scene) return tellMissingScene();
   if (!mayDrive()) return undefined;
   const seed = Math.floor(Math.random() * DRAWN_SEEDS);
-  return whileDisabled(byId("random-goal"), () => tellFailure(async () =>
-    takeGoal(await post("goals", { scene: scene.id, random: { seed, moved: null }, name: `Random goal ${seed}` }))));
+  return act(byId("random-goal"), async () =>
+    takeGoal(await post("goals", { scene: scene.id, random: { seed, moved: null }, name: `Random goal ${seed}` })));
 }
 
 /** Sends an image; what is wrong with it is the service's to say. */
@@ -62,7 +62,7 @@ export async function uploadGoal(file) {
     const goal = await upload(`goals?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
     takeGoal(goal);
     if (goal.photo.width !== goal.photo.height) openCrop(); // its middle is a guess
-  });
+  }, byId("upload-goal"));
   bar.hidden = true;
 }
 

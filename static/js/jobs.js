@@ -1,10 +1,10 @@
 // Long work: starting it, watching it, pausing, cancelling, and taking the results.
 import { get, post, remove } from "./api.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { inWords, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
-import { tellFailure } from "./toasts.js";
+import { act, tellFailure } from "./toasts.js";
 
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
@@ -57,8 +57,7 @@ async function start(event) {
   for (const input of byId("job-fields").querySelectorAll("input, select")) {
     params[input.name] = input.type === "number" ? Number(input.value) : input.value;
   }
-  await whileDisabled(form.querySelector("[type=submit]"), () =>
-    tellFailure(async () => showJob(await post("jobs", { kind: form.elements.kind.value, params }))));
+  await act(form.querySelector("[type=submit]"), async () => showJob(await post("jobs", { kind: form.elements.kind.value, params })));
 }
 
 export function timeLeft(seconds) {
@@ -107,7 +106,7 @@ export function titleText({ kind, params }) {
 
 function command(text, className, action) {
   const button = el("button", { type: "button", className, textContent: text });
-  button.addEventListener("click", () => whileDisabled(button, () => tellFailure(async () => showJob(await action()))));
+  button.addEventListener("click", () => act(button, async () => showJob(await action())));
   return button;
 }
 
@@ -230,6 +229,6 @@ export function setUpJobs() {
   form.addEventListener("submit", start);
   form.elements.kind.addEventListener("change", drawFields);
   const more = byId("more-jobs");
-  more.addEventListener("click", () => whileDisabled(more, () => tellFailure(showOlder)));
+  more.addEventListener("click", () => act(more, showOlder));
   watch("objects", drawFields);
 }

@@ -6,6 +6,7 @@ import { cancelEpisode, resetTable, startEpisode, stepOnce, togglePause } from "
 import { randomGoal } from "./goals.js";
 import { pushKey } from "./push.js";
 import { anotherScene } from "./scenes.js";
+import { isLiveShown } from "./viewer.js";
 
 const OFF = "osf-keys-off";
 
@@ -33,8 +34,11 @@ const OF_VIEW = ["w", "a", "s", "d", "q", "e"]; // move the camera where the 3D 
 
 const isOff = () => localStorage.getItem(OFF) === "1";
 
+// Caps Lock alone makes capitals, too.
+const isMeant = ({ key, shiftKey }) => key in COMMANDS && (!/^[A-Z]$/.test(key) || shiftKey);
+
 function take(event) {
-  if (!(event.key in COMMANDS) || event.repeat) return;
+  if (!isMeant(event) || event.repeat) return;
   event.preventDefault();
   COMMANDS[event.key]();
 }
@@ -42,8 +46,8 @@ function take(event) {
 const isPlain = (event) => !(event.ctrlKey || event.metaKey || event.altKey || isOff() || isDialogOpen());
 
 function down(event) {
-  if (!isPlain(event) || isTyping(event.target) || (event.key === " " && isPressed(event.target))) return;
-  if (pushKey(event.key, true)) event.preventDefault();
+  if (event.defaultPrevented || !isPlain(event) || isTyping(event.target) || (event.key === " " && isPressed(event.target))) return;
+  if (isLiveShown() && pushKey(event.key, true)) event.preventDefault();
   else take(event);
 }
 
@@ -51,7 +55,8 @@ function down(event) {
 function listenInView() {
   const view = byId("viewer");
   view.addEventListener("load", () => view.contentWindow.addEventListener("keydown", (event) => {
-    if (isPlain(event) && !isTyping(event.target) && !OF_VIEW.includes(event.key)) take(event);
+    const isOwn = OF_VIEW.includes(event.key) || (event.key === " " && isPressed(event.target));
+    if (isPlain(event) && !isTyping(event.target) && !isOwn) take(event);
   }));
 }
 

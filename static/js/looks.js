@@ -81,12 +81,13 @@ function showLarge(on) {
 /** Another look begins: what it looks at. */
 function begin(look) {
   const scene = current();
+  const goal = known("goals").find(({ id }) => id === known("report")?.goal) ?? known("goal");
   byId("looking-what").textContent = QUESTIONS[look] ?? "";
   for (const tile of byId("looking-tiles").children) {
     const { camera } = tile.dataset;
     tile.hidden = (look === "goal") !== (camera === "goal");
     const query = new URLSearchParams({ size: SIDE, v: scene?.revision });
-    const url = camera === "goal" ? known("goal") && imageOf(known("goal")) : scene && `api/scenes/${scene.id}/images/${camera}.png?${query}`;
+    const url = camera === "goal" ? goal && imageOf(goal) : scene && `api/scenes/${scene.id}/images/${camera}.png?${query}`;
     const base = tile.querySelector(".base");
     if (url && !tile.hidden) base.src = url;
     else base.removeAttribute("src");
@@ -132,7 +133,9 @@ export function setUpLooks() {
     tile.dataset.camera = camera;
     byId("looking-tiles").append(tile);
   }
-  watch("episode", () => {
-    if (!LIVE.has(known("episode")?.state) && !LIVE.has(known("estimate")?.state)) clear();
-  });
+  for (const what of ["episode", "estimate"]) {
+    watch(what, () => {
+      if (!LIVE.has(known("episode")?.state) && !LIVE.has(known("estimate")?.state)) clear();
+    });
+  }
 }

@@ -37,7 +37,7 @@ import { expectOlder, set } from "./state.js";
 import { setUpStory } from "./story.js";
 import { setUpTabs } from "./tabs.js";
 import { setUpTheme } from "./theme.js";
-import { toast } from "./toasts.js";
+import { setUpToasts, settleUnreachable, toast } from "./toasts.js";
 import { isViewerShown, setUpViewer, showViewer } from "./viewer.js";
 import { setUpWelcome } from "./welcome.js";
 
@@ -79,6 +79,7 @@ async function followHealth(again) {
 setUpAddress();
 setUpTheme();
 setUpTabs();
+setUpToasts();
 setUpViewer(followLive);
 setUpDriver();
 setUpCameras();
@@ -118,6 +119,7 @@ refreshGoals();
 
 listen(VISITOR, {
   open(again) {
+    settleUnreachable();
     followHealth(again);
     refreshJobs();
     if (again) {

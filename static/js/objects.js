@@ -1,6 +1,6 @@
 // The catalogue: what there is, how it looks from all around, how big and heavy, and what is still to be fetched.
 import { get, post, remove } from "./api.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { prepareTraining } from "./fields.js";
 import { showJob } from "./jobs.js";
@@ -8,7 +8,7 @@ import { makeScene } from "./scenes.js";
 import { closeStory } from "./story.js";
 import { current, known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const MOST_ON_TABLE = 8;
 const SIDE = 96; // of one view in a thumbnail [px]
@@ -51,7 +51,7 @@ async function deleteObject(object) {
 
 function button(text, label, action) {
   const made = el("button", { type: "button", className: "plain", textContent: text, attributes: { "aria-label": `${text}: ${label}` } });
-  made.addEventListener("click", () => whileDisabled(made, () => tellFailure(action)));
+  made.addEventListener("click", () => act(made, action));
   return made;
 }
 
@@ -88,10 +88,10 @@ async function fetchNow(names) {
 
 /** Starts the job that fetches all objects and shows it. */
 export function fetchObjects(pressed) {
-  return whileDisabled(pressed, () => tellFailure(async () => {
+  return act(pressed, async () => {
     await fetchNow([]);
     showTab("objects");
-  }));
+  });
 }
 
 let drawn = ""; // what the tiles show: those that turn, or are about to be pressed, stay where nothing has changed

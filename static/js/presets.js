@@ -19,7 +19,7 @@ async function choose(preset, tile) {
     set("scene", { ...scene, is_current: true });
     takeGoal(goal);
     await refreshScenes();
-  });
+  }, tile);
   byId("preset-list").classList.remove("busy");
   tile.removeAttribute("aria-busy");
   isBusy = false;
@@ -53,7 +53,7 @@ export function setUpPresets() {
   const count = byId("table-count");
   const another = byId("another-table");
   another.addEventListener("click", () => {
-    if (count.reportValidity()) whileDisabled(another, () => anotherScene(count.valueAsNumber));
+    if (count.reportValidity()) whileDisabled(another, () => anotherScene(another, count.valueAsNumber));
   });
   // What is missing may have been fetched or trained by now.
   watch("objects", (objects) => { if (objects.length) refreshPresets(); });

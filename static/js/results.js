@@ -27,7 +27,7 @@ function busily(button, action) {
   const text = button.textContent;
   return whileDisabled(button, async () => {
     button.textContent = "One moment";
-    await tellFailure(action);
+    await tellFailure(action, button);
     button.textContent = text;
   });
 }

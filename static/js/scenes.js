@@ -1,8 +1,9 @@
 // New scenes and the list of those there are.
 import { getAll, post, remove } from "./api.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { byId, el } from "./dom.js";
+import { doubted } from "./doubt.js";
 import { current, set, watch } from "./state.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 
 const MOST_OBJECTS = 8;
 const form = () => byId("new-scene");
@@ -30,34 +31,32 @@ async function submit(event) {
     body.count = Number(fields.count.value);
   }
   if (fields["own-light"].checked && current()) body.light = { position: current().light.position };
-  return whileDisabled(form().querySelector("[type=submit]"), () => tellFailure(() => makeScene(body)));
+  return act(form().querySelector("[type=submit]"), () => makeScene(body));
 }
 
-/** Another random scene, with as many objects as this one if nothing else is said. */
-export function anotherScene(count = current()?.objects.length ?? Number(form().elements.count.value)) {
+/** Another random scene, with as many objects as this one if nothing else is said; `near` is what asks for it. */
+export function anotherScene(near = null, count = current()?.objects.length ?? Number(form().elements.count.value)) {
   const seed = randomSeed();
   form().elements.seed.value = seed;
-  return tellFailure(() => makeScene({ seed, count }));
+  return tellFailure(() => makeScene({ seed, count }), near);
 }
 
 export function resetScene() {
   const scene = current();
   if (!scene) return undefined;
-  return whileDisabled(byId("reset"), () =>
-    tellFailure(async () => set("scene", { ...(await post(`scenes/${scene.id}/reset`)), is_current: true })));
+  return act(byId("reset"), async () => set("scene", { ...(await post(`scenes/${scene.id}/reset`)), is_current: true }));
 }
 
 function entry(scene) {
   const show = el("button", { type: "button", className: "plain", textContent: "Show" });
-  show.addEventListener("click", () => whileDisabled(show, () => tellFailure(async () => {
+  show.addEventListener("click", () => act(show, async () => {
     set("scene", await post(`scenes/${scene.id}/activate`));
     await refreshScenes();
-  })));
-  const drop = el("button", { type: "button", className: "plain danger", textContent: "Delete" });
-  drop.addEventListener("click", () => whileDisabled(drop, () => tellFailure(async () => {
+  }));
+  const drop = doubted(el("button", { type: "button", className: "plain danger", textContent: "Delete" }), "Really delete", async () => {
     await remove(`scenes/${scene.id}`);
     await refreshScenes();
-  })));
+  });
   const names = scene.objects.map((object) => object.label).join(", ");
   const made = new Date(scene.created_at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   return el(

@@ -19,8 +19,10 @@ export const objects = () => state.objects;
 export const known = (what) => state[what];
 export const labelOf = (name) => state.objects.find((object) => object.name === name)?.label ?? name;
 
+const bare = /[\w.-]*\w/g; // a whole word, as names of objects are
+
 /** A sentence of the service with what people call the objects in place of their names. */
-export const inWords = (text) => state.objects.reduce((told, { name, label }) => told.replaceAll(name, label), text);
+export const inWords = (text) => text.replace(bare, (word) => (/[_\d]/.test(word) ? labelOf(word) : word));
 
 /** Calls `listener` now and whenever the value changes. */
 export function watch(what, listener) {

@@ -3,15 +3,16 @@ import { asked } from "./address.js";
 import { get, post } from "./api.js";
 import { drawLegend } from "./charts.js";
 import { COLOURS, svg } from "./curves.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
+import { closeShown } from "./episode-view.js";
 import { takeGoal } from "./goals.js";
 import { LIVE } from "./jobs.js";
 import { refreshObjects } from "./objects.js";
 import { refreshScenes } from "./scenes.js";
 import { known, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
-import { tellFailure, toast } from "./toasts.js";
+import { act, tellFailure, toast } from "./toasts.js";
 import { isViewerShown, pace, replayStory, showLive } from "./viewer.js";
 
 const TICK_MS = 80;
@@ -19,6 +20,7 @@ const LENGTH_S = 11; // of a story; its replay is played as much faster as that 
 const REST_S = 4; // at its end
 const ROUNDS = 2; // of all stories, then the last one rests: an open page at rest costs nothing
 const WAIT_MS = 300;
+const PATIENCE_MS = 30_000; // with a 3D view that does not open; then pictures and curve play alone
 const SEEN = "osf-story-seen";
 const [WIDTH, HEIGHT] = [300, 64];
 
@@ -65,7 +67,8 @@ function draw(at) {
   const { step_s: times } = story();
   const step = Math.max(times.filter((time) => time <= at).length - 1, 0);
   byId("story-now").style.transform = `translateY(${(-100 * step) / times.length}%)`;
-  byId("story-stage").textContent = stageAt(at, step);
+  const stage = stageAt(at, step);
+  if (byId("story-stage").textContent !== stage) byId("story-stage").textContent = stage; // it is read aloud
   drawCurve(at);
 }
 
@@ -83,7 +86,8 @@ function begin() {
 async function play() {
   clearInterval(timer);
   begin();
-  for (let isOpen = false; isOn && !isOpen; ) {
+  let isOpen = false;
+  for (const until = performance.now() + PATIENCE_MS; isOn && !isOpen && performance.now() < until; ) {
     isOpen = isViewerShown() && (await replayStory({ story: story().name, at_s: 0, plays: false, speed: 1 }));
     if (!isOpen) await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
   }
@@ -114,6 +118,7 @@ function show(on) {
 
 function open() {
   if (!stories.length || isOn) return;
+  closeShown(); // both would want the 3D view
   isOn = true;
   show(true);
   play();
@@ -148,9 +153,13 @@ async function runLive() {
     return toast(`${missing.map(labelOf).join(", ")} must be fetched first.`, "warning");
   }
   pace(true);
-  await layTable();
-  closeStory();
-  return startEpisode();
+  try {
+    await layTable();
+    closeStory();
+    await startEpisode();
+  } finally {
+    pace(LIVE.has(known("episode")?.state));
+  }
 }
 
 function usePhoto() {
@@ -172,7 +181,7 @@ const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("
 
 export async function setUpStory() {
   const run = byId("story-run");
-  run.addEventListener("click", () => whileDisabled(run, () => tellFailure(runLive)));
+  run.addEventListener("click", () => act(run, runLive));
   byId("story-photo").addEventListener("click", usePhoto);
   byId("story-lamp").addEventListener("click", moveLamp);
   byId("story-close").addEventListener("click", closeStory);
@@ -181,8 +190,18 @@ export async function setUpStory() {
     play();
   });
   byId("story-button").addEventListener("click", open);
+  // Whoever chooses another table or an episode wants to see that.
+  let table;
+  watch("scene", (scene) => {
+    if (scene && table && scene.id !== table) closeStory();
+    table = scene?.id ?? table;
+  });
   watch("opened", (opened) => { if (opened) closeStory(); });
-  watch("episode", () => { if (hasOtherPlans()) closeStory(); });
+  watch("report", (report) => { if (report) closeStory(); });
+  watch("episode", (job) => {
+    byId("story-button").disabled = LIVE.has(job?.state);
+    if (hasOtherPlans()) closeStory();
+  });
   const [answer] = await Promise.all([tellFailure(() => get("stories")), refreshObjects()]);
   // Those that can be run live come first.
   const answers = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");

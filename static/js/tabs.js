@@ -44,5 +44,9 @@ export function setUpTabs() {
 /** Scrolls the panel so that a card of it begins at its top; the page itself stays where it is. */
 export function scrollTo(card) {
   const panel = card.closest('[role="tabpanel"]');
+  if (getComputedStyle(panel).overflowY === "visible") { // on narrow screens the page scrolls
+    card.scrollIntoView({ block: "start" });
+    return;
+  }
   panel.scrollTop += card.getBoundingClientRect().top - panel.getBoundingClientRect().top;
 }

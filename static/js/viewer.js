@@ -30,6 +30,9 @@ export function showViewer() {
 
 export const isViewerShown = () => !byId("viewer").hidden;
 
+/** Whether the table that is pushed is the one on view. */
+export const isLiveShown = () => !replayed;
+
 const show = () => put(`views/${VISITOR}`, { replay: replayed, shows });
 const wish = new Newest(show);
 
@@ -74,7 +77,10 @@ export function pace(isBusy) {
 export function setUpViewer(listener) {
   onLive = listener;
   watch("episode", (job) => pace(LIVE.has(job?.state)));
-  byId("viewer").addEventListener("load", () => pace(LIVE.has(known("episode")?.state)));
+  byId("viewer").addEventListener("load", () => {
+    pace(LIVE.has(known("episode")?.state));
+    if (replayed || shows !== "meshes") wish.ask(); // a service that was started again does not know
+  });
   for (const what of ["episode", "estimate", "scene"]) watch(what, tellNothing);
   for (const radio of document.getElementsByName("shows")) {
     radio.addEventListener("change", () => {

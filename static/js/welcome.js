@@ -17,7 +17,7 @@ function draw() {
 
 export function setUpWelcome() {
   const button = byId("welcome-button");
-  button.addEventListener("click", () => (hasObjects() ? whileDisabled(button, anotherScene) : fetchObjects(button)));
+  button.addEventListener("click", () => (hasObjects() ? whileDisabled(button, () => anotherScene(button)) : fetchObjects(button)));
   watch("scene", draw);
   watch("objects", draw);
 }
