@@ -77,7 +77,8 @@ class MissingAssets(OsfError):
 
     def __init__(self, names: Iterable[str]) -> None:
         super().__init__(
-            f"The meshes of these objects are not on this machine: {_listed(names)}; get them with 'osf assets fetch'."
+            f"The meshes of these objects are not on this machine: {_listed(names)}; "
+            "fetch them under Objects on the page, or with 'osf assets fetch'."
         )
 
 

@@ -57,7 +57,7 @@ from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
-from app.services.visitors.driver import Driver
+from app.services.visitors.driver import GRACE_S, Driver
 from app.services.visitors.look_outlines import Outliner
 from app.storage.database import Store
 from app.storage.paths import static_folder
@@ -147,7 +147,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
         services = Services(
             settings, store, runner, viewer, objects, fields, neural, estimate_service, prediction_service,
-            goal_service, checks, Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish),
+            goal_service, checks, Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish, GRACE_S),
             OwnObjects(runner), thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()),
         )  # fmt: skip
         app.state.services = services

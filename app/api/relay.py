@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
+from collections.abc import Callable
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -21,7 +22,7 @@ from websockets.typing import Subprotocol
 from app.api.dependencies import Services, ServicesDep
 from app.api.guards.rate_limit import RateLimit
 from app.api.guards.security import is_same_origin
-from app.api.guards.viewer_messages import BURST, RATE, is_allowed
+from app.api.guards.viewer_messages import BURST, CAMERA, DROP, RATE, allowed_kind
 from app.api.schemas.limits import NAME, VISITOR, sized
 from app.viewer.private_server import PAGE_HEADER, SECRET_HEADER
 from osfcore.errors import shown
@@ -82,10 +83,10 @@ async def relay_of_page(
     browser: WebSocket, services: ServicesDep, visitor: Annotated[str, Path(**sized(NAME), pattern=f"^{VISITOR}$")]
 ) -> None:
     """Likewise, telling the viewer in which page the browser shows it."""
-    await _relay(browser, services, {PAGE_HEADER: visitor})
+    await _relay(browser, services, {PAGE_HEADER: visitor}, visitor)
 
 
-async def _relay(browser: WebSocket, services: Services, headers: dict[str, str]) -> None:
+async def _relay(browser: WebSocket, services: Services, headers: dict[str, str], visitor: str | None = None) -> None:
     if not is_same_origin(browser, services.settings.allowed_origins):
         await browser.close(code=1008)  # before accepting: the browser sees 403
         return
@@ -107,12 +108,23 @@ async def _relay(browser: WebSocket, services: Services, headers: dict[str, str]
         return
     async with upstream:
         await browser.accept(subprotocol=upstream.subprotocol)
-        await _pump_both(browser, upstream)
+        await _pump_both(browser, upstream, lambda frame: _may_pass(frame, services, visitor))
 
 
-async def _pump_both(browser: WebSocket, upstream: ClientConnection) -> None:
+def _may_pass(frame: bytes, services: Services, visitor: str | None) -> bool:
+    """Whether a message goes on to the viewer; a page that only watches moves nothing but its camera."""
+    kind = allowed_kind(frame)
+    if kind in (None, CAMERA) or services.driver.may_drive(visitor):
+        return kind is not None
+    if kind == DROP:
+        services.viewer.put_handles_back()
+    return False
+
+
+async def _pump_both(browser: WebSocket, upstream: ClientConnection, may_pass: Callable[[bytes], bool]) -> None:
     """Relay until either end closes, then end the other direction as well and close both."""
-    pumps = [asyncio.create_task(_to_viewer(browser, upstream)), asyncio.create_task(_to_browser(browser, upstream))]
+    ways = _to_viewer(browser, upstream, may_pass), _to_browser(browser, upstream)
+    pumps = [asyncio.create_task(way) for way in ways]
     try:
         await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
     finally:
@@ -126,13 +138,13 @@ async def _pump_both(browser: WebSocket, upstream: ClientConnection) -> None:
             await browser.close(code if code in _PASSED_CLOSE_CODES else _INTERNAL_ERROR)
 
 
-async def _to_viewer(browser: WebSocket, upstream: ClientConnection) -> None:
+async def _to_viewer(browser: WebSocket, upstream: ClientConnection, may_pass: Callable[[bytes], bool]) -> None:
     """Pass on what the page may send; end with whoever sends too much."""
     limit = RateLimit(RATE, BURST)
     with contextlib.suppress(websockets.ConnectionClosed):
         while (message := await browser.receive())["type"] == "websocket.receive" and limit.take():
             frame = message.get("bytes")
-            if frame is not None and is_allowed(frame):
+            if frame is not None and may_pass(frame):
                 await upstream.send(frame)
 
 

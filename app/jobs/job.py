@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -23,42 +23,52 @@ Kind = Literal[
 ]
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files
+WORDS: Mapping[str, str] = {  # for people
+    "collect_pushes": "data collection", "collect_object": "data collection", "collect_table": "data collection",
+    "fetch_assets": "download of objects", "add_object": "new object", "train_field": "training",
+    "estimate": "estimate", "episode": "episode", "clip": "clip",
+}  # fmt: skip
 FINISHED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
+
+
+def in_words(job: Job) -> str:
+    """What a job is, for people."""
+    return WORDS.get(job.kind, "job")
 
 
 class WrongJobState(OsfError):
     """An order that does not fit the state that a job is in."""
 
     def __init__(self, job: Job, wanted: str) -> None:
-        super().__init__(f"Job {job.id} is {job.state}, so it cannot be {wanted}.")
+        super().__init__(f"This {in_words(job)} is {job.state}, so it cannot be {wanted}.")
 
 
 class TrainingAlready(OsfError):
     """A second order for a field that is being trained."""
 
-    def __init__(self, name: str, job: str) -> None:
-        super().__init__(f"Job {job} trains a field named {name} already; wait for it, cancel it or take another name.")
+    def __init__(self, name: str) -> None:
+        super().__init__(f"A field of {name} is being trained already; wait for it, cancel it or take another name.")
 
 
 class SetInUse(OsfError):
     """An image set that a job needs."""
 
-    def __init__(self, set_id: str, job: str) -> None:
-        super().__init__(f"Job {job} needs image set {set_id}; wait for it or cancel it first.")
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"A training of {job.params['name']} needs these images; wait for it or cancel it first.")
 
 
 class SceneNeeded(OsfError):
     """A scene that a job needs to go on, or to begin."""
 
-    def __init__(self, scene: str, job: Job) -> None:
-        super().__init__(f"Job {job.id} is {job.state} and needs scene {scene}; cancel it first.")
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"This table is needed by the {in_words(job)} that is {job.state}; cancel that first.")
 
 
 class WorkshopInUse(OsfError):
     """Files of a training that goes on, or waits."""
 
     def __init__(self, name: str, job: Job) -> None:
-        super().__init__(f"Job {job.id} is {job.state} and trains the field {name} from these files; cancel it first.")
+        super().__init__(f"The training of {name} that is {job.state} needs these files; cancel it first.")
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,11 +134,15 @@ class Jobs:
         """Where a job's outputs are."""
         return self._folders.folder(job)
 
-    def holder(self, scene: str) -> str | None:
+    def holder(self, scene: str) -> Job | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
         run = self._loop.run
         job = self._table[run.id] if run else None
-        return job.id if job and job.state == "running" and job.params.get("scene") == scene else None
+        return job if job and job.state == "running" and job.params.get("scene") == scene else None
+
+    def needs(self, scene: str) -> Job | None:
+        """A job that waits, runs or pauses and drives a scene, if there is one."""
+        return next((job for job in self.live() if job.params.get("scene") == scene), None)
 
     def inputs(self, job: str) -> Path:
         """Where a job's inputs are, if it was given any."""

@@ -13,7 +13,7 @@ DIMMED = 0.45
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """What is done to a scene's pictures; it lasts until the scene is put back or the simulation starts again.
+    """What is done to a scene's pictures, until its episode ends, it is put back, or the simulation starts again.
 
     Attributes:
         brightness: factor of all radiance, ambient light included, as a dimmed lamp in a dark room has it.
@@ -50,9 +50,9 @@ class Disturbances:
         self._of[scene] = then
         return then
 
-    def forget(self, scene: str) -> None:
-        """Back to what is there."""
-        self._of.pop(scene, None)
+    def forget(self, scene: str) -> bool:
+        """Back to what is there; tells whether that is another picture."""
+        return self._of.pop(scene, Disturbance()) != Disturbance()
 
     def apply(self, scene: str, observation: Observation) -> Observation:
         """An observation of a scene as its cameras see it."""

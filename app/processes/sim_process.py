@@ -38,6 +38,7 @@ from app.processes.messages.scene_messages import (
     TakeImage,
     TakeMask,
     TakeView,
+    UndoDisturbances,
     WatchFrames,
 )
 from app.processes.process_server import IsOvertaken, ProcessServer
@@ -154,6 +155,9 @@ class Simulation:
             case Disturb(scene, camera):
                 self._report(self._record(scene))  # new pictures are due
                 return self._disturbances.toggle(scene, camera)
+            case UndoDisturbances(scene):
+                if self._disturbances.forget(scene):
+                    self._report(self._record(scene))
             case TakeImage():
                 return image_png(self._world(command.id), command)
             case TakeView(scene, camera, pusher):

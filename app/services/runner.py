@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobChanged, JobEvent, SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse, check_params
+from app.jobs.job import (
+    Job,
+    JobChanged,
+    JobEvent,
+    SceneNeeded,
+    SetInUse,
+    TrainingAlready,
+    WorkshopInUse,
+    check_params,
+    in_words,
+)
 from app.jobs.job_process import JobProcess
 from app.jobs.registry import Jobs
 from app.jobs.standby import Standby
 from app.jobs.stored import check_stored
-from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene
+from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene, UndoDisturbances
 from app.services.event_hub import Notice
 from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes
@@ -79,8 +90,9 @@ class Runner(Scenes):
         self.storage.stop()
 
     def holder(self, scene: str) -> str | None:
-        """The job that drives a scene, if one does: then only that job may change it."""
-        return self.jobs.holder(scene)
+        """What drives a scene, in words, if a job does: then only that job may change it."""
+        job = self.jobs.holder(scene)
+        return None if job is None else in_words(job)
 
     @property
     def unwritten(self) -> int:
@@ -148,9 +160,8 @@ class Runner(Scenes):
             SceneNeeded: if a job that waits, runs or pauses drives it.
         """
         with self._ordering:
-            for job in self.jobs.live():
-                if job.params.get("scene") == scene:
-                    raise SceneNeeded(scene, job)
+            if (job := self.jobs.needs(scene)) is not None:
+                raise SceneNeeded(job)
             super().delete_scene(scene)
 
     def disturb(self, command: Disturb | EditScene) -> Any:  # noqa: ANN401  each command says what answers it
@@ -198,7 +209,7 @@ class Runner(Scenes):
             self.sets.get(set_id)
             for job in self.jobs.live("train_field"):
                 if job.params["source"]["set"] == set_id:
-                    raise SetInUse(set_id, job.id)
+                    raise SetInUse(job)
             self.sets.remove(set_id)
         self.storage.outdate()
 
@@ -233,13 +244,21 @@ class Runner(Scenes):
             self.sets.get(source["set"])
         for job in self.jobs.live("train_field"):
             if job.params["name"] == name:
-                raise TrainingAlready(name, job.id)
+                raise TrainingAlready(name)
 
     def _on_job(self, event: JobEvent) -> None:
         self.hub.publish(event)
-        if (
-            isinstance(event, JobChanged)
-            and event.job.kind in ("fetch_assets", "add_object")
-            and event.job.state == "done"
-        ):
-            self.ensure_demo_scene()
+        match event:
+            case JobChanged(_, Job(kind="fetch_assets" | "add_object", state="done")):
+                self.ensure_demo_scene()
+            case JobChanged(_, Job(kind="episode") as job) if job.is_finished:
+                # In the background: the jobs' thread must not wait for the simulation.
+                undo = self._undo_disturbances, (job.params["scene"],)
+                threading.Thread(target=undo[0], args=undo[1], name="undo-disturbances", daemon=True).start()
+            case _:
+                pass
+
+    def _undo_disturbances(self, scene: str) -> None:
+        """What was done to fool an episode ends with it, or the next one would begin in the dark."""
+        with contextlib.suppress(OsfError):  # the scene may be gone, and the simulation just starting again
+            self._simulation.call(UndoDisturbances(scene))

@@ -51,15 +51,15 @@ _LOST = "The simulation stopped unexpectedly and is being restarted."
 class SceneHeld(OsfError):
     """A job drives the scene, so hands have to stay off."""
 
-    def __init__(self, scene: str, job: str) -> None:
-        super().__init__(f"Job {job} is using scene {scene}; pause or cancel it first.")
+    def __init__(self, by: str) -> None:
+        super().__init__(f"The {by} that runs is using this table; pause or cancel it first.")
 
 
 class TooManyScenes(OsfError):
     """No more scenes are kept."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"There are {limit} scenes already, which is the most; delete one first.")
+        super().__init__(f"There are {limit} tables already, which is the most; delete one under Scenes first.")
 
 
 class Scenes:
@@ -317,9 +317,9 @@ class Scenes:
             raise MissingAssets([name])
 
     def _check_free(self, scene: str) -> None:
-        job = self.holder(scene)
-        if job is not None:
-            raise SceneHeld(scene, job)
+        by = self.holder(scene)
+        if by is not None:
+            raise SceneHeld(by)
 
     def _greeting(self) -> list[Command]:
         with self._lock:

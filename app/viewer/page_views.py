@@ -115,7 +115,7 @@ class PageViews(Panel):
         self._library = library
         self._page_of = page_of
         self._live = live
-        self.neural = NeuralPanel(link, self.seen, fields)
+        self.neural = NeuralPanel(link, self.seen, fields, lambda name: library.info(name).label)
         self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, but for what is drawn
 
     def ask(self, page: str, wish: Wish) -> bool:
@@ -129,7 +129,9 @@ class PageViews(Panel):
         with self._thread.changed:
             known = self._pages.setdefault(page, _Page())
             self._pages.move_to_end(page)
-            known.wish, known.since, known.is_due = wish, time.monotonic(), True
+            if wish.replay != known.wish.replay:  # else only another look at it is wanted: what plays goes on
+                known.since = time.monotonic()
+            known.wish, known.is_due = wish, True
             idle = [name for name, one in self._pages.items() if one.client is None]
             for name in idle[: max(len(self._pages) - _MOST_PAGES, 0)]:
                 del self._pages[name]

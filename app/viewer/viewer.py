@@ -123,6 +123,10 @@ class Viewer:
             self._server.stop()
         self._server = None
 
+    def put_handles_back(self) -> None:
+        """Show all handles where they were, in every browser: one was dragged by somebody who only watches."""
+        self._drawing.put_handles_back()
+
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
         """The panels, in the order of their folders."""
         library, table = self._runner.library, self._drawing

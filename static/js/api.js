@@ -1,8 +1,18 @@
 // REST calls. Every failure is an ApiError whose message is a sentence for a person.
 
+const CALLED = "osf-visitor";
+
+/** The name of before where the page is only loaded again: who drove goes on driving. A duplicated tab is another page. */
+function ownName() {
+  const kept = performance.getEntriesByType("navigation")[0]?.type === "reload" && sessionStorage.getItem(CALLED);
+  // Not crypto.randomUUID: browsers keep that for secure pages, and this one may come from another machine.
+  const name = kept || [...crypto.getRandomValues(new Uint8Array(12))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+  sessionStorage.setItem(CALLED, name);
+  return name;
+}
+
 // What this page calls itself; the service takes no changes from one that only watches.
-// Not crypto.randomUUID: browsers keep that for secure pages, and this one may come from another machine.
-export const VISITOR = [...crypto.getRandomValues(new Uint8Array(12))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+export const VISITOR = ownName();
 const SIGNED = { "X-OSF-Visitor": VISITOR };
 
 export class ApiError extends Error {
@@ -31,6 +41,7 @@ async function call(method, path, body) {
   } catch {
     throw new ApiError("The service cannot be reached.", 0);
   }
+  if (answer.status === 404) throw new ApiError("It is not there any more; somebody has deleted it.", 404);
   if (!answer.ok) throw new ApiError(await problemOf(answer), answer.status);
   return answer.status === 204 ? null : answer.json();
 }

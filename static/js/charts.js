@@ -26,12 +26,24 @@ function drawMark(plot) {
   ctx.restore();
 }
 
+function drop(node) {
+  const kept = charts.get(node);
+  kept?.resized.disconnect();
+  kept?.plot.destroy();
+  charts.delete(node);
+}
+
+/** Draws all charts again, in the colours of another theme. */
+export function redrawCharts() {
+  for (const node of document.querySelectorAll(".plot")) charts.get(node)?.plot.redraw();
+}
+
 /** The chart in an element, made anew when its curves are others; `isBars` gives bars half a step of room at either side. */
 function chartIn(node, series, unit, isBars) {
   const key = series.map(({ label }) => label).join();
   const kept = charts.get(node);
   if (kept?.key === key) return kept;
-  kept?.plot.destroy();
+  drop(node);
   const options = {
     width: Math.max(node.clientWidth, 100), height: HEIGHT, legend: { show: false }, cursor: { y: false, drag: { x: false } },
     padding: [10, 8, 0, 0],
@@ -44,9 +56,11 @@ function chartIn(node, series, unit, isBars) {
     hooks: { draw: [drawMark] },
   };
   node.replaceChildren();
-  const chart = { key, plot: new uPlot(options, [[]], node), at: -1 };
+  const plot = new uPlot(options, [[]], node);
+  const resized = new ResizeObserver(() => node.clientWidth && plot.setSize({ width: node.clientWidth, height: HEIGHT }));
+  const chart = { key, plot, resized, at: -1 };
   charts.set(node, chart);
-  new ResizeObserver(() => node.clientWidth && chart.plot.setSize({ width: node.clientWidth, height: HEIGHT })).observe(node);
+  resized.observe(node);
   return chart;
 }
 
@@ -72,8 +86,7 @@ export const drawLines = (node, series, options) => draw(node, series, options, 
 export const drawBars = (node, series, options) => draw(node, series, options, true);
 
 function empty(node, name) {
-  charts.get(node)?.plot.destroy();
-  charts.delete(node);
+  drop(node);
   node.replaceChildren(el("p", { className: "hint" }, "comes with the first steps"));
   node.setAttribute("aria-label", `${name}; no steps yet`);
 }

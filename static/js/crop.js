@@ -77,17 +77,24 @@ async function use() {
 }
 
 function setUpDrag(frame) {
-  let last = null;
+  const fingers = new Map(); // where each is
+  const apart = () => {
+    const [a, b] = [...fingers.values()];
+    return b ? Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY) : 1;
+  };
   frame.addEventListener("pointerdown", (event) => {
-    last = event;
+    fingers.set(event.pointerId, event);
     frame.setPointerCapture(event.pointerId);
   });
   frame.addEventListener("pointermove", (event) => {
+    const last = fingers.get(event.pointerId);
     if (!last || !goal) return;
-    pan(event.clientX - last.clientX, event.clientY - last.clientY);
-    last = event;
+    const before = apart();
+    fingers.set(event.pointerId, event);
+    pan((event.clientX - last.clientX) / fingers.size, (event.clientY - last.clientY) / fingers.size);
+    if (fingers.size === 2) show({ width: (at.width * before) / Math.max(apart(), 1) }); // pinched
   });
-  for (const kind of ["pointerup", "pointercancel"]) frame.addEventListener(kind, () => { last = null; });
+  for (const kind of ["pointerup", "pointercancel"]) frame.addEventListener(kind, ({ pointerId }) => fingers.delete(pointerId));
   frame.addEventListener("wheel", (event) => {
     event.preventDefault();
     show({ width: at.width * Math.exp(event.deltaY * WHEEL) });

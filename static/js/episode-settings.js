@@ -8,11 +8,11 @@ import { tellFailure } from "./toasts.js";
 
 // The sliders span what makes sense; the numbers beside them take all that is allowed.
 const SLIDERS = [
-  { name: "horizon", label: "Horizon", title: "How far the plans look ahead, in actions of 0.2 s", low: 5, high: 80 },
+  { name: "horizon", label: "Horizon, actions", title: "How far the plans look ahead, in actions of 0.2 s", low: 5, high: 80 },
   { name: "samples", label: "Samples", title: "How many futures are predicted in each round", low: 16, high: 1024, isLog: true },
   { name: "temperature", label: "Temperature", title: "How much worse futures count: small keeps the best alone", low: 0.001, high: 1, isLog: true },
-  { name: "steps", label: "Steps", title: "Actions at most", low: 1, high: 100 },
-  { name: "replan_every", label: "Replan every", title: "Actions that are executed of each plan", low: 1, high: 10 },
+  { name: "steps", label: "Pushes at most", title: "Of 0.2 s each", low: 1, high: 100 },
+  { name: "replan_every", label: "Replan after, actions", title: "Actions that are executed of each plan", low: 1, high: 10 },
 ];
 const SWITCHES = ["planning", "acting", "despite_doubts"];
 const COSTS = {
@@ -64,7 +64,7 @@ function fill(settings) {
 function tell() {
   const { cost, samples, steps } = form().elements;
   byId("cost-hint").textContent = COSTS[cost.value];
-  byId("settings-facts").textContent = `${cost.value} cost, ${samples.value} samples, ${steps.value} steps`;
+  byId("settings-facts").textContent = `${cost.value} cost, ${samples.value} samples, ${steps.value} pushes`;
 }
 
 /** A change by hand: at once, where an episode runs. */

@@ -150,6 +150,7 @@ function drawStep(at) {
   byId("shown-likeness").title = step ? `PSNR and SSIM of goal image and rendered estimate; image cost ${step.image_cost.toPrecision(3)}` : "";
   const knowsTruth = shown.steps.some((other) => other.estimate_off_mm);
   byId("estimate-off-head").hidden = !knowsTruth;
+  byId("to-go-head").title = knowsTruth ? "True distance to where it should be, which only the simulation knows" : "Distance to where it should be, as estimated";
   byId("offset-rows").replaceChildren(...shown.objects.map((name) => {
     const far = step && (step.truly_to_goal_mm ?? step.to_goal_mm)[name];
     const cells = [far, step?.to_goal_deg[name], ...(knowsTruth ? [step?.estimate_off_mm?.[name]] : [])];

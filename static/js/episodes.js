@@ -101,6 +101,7 @@ const wanted = () => {
 };
 
 function draw() {
+  if (byId("episode-list").contains(document.activeElement) && document.activeElement.matches("input")) return; // a name is being written
   byId("no-episodes").hidden = all.length > 0;
   byId("no-episodes").textContent = Object.keys(wanted()).length ? "None like this." : "None yet. The first one begins with Start.";
   byId("episode-find").hidden = total <= FEW && !Object.keys(wanted()).length;
@@ -119,8 +120,10 @@ function take(answer, before) {
 
 export async function refreshEpisodes() {
   const limit = Math.min(Math.max(all.length, PAGE), MOST);
-  const answer = await tellFailure(() => get(`episodes?${new URLSearchParams({ limit, ...wanted() })}`));
-  if (answer) take(answer, []);
+  const query = new URLSearchParams({ limit, ...wanted() });
+  const answer = await tellFailure(() => get(`episodes?${query}`));
+  const isOvertaken = query.toString() !== new URLSearchParams({ limit, ...wanted() }).toString();
+  if (answer && !isOvertaken) take(answer, []);
 }
 
 async function showOlder() {

@@ -11,6 +11,7 @@ import { act, tellFailure, toast } from "./toasts.js";
 const PICTURE_MS = 700; // rendering takes time from the estimator
 const form = () => byId("new-estimate");
 const deg = (radians) => (radians * 180) / Math.PI;
+const SIGMAS = 2;
 const two = (value) => (value === null ? "any" : Number(value.toPrecision(2)).toString());
 const picture = new LatestImage(byId("estimate-image"));
 let shown = { id: "", state: "" };
@@ -125,8 +126,8 @@ function row(object, error) {
     "tr", { className: object.doubt ? "doubtful" : "" },
     el("td", {}, labelOf(object.name), object.doubt ? el("span", { className: "missing", textContent: `doubtful: ${object.doubt}` }) : null),
     el("td", { textContent: object.position.map((value) => (100 * value).toFixed(1)).join(", ") }),
-    el("td", { textContent: two(position === null ? null : 1000 * position) }),
-    el("td", { textContent: two(rotation === null ? null : deg(rotation)) }),
+    el("td", { textContent: two(position === null ? null : 1000 * SIGMAS * position) }),
+    el("td", { textContent: two(rotation === null ? null : deg(SIGMAS * rotation)) }),
     el("td", { className: "off" }, error ? `${two(error.position_mm)} mm` : "", error ? el("br") : null, error ? `${two(error.rotation_deg)}°` : ""),
   );
   item.dataset.object = object.name;
@@ -143,7 +144,7 @@ function lightRow(light, simulation) {
     el("td", { textContent: "Light" }),
     el("td", { textContent: `${azimuth.toFixed(0)}°, ${elevation.toFixed(0)}° up`, title: "azimuth and elevation" }),
     el("td", { textContent: "" }),
-    el("td", { textContent: two(deviation === null ? null : deg(deviation)) }),
+    el("td", { textContent: two(deviation === null ? null : deg(SIGMAS * deviation)) }),
     el("td", { className: "off", textContent: simulation ? `${two(simulation.light_deg)}°` : "" }),
   );
   item.dataset.object = "light";

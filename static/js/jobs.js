@@ -90,7 +90,7 @@ function outcome({ result }) {
 /** What was asked for, in one line. */
 function orderText({ kind, params: p }) {
   if (kind === "collect_pushes") return `${p.episodes} × ${p.steps} steps, ${p.objects} objects, ${p.policy} policy, seed ${p.seed}`;
-  if (kind === "fetch_assets") return p.names?.length ? p.names.join(", ") : "all from the package index";
+  if (kind === "fetch_assets") return p.names?.length ? p.names.map(labelOf).join(", ") : "all from the package index";
   if (kind === "add_object") return `from ${p.file_name}`;
   if (kind === "train_field") return `${p.minutes} min from ${p.source.mesh ? `${p.images} images of its mesh` : "an uploaded set"}, seed ${p.seed}`;
   if (kind === "clip") return `of ${p.title}`;
@@ -154,6 +154,10 @@ function draw(job, isOlder) {
     const made = new Date(job.created_at).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
     const head = el("span", { className: "title", textContent: titleText(job), title: `${job.id}, asked for ${made}` });
     const order = el("span", { className: "hint", textContent: orderText(job) });
+    node.say = () => {
+      head.textContent = titleText(job);
+      order.textContent = orderText(job);
+    };
     node.item = el("li", {}, head, order, node.bar, node.text, node.error, node.actions);
     node.item.dataset.job = job.id;
     nodes.set(job.id, node);
@@ -230,5 +234,11 @@ export function setUpJobs() {
   form.elements.kind.addEventListener("change", drawFields);
   const more = byId("more-jobs");
   more.addEventListener("click", () => act(more, showOlder));
-  watch("objects", drawFields);
+  let offered = "";
+  watch("objects", () => {
+    for (const node of nodes.values()) node.say(); // by the names that people use
+    const now = JSON.stringify(FIELDS.collect_object());
+    if (now !== offered) drawFields(); // else what was filled in stays
+    offered = now;
+  });
 }

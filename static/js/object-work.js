@@ -16,7 +16,7 @@ function endText(job) {
 function settle(job) {
   if (job.state !== "done") return;
   refreshObjects();
-  if (job.kind === "add_object") clearMesh();
+  if (job.kind === "add_object") clearMesh(job.params.file_name);
 }
 
 function draw(job) {

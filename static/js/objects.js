@@ -55,9 +55,15 @@ function button(text, label, action) {
   return made;
 }
 
+function fetchButton({ name, label }) {
+  const made = el("button", { type: "button", className: "plain", textContent: "Fetch", attributes: { "aria-label": `Fetch: ${label}` } });
+  made.addEventListener("click", () => fetchObjects(made, [name]));
+  return made;
+}
+
 function actions(object) {
   const { label } = object;
-  if (!object.available) return object.fetchable ? [button("Fetch", label, () => fetchNow([object.name]))] : [];
+  if (!object.available) return object.fetchable ? [fetchButton(object)] : [];
   const buttons = [button("Put on the table", label, () => putOnTable(object))];
   if (!(known("fields") ?? []).some((field) => field.name === object.name)) {
     buttons.push(button("Train its field", label, () => prepareTraining(object.name)));
@@ -82,15 +88,12 @@ export async function refreshObjects() {
   if (answer) set("objects", answer.objects);
 }
 
-async function fetchNow(names) {
-  showJob(await post("jobs", { kind: "fetch_assets", params: { names } }));
-}
-
-/** Starts the job that fetches all objects and shows it. */
-export function fetchObjects(pressed) {
+/** Fetches some objects, all for none, and shows how that goes; `pressed` is what was pressed for it. */
+export function fetchObjects(pressed, names = []) {
   return act(pressed, async () => {
-    await fetchNow([]);
+    showJob(await post("jobs", { kind: "fetch_assets", params: { names } }));
     showTab("objects");
+    scrollTo(byId("object-work"));
   });
 }
 

@@ -103,8 +103,9 @@ async function submit(event) {
   }
 }
 
-/** Empties the form once its object is there. */
-export function clearMesh() {
+/** Empties the form once the object of its file is there; by then it may hold the next one. */
+export function clearMesh(file) {
+  if (chosen && chosen.name !== file) return;
   form().reset();
   [chosen, size] = [null, null];
   byId("own-object-file-name").textContent = "or drop it anywhere";

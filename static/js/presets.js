@@ -1,9 +1,11 @@
 // Examples to begin with: one click lays the table and chooses the goal.
 import { get, post } from "./api.js";
 import { byId, el, whileDisabled } from "./dom.js";
+import { prepareTraining } from "./fields.js";
 import { takeGoal } from "./goals.js";
+import { fetchObjects } from "./objects.js";
 import { anotherScene, refreshScenes } from "./scenes.js";
-import { current, labelOf, set, watch } from "./state.js";
+import { current, labelOf, objects, set, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
 let isBusy = false;
@@ -25,6 +27,12 @@ async function choose(preset, tile) {
   isBusy = false;
 }
 
+/** What an example needs: its objects' meshes, else a field. */
+function getMissing(names, tile) {
+  const absent = objects().filter(({ name, available }) => names.includes(name) && !available).map(({ name }) => name);
+  return absent.length ? fetchObjects(tile, absent) : prepareTraining(names[0]);
+}
+
 function tile(preset) {
   const picture = preset.image
     ? el("img", { src: preset.image, alt: "", width: 112, height: 84 })
@@ -33,11 +41,11 @@ function tile(preset) {
     "button", { type: "button", title: preset.text }, picture,
     el("span", { className: "title", textContent: preset.title }),
     preset.missing?.length
-      ? el("span", { className: "missing", textContent: `needs ${preset.missing.map(labelOf).join(", ")}` })
+      ? el("span", { className: "missing", textContent: `Fetch ${preset.missing.map(labelOf).join(", ")} first` })
       : el("span", { className: "hint", textContent: preset.text }),
   );
   button.dataset.preset = preset.id;
-  button.addEventListener("click", () => choose(preset, button));
+  button.addEventListener("click", () => (preset.missing?.length ? getMissing(preset.missing, button) : choose(preset, button)));
   return el("li", {}, button);
 }
 

@@ -67,7 +67,7 @@ export function drawResults(episode, isOther) {
   byId("shown-actions").hidden = episode.steps.length === 0;
   byId("watch-video").hidden = !files.includes(VIDEO);
   byId("downloads").replaceChildren(...files.map((name) =>
-    el("a", { href: fileUrl(name), textContent: FILES[name] ?? name, download: `${episode.id}-${name}` })));
+    el("a", { href: fileUrl(name), textContent: FILES[name] ?? name, download: `${episode.name}-${name}` })));
 }
 
 export function setUpResults(step) {

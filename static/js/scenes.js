@@ -87,7 +87,7 @@ export function setUpScenes() {
   });
   byId("dice").addEventListener("click", () => { form().elements.seed.value = randomSeed(); });
   byId("reset").addEventListener("click", resetScene);
-  let shown;
+  let [shown, offered] = [undefined, ""];
   watch("scene", (scene) => {
     if (scene === undefined || (scene?.id ?? null) === shown) return;
     shown = scene?.id ?? null;
@@ -95,9 +95,11 @@ export function setUpScenes() {
   });
   watch("objects", (objects) => {
     const there = objects.filter((object) => object.available);
-    byId("chips").replaceChildren(...there.map((object) => el(
+    const names = there.map(({ name }) => name).join();
+    if (names !== offered) byId("chips").replaceChildren(...there.map((object) => el(
       "label", {}, el("input", { type: "checkbox", value: object.name }), el("span", { textContent: object.label }),
     )));
+    offered = names; // what was chosen stays while they are the same
     const { count } = form().elements;
     if (there.length) {
       count.max = Math.min(MOST_OBJECTS, there.length);

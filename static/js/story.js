@@ -150,7 +150,7 @@ async function runLive() {
   if (missing.length) {
     closeStory();
     showTab("objects");
-    return toast(`${missing.map(labelOf).join(", ")} must be fetched first.`, "warning");
+    return toast(`${missing.map(labelOf).join(", ")} must be fetched first: press Fetch beside them.`, "warning");
   }
   pace(true);
   try {

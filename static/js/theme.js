@@ -1,4 +1,5 @@
 // Dark or light: the system's choice until the person makes one.
+import { redrawCharts } from "./charts.js";
 import { byId } from "./dom.js";
 
 const system = matchMedia("(prefers-color-scheme: dark)");
@@ -10,6 +11,7 @@ function apply() {
   const dark = (localStorage.getItem(KEY) ?? (system.matches ? "dark" : "light")) === "dark";
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   byId("theme-button").textContent = dark ? "Light" : "Dark";
+  redrawCharts();
 }
 
 export function setUpTheme() {

@@ -18,30 +18,33 @@ _MOST_TEXT = 200
 _CAMERA = frozenset({
     "type", "wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction",
 })  # fmt: skip
+CAMERA, DROP = "ViewerCameraMessage", "TransformControlsDragEndMessage"
 _FIELDS: Mapping[str, frozenset[str]] = {
-    "ViewerCameraMessage": _CAMERA,
+    CAMERA: _CAMERA,
     "GuiUpdateMessage": frozenset({"type", "uuid", "updates"}),
     "TransformControlsUpdateMessage": frozenset({"type", "name", "wxyz", "position", "owner"}),
     "TransformControlsDragStartMessage": frozenset({"type", "name", "owner"}),
-    "TransformControlsDragEndMessage": frozenset({"type", "name", "owner"}),
+    DROP: frozenset({"type", "name", "owner"}),
 }
 
 
-def is_allowed(frame: bytes) -> bool:
-    """Whether a frame holds a message that the page sends, with the fields that it sends."""
+def allowed_kind(frame: bytes) -> str | None:
+    """The kind of message in a frame, if the page sends such with such fields; None if it may not pass."""
     if len(frame) > MAX_FRAME_BYTES:
-        return False
+        return None
     try:
         message = msgspec.msgpack.decode(frame, type=dict[str, Any])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return False
+        return None
     kind = message.get("type")
     if not isinstance(kind, str) or kind not in _FIELDS or not message.keys() <= _FIELDS[kind]:
-        return False
+        return None
     if kind == "GuiUpdateMessage":
         updates = message.get("updates")
-        return isinstance(updates, dict) and updates.keys() == {"value"} and _is_value(updates["value"])
-    return all(_is_plain(value) for value in message.values())
+        is_fine = isinstance(updates, dict) and updates.keys() == {"value"} and _is_value(updates["value"])
+    else:
+        is_fine = all(_is_plain(value) for value in message.values())
+    return kind if is_fine else None
 
 
 def _is_value(value: object) -> bool:

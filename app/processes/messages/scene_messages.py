@@ -98,6 +98,13 @@ class Disturb:
     camera: str | None  # None for the light
 
 
+@dataclass(frozen=True, slots=True)
+class UndoDisturbances:
+    """Back to the light and cameras as they are. Answered by None."""
+
+    id: str
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Act:
     """Hold each velocity [m/s] for one step. Answered by a SceneRecord."""
@@ -211,6 +218,7 @@ Command = (
     | EditScene
     | Act
     | Disturb
+    | UndoDisturbances
     | TakeImage
     | TakeView
     | TakeMask

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +11,7 @@ from app.processes.messages.scene_messages import SceneRecord
 from app.services.goals.goals import Goals
 from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord
-from osfcore.errors import UnknownName
+from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.light import Light
 
 
@@ -83,7 +84,7 @@ def preset(name: str) -> Preset:
 
 
 def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, GoalRecord]:
-    """Make a preset's table and its goal, and show them.
+    """Make a preset's table and its goal, or put back those that there are, and show them.
 
     Args:
         chosen: the preset.
@@ -93,6 +94,11 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     Raises:
         OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
     """
+    for goal in goals.all():
+        with contextlib.suppress(OsfError):  # in use, or deleted: then another one
+            if goal.example == chosen.id and goal.scene and not runner.jobs.needs(goal.scene):
+                runner.reset_scene(goal.scene)
+                return runner.activate(goal.scene), goal
     # Shown when all is there: the pages ask for its images then, and the goal's would wait behind them.
     scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
     try:

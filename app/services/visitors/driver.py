@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 from osfcore.errors import OsfError
 
+GRACE_S = 5.0  # how long a page takes at most to load again
+
 
 @dataclass(frozen=True, slots=True)
 class DriverChanged:
@@ -38,10 +40,11 @@ class Driver:
 
     Args:
         publish: told of every change.
+        grace_s: how long the wheel is kept for a driver whose page is gone [s].
     """
 
-    def __init__(self, publish: Callable[[DriverChanged], None]) -> None:
-        self._publish = publish
+    def __init__(self, publish: Callable[[DriverChanged], None], grace_s: float = 0.0) -> None:
+        self._publish, self._grace_s = publish, grace_s
         self._lock = threading.Lock()
         self._streams: Counter[str] = Counter()  # a page that reconnects has two for a moment
         self._driver: str | None = None
@@ -57,8 +60,12 @@ class Driver:
         Raises:
             NotDriving: if another page drives.
         """
-        if visitor is not None and self.now().driver not in (None, visitor):
+        if not self.may_drive(visitor):
             raise NotDriving
+
+    def may_drive(self, visitor: str | None) -> bool:
+        """Whether a page drives, or nobody does; programs, which have no name, always may."""
+        return visitor is None or self.now().driver in (None, visitor)
 
     def arrive(self, visitor: str) -> None:
         """A page has opened its stream; the first one drives."""
@@ -69,13 +76,27 @@ class Driver:
         self._publish(self.now())
 
     def leave(self, visitor: str) -> None:
-        """A stream of a page has ended; if it was the driver's last one, the page that came next drives."""
+        """A stream of a page has ended; if it was the driver's last one, the page that came next drives.
+
+        Not at once: a page that is loaded again, or lost its connection, is back in a moment.
+        """
         with self._lock:
             self._streams[visitor] -= 1
             if self._streams[visitor] <= 0:
                 del self._streams[visitor]
-                if self._driver not in self._streams:
-                    self._driver = next(iter(self._streams), None)
+            waits = self._driver is not None and self._driver not in self._streams and self._grace_s > 0
+        if waits:
+            timer = threading.Timer(self._grace_s, self._hand_over)
+            timer.daemon = True
+            timer.start()
+            self._publish(self.now())
+        else:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        with self._lock:
+            if self._driver not in self._streams:
+                self._driver = next(iter(self._streams), None)
         self._publish(self.now())
 
     def take(self, visitor: str) -> DriverChanged:

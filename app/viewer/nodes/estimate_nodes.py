@@ -200,7 +200,7 @@ class EstimateNodes:
             self._mark(name, doubt)
             self._add_bounds(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
         self._add_words(estimate)
-        within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}°"
+        within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}° ({_SIGMAS:.0f}σ)"
         self._show_light(estimate.state.light, None, f"estimated light {within}")
 
     def _mark(self, name: str, doubt: str) -> None:
@@ -214,7 +214,7 @@ class EstimateNodes:
         for n, name in enumerate(estimate.state.names):
             pose = estimate.state.poses[n]
             far_mm, turn_deg = 1000 * _SIGMAS * estimate.position_std[n], np.rad2deg(_SIGMAS * estimate.rotation_std[n])
-            text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}°"
+            text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}° ({_SIGMAS:.0f}σ)"
             text = f"DOUBTFUL: {estimate.doubts[n]}" if estimate.doubts[n] else text
             texts.append(text if name in standing else f"{self._label(name)}: {text}")
             anchors.append(pose.position + np.array([0, 0, top_m(self._meshes[name][0], pose.quaternion) + _LABEL_M]))

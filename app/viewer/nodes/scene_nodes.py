@@ -31,6 +31,7 @@ LIVE_NODES = (
 )  # fmt: skip
 LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
 LABEL_GAP_M = 0.01
+_NUDGE = 1e-7  # viser sends nothing that is as it was
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
@@ -189,6 +190,14 @@ class SceneNodes:
                 self._has_gizmos = is_on
                 for gizmo in self._gizmos.values():
                     gizmo.visible = is_on
+
+    def put_handles_back(self) -> None:
+        """Send where the handles are once more: a browser may have moved its own."""
+        with self._lock:
+            for handle in (self._light_gizmo, *self._gizmos.values()):
+                if handle is not None:
+                    handle.position = np.asarray(handle.position, float) + _NUDGE
+                    handle.wxyz = np.asarray(handle.wxyz, float) * (1 + _NUDGE)
 
     def _add_pusher(self) -> None:
         self._pusher = self._scene.add_cylinder(

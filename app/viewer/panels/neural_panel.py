@@ -1,4 +1,4 @@
-"""Neural renderings in the 3D view: a switch for each browser, and a thread that keeps its picture up to date."""
+"""Neural renderings in the 3D view: on or off for each browser, and a thread that keeps its picture up to date."""
 
 from __future__ import annotations
 
@@ -47,10 +47,15 @@ class _Answer:
 
 
 class ClientView:
-    """One browser: its switch, and the picture on view. All but the switch belongs to the thread of `NeuralPanel`."""
+    """One browser, and the picture on view. All but `is_on` belongs to the thread of `NeuralPanel`.
 
-    def __init__(self, client: viser.ClientHandle, on_switch: Callable[[], None]) -> None:
+    Attributes:
+        is_on: whether neural pictures are switched on.
+    """
+
+    def __init__(self, client: viser.ClientHandle) -> None:
         self.client = client
+        self.is_on = False
         self.refinement = Refinement()
         self.answers: list[_Answer] = []
         self.waiting_since: float | None = None  # for a first picture
@@ -58,21 +63,6 @@ class ClientView:
         self._waiting: viser.NotificationHandle | None = None
         self._meshes: tuple[str, ...] = ()
         self._is_clear = True
-        self._switch = client.gui.add_checkbox(
-            "Neural render", False, hint="Show what the trained fields look like from here, instead of the meshes."
-        )
-        self._note = client.gui.add_text("Still meshes", "", multiline=True, disabled=True, visible=False)
-        self._switch.on_update(lambda _: on_switch())
-
-    @property
-    def is_on(self) -> bool:
-        """Whether neural pictures are switched on."""
-        return bool(self._switch.value)
-
-    def switch(self, *, is_on: bool) -> None:
-        """Switch neural pictures on or off, as a hand would."""
-        if self.is_on != is_on:
-            self._switch.value = is_on
 
     def due_at(self) -> float | None:
         """When there is something to do; None if there is nothing."""
@@ -120,24 +110,23 @@ class ClientView:
 
     def refuse(self, reason: str) -> None:
         """Switch off, and say why."""
-        self._switch.value = False
+        self.is_on = False
         self.clear()
-        self.client.add_notification("No neural render", reason, color="orange", auto_close_seconds=10.0)
+        self.client.add_notification("No neural fields", reason, color="orange", auto_close_seconds=10.0)
 
     def tell_late(self, now: float) -> None:
         """Say that the renderer takes its time, if it does."""
         if self.waiting_since is not None and self._waiting is None and now >= self.waiting_since + _TELL_AFTER_S:
-            self._waiting = self.client.add_notification("Neural render", WARM_UP, loading=True)
+            self._waiting = self.client.add_notification("Neural fields", WARM_UP, loading=True)
 
     def tell_meshes(self, names: tuple[str, ...]) -> None:
         """Say which objects have no field."""
         if names == self._meshes:
             return
         self._meshes = names
-        self._note.value, self._note.visible = ", ".join(names), bool(names)
         if names:
             text = f"Without a field, so still shown as meshes: {', '.join(names)}. Fields are trained under Fields."
-            self.client.add_notification("Neural render", text, auto_close_seconds=8.0)
+            self.client.add_notification("Neural fields", text, auto_close_seconds=8.0)
 
     def _stop_waiting(self) -> None:
         self.waiting_since = None
@@ -160,18 +149,22 @@ class NeuralPanel(Panel):
         link: to the renderer.
         seen: what a browser, named by its number, shows now, and the root of its nodes.
         fields: names of the objects that have one.
+        label: what people call an object.
     """
 
-    def __init__(self, link: ProcessClient, seen: Seen, fields: Callable[[], Collection[str]]) -> None:
+    def __init__(
+        self, link: ProcessClient, seen: Seen, fields: Callable[[], Collection[str]], label: Callable[[str], str] = str
+    ) -> None:
         super().__init__("neural-panel")
+        self._label = label
         self._link = link
         self._seen = seen
         self._fields = fields
         self._views: dict[int, ClientView] = {}  # guarded by `_thread.changed`, with what belongs to them
 
     def add_client(self, client: viser.ClientHandle) -> None:
-        """Give a new browser the switch."""
-        view = ClientView(client, lambda: self._moved(view))
+        """Look after a new browser."""
+        view = ClientView(client)
         client.camera.on_update(lambda _: self._moved(view))
         with self._thread.changed:
             self._views[client.client_id] = view
@@ -185,8 +178,9 @@ class NeuralPanel(Panel):
         """Switch neural pictures on or off in one browser. Any thread may call."""
         with self._thread.changed:
             view = self._views.get(client)
-        if view is not None:
-            view.switch(is_on=is_on)
+            if view is not None and view.is_on != is_on:
+                view.is_on = is_on
+                self._moved(view)
 
     def view_moved(self, client: int) -> None:
         """What one browser shows has changed. Any thread may call."""
@@ -246,7 +240,7 @@ class NeuralPanel(Panel):
             with self._thread.changed:
                 view.refinement.give_up(ticket)
             return
-        view.tell_meshes(others)
+        view.tell_meshes(tuple(self._label(name) for name in others))
         if not self._link.is_warm and view.waiting_since is None:
             view.waiting_since = now
         order = DrawView(f"view-{view.client.client_id}", state, camera, step.is_sharp)

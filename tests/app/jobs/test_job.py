@@ -31,7 +31,8 @@ def test_files_have_to_be_the_jobs_own():
 
 
 def test_orders_that_do_not_fit_say_so():
-    assert str(WrongJobState(Job("a", "x", {}, "done"), "paused")) == "Job a is done, so it cannot be paused."
+    told = str(WrongJobState(Job("a", "train_field", {}, "done"), "paused"))
+    assert told == "This training is done, so it cannot be paused."
 
 
 @pytest.mark.parametrize("available", [0, 2])

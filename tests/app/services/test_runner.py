@@ -202,7 +202,9 @@ def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(o
     if state == "paused":
         runner.jobs.pause(busy.id)
         runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))  # hands may move things meanwhile
-    with pytest.raises(SceneNeeded, match=f"Job {needs.id} is {state} and needs scene {scene.id}; cancel it first"):
+    with pytest.raises(
+        SceneNeeded, match=f"needed by the data collection that is {state}; cancel that first"
+    ):
         runner.delete_scene(scene.id)
     assert runner.scene(scene.id).id == scene.id
     runner.jobs.cancel(needs.id)

@@ -99,7 +99,7 @@ def test_a_job_that_cannot_be_stored_is_not_answered_202(service, services):
 def test_a_finished_job_is_removed_for_good_and_a_live_one_is_not(service, services):
     busy = keep_busy(service)
     detail = is_problem(service.delete(f"/api/jobs/{busy}", params={"forget": True}), 409)["detail"]
-    assert detail == f"Job {busy} is paused, so it cannot be removed; cancel it first."
+    assert detail == "This data collection is paused, so it cannot be removed; cancel it first."
     service.delete(f"/api/jobs/{busy}")
     is_problem(service.delete(f"/api/jobs/{busy}"), 409)
     gone = service.delete(f"/api/jobs/{busy}", params={"forget": True})

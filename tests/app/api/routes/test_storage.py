@@ -48,7 +48,7 @@ def test_leftovers_that_a_waiting_training_goes_on_from_stay(service, left):
     (entry,) = (one for one in service.get("/api/storage/training").json()["leftovers"] if one["name"] == left)
     assert entry["job"] == job
     detail = is_problem(service.delete(f"/api/storage/training/{left}"), 409)["detail"]
-    assert detail == f"Job {job} is queued and trains the field {left} from these files; cancel it first."
+    assert detail == f"The training of {left} that is queued needs these files; cancel it first."
     for one in (job, busy):
         service.delete(f"/api/jobs/{one}")
 

@@ -126,7 +126,7 @@ def test_doubted_objects_are_drawn_in_another_colour_with_the_reason(drawing, dr
     texts = [node.text for node in verdicts(driver, "words")]
     assert texts[0] == "DOUBTFUL: it is hardly visible"
     assert texts[1].startswith("± 2 mm, ± 2.3")
-    assert driver.node("/estimate/light_name").text == "estimated light ± 1.1°"
+    assert driver.node("/estimate/light_name").text == "estimated light ± 1.1° (2σ)"
     drawing.show(step())  # another estimate begins: no verdict is left
     assert driver.below(f"/estimate/verdict/{BOX}") == set()
     np.testing.assert_array_equal(guess(driver).batched_colors, guess(driver, UNKNOWN).batched_colors)

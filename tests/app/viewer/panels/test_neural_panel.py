@@ -40,16 +40,8 @@ class Browser:
     def __init__(self):
         eye = Camera.look_at("eye", (0.9, -0.9, 0.9), (0, 0, 0)).T_world_camera
         self.camera = Node(position=eye.position, wxyz=eye.quaternion, fov=0.8, aspect=1.5, image_height=600)
-        self.gui = SimpleNamespace(
-            add_checkbox=lambda label, value, hint: self._made("switch", Node(value=value)),
-            add_text=lambda label, value, **_: self._made("note", Node(value=value, visible=False)),
-        )
         self.scene = SimpleNamespace(set_background_image=self._show, add_frame=self._hide)
         self.notifications, self.pictures, self.hidden = [], [], {}
-
-    def _made(self, name, node):
-        setattr(self, name, node)
-        return node
 
     def _show(self, image, format="auto", *, jpeg_quality=None, depth=None):
         self.pictures.append((image, depth))
@@ -66,10 +58,6 @@ class Browser:
 
     def hides(self):
         return {path for path, node in self.hidden.items() if not node.is_removed}
-
-    def turn(self, is_on):
-        self.switch.value = is_on
-        self.switch.update(None)
 
 
 class Renderer:
@@ -103,7 +91,7 @@ class Room:
         self.fields = {A, B}
         self.light = Light(np.array([0, 0, 1.0]))
         self.renderer = Renderer()
-        self.panel = NeuralPanel(self.renderer, lambda _: (self.state(), ""), lambda: self.fields)
+        self.panel = NeuralPanel(self.renderer, lambda _: (self.state(), ""), lambda: self.fields, "the {}".format)
 
     def state(self):
         poses = Pose(np.array([[0, 0, 0.1], [0.1, 0, 0.1]]), np.array([[1.0, 0, 0, 0]] * 2))
@@ -129,7 +117,7 @@ def browser(room):
 def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, browser):
     room.panel.scene_moved()
     assert room.renderer.orders == []  # nobody asked
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     orders = [room.renderer.answer(number) for number in range(3)]
     assert [order.camera.height for order in orders] == [112, 256, 480]
     assert [order.is_sharp for order in orders] == [False, True, True]
@@ -140,7 +128,7 @@ def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, br
     assert image.shape == (480, 720, 3)
     assert (depth == 100).all()  # a picture of nothing hides nothing
     assert browser.pictures[0][1] is None
-    browser.turn(False)
+    room.panel.switch(browser.client_id, is_on=False)
     until(lambda: browser.pictures[-1][0] is None)
     assert browser.hides() == set()
     assert len(room.renderer.orders) == 3
@@ -148,7 +136,7 @@ def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, br
 
 def test_meshes_stay_until_the_first_picture(room, browser):
     room.renderer.is_warm = False
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     until(lambda: browser.notifications)
     assert "loading" in browser.notifications[0].body
     assert browser.hides() == set()
@@ -158,7 +146,7 @@ def test_meshes_stay_until_the_first_picture(room, browser):
 
 
 def test_the_light_and_the_view_are_followed(room, browser):
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     room.renderer.answer(0)
     room.light = Light(np.array([1.0, 0, 0.5]))
     room.panel.scene_moved()
@@ -173,33 +161,31 @@ def test_the_light_and_the_view_are_followed(room, browser):
 
 def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
     room.fields = {B}
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     order = room.renderer.answer(0)
     assert order.state.names == (B,)
     np.testing.assert_allclose(order.state.poses.position, [[0.1, 0, 0.1]])
     until(lambda: browser.hides() == {"/table", "/pusher", "/shadows", f"/objects/{B}"})
-    assert browser.note.visible
-    assert browser.note.value == A
-    assert A in browser.notifications[0].body
+    assert f"the {A}" in browser.notifications[0].body
     room.fields = {A, B}  # it was trained meanwhile
     room.panel.scene_moved()
     room.renderer.answer(1)
     until(lambda: f"/objects/{A}" in browser.hides())
-    assert not browser.note.visible
 
 
 def test_where_the_renderer_fails_the_switch_goes_back_and_says_why(room, browser):
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     room.renderer.answer(0, ProcessUnavailable("neural renderer", "stopped unexpectedly"))
     until(lambda: browser.notifications)
     assert "stopped unexpectedly" in browser.notifications[0].body
-    assert browser.switch.value is False
     assert browser.hides() == set()
+    room.panel.scene_moved()
+    assert len(room.renderer.orders) == 1  # it is off
 
 
 def test_a_view_that_makes_no_sense_is_left_alone_until_it_does(room, browser):
     browser.camera.aspect = float("nan")
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     browser.camera.update(None)
     assert room.renderer.orders == []
     browser.camera.aspect = 1.0
@@ -209,13 +195,13 @@ def test_a_view_that_makes_no_sense_is_left_alone_until_it_does(room, browser):
 
 
 def test_who_left_gets_no_more_pictures(room, browser):
-    browser.turn(True)
+    room.panel.switch(browser.client_id, is_on=True)
     until(lambda: room.renderer.orders)
     room.panel.remove_client(browser)
     room.renderer.answer(0)
     other = Browser()
     room.panel.add_client(other)
-    other.turn(True)
+    room.panel.switch(other.client_id, is_on=True)
     room.renderer.answer(1)
     until(lambda: other.pictures)
     assert browser.pictures == []
