@@ -12,6 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
 
+from app.api.problems import too_large
 from app.api.schemas.common import Input
 
 JSON = "application/json"
@@ -58,7 +59,7 @@ async def whole_body(request: Request, max_bytes: int) -> bytes:
     async for chunk in request.stream():
         body += chunk
         if len(body) > max_bytes:
-            raise HTTPException(status.HTTP_413_CONTENT_TOO_LARGE, f"The request is larger than {max_bytes} bytes.")
+            raise HTTPException(status.HTTP_413_CONTENT_TOO_LARGE, too_large(max_bytes))
     return bytes(body)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,9 +23,10 @@ class TooManyStreams(OsfError):
 
 
 class EventTexts:
-    """The JSON of events; used by the event loop only."""
+    """The JSON of events. Any thread may call."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._kept: OrderedDict[int, tuple[object, str]] = OrderedDict()
         self._streams = 0
 
@@ -39,9 +41,10 @@ class EventTexts:
         if known is not None:
             return known[1]
         text = make().model_dump_json()
-        self._kept[id(source)] = source, text  # holding the source keeps its identity from being used again
-        if len(self._kept) > _KEPT:
-            self._kept.popitem(last=False)
+        with self._lock:
+            self._kept[id(source)] = source, text  # holding the source keeps its identity from being used again
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
         return text
 
     @contextmanager

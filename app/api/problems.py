@@ -117,6 +117,13 @@ def problem(
     return ProblemResponse(body.model_dump(exclude_none=True), status, headers)
 
 
+def too_large(most_bytes: int) -> str:
+    """That a request or file is larger than it may be."""
+    scale, unit = next((s, u) for s, u in ((1e6, "MB"), (1e3, "KB"), (1, "bytes")) if most_bytes >= s or s == 1)
+    most = f"{most_bytes / scale:.0f} {unit}"
+    return f"This is larger than {most}, which is the most; send something smaller."
+
+
 def status_of(error: OsfError) -> int:
     """The HTTP status that says what an error says."""
     return STATUS_OF_KIND.get(type(error).__name__, 422)

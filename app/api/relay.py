@@ -114,7 +114,7 @@ async def _relay(browser: WebSocket, services: Services, headers: dict[str, str]
 def _may_pass(frame: bytes, services: Services, visitor: str | None) -> bool:
     """Whether a message goes on to the viewer; a page that only watches moves nothing but its camera."""
     kind = allowed_kind(frame)
-    if kind in (None, CAMERA) or services.driver.may_drive(visitor):
+    if kind in (None, CAMERA) or services.driver.may_drive(visitor or ""):  # "" is the view without a page
         return kind is not None
     if kind == DROP:
         services.viewer.put_handles_back()

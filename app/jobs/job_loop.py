@@ -138,7 +138,7 @@ class JobLoop:
                 sync_tree(self._folders.folder(job.id))  # before anybody is told that it is there
         with self._changed:
             self.run = None
-            self._table.set(then)
+            self._table.set(replace(then, params=self._table[run.id].params))  # which may have changed meanwhile
             self._changed.notify_all()
 
     def _on_event(self, event: object) -> None:

@@ -28,7 +28,7 @@ class JobStopped(OsfError):
 class JobDied(OsfError):
     """The job's process ended without a word, or was frozen and ended."""
 
-    def __init__(self, what: str = "ended unexpectedly; it may have run out of memory") -> None:
+    def __init__(self, what: str = "ended unexpectedly; it may have run out of memory or time") -> None:
         super().__init__(f"The job's process {what}.")
 
 

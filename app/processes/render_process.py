@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from app.processes.messages.neural_messages import CheckPhoto, CompareView, Comparison, DrawnView, DrawView, Order
 from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.render_cameras import bands
-from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME, FieldLibrary
+from osfcore.fields.field_library import TABLE_NAME, FieldLibrary
 from osfcore.io.image_file import encode_png, to_uint8
 
 if TYPE_CHECKING:
@@ -135,15 +135,7 @@ class NeuralRenderer:
         return {name: self._fields.load(name) for name in names}
 
     def _key(self, names: tuple[str, ...]) -> object:
-        return names, *(self._stamp(name) for name in (*names, TABLE_NAME))
-
-    def _stamp(self, name: str) -> object:
-        """Changes when a field is trained, trained again or deleted; those that ship with the program stay."""
-        try:
-            status = (self._fields.folder(name) / FIELD_FILE).stat()
-        except OSError:
-            return None
-        return status.st_mtime_ns, status.st_size
+        return names, *(self._fields.stamp(name) for name in (*names, TABLE_NAME))
 
 
 def _decoded(png: bytes) -> UInt8[np.ndarray, "h w 3"]:

@@ -131,9 +131,15 @@ class EpisodeResults:
 
     def _made(self, job: Job, name: str) -> Path:
         path = self._folder(job) / name
-        if not path.is_file():
+        if not path.is_file() or (name == ARCHIVE_FILE and self._is_outdated(job, path)):
             self._make(job, path)
         return path
+
+    def _is_outdated(self, job: Job, archive: Path) -> bool:
+        """Whether something was made after the archive, such as a clip."""
+        made_at = archive.stat().st_mtime_ns
+        files = (self._folder(job) / name for name in self.files(job))
+        return any(file.is_file() and file.stat().st_mtime_ns > made_at for file in files)
 
     def _make(self, job: Job, path: Path) -> None:
         """What an episode has not left itself: all in one, or video and recording of one that was broken off."""

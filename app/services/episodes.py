@@ -179,9 +179,11 @@ class Episodes(EpisodeResults):
         words = search.casefold().split()
 
         def fits(job: Job) -> bool:
-            text = " ".join((self.name(job), *map(self._label, job.params["names"]))).casefold()
             ended = (job.result or {}).get("outcome")
-            return all(word in text for word in words) and outcome in (None, ended, job.state)
+            if outcome not in (None, ended, job.state):
+                return False
+            text = " ".join((self.name(job), *map(self._label, job.params["names"]))).casefold() if words else ""
+            return all(word in text for word in words)
 
         return self._runner.jobs.page(limit, before, KIND, fits)
 

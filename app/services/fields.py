@@ -58,6 +58,10 @@ class FieldCatalogue:
         """Objects with a field."""
         return self._library.names()
 
+    def stamp(self, name: str) -> object:
+        """Changes with the field."""
+        return self._library.stamp(name)
+
     def get(self, name: str) -> FieldInfo:
         """One field.
 

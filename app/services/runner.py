@@ -36,7 +36,7 @@ from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
 _PROBE_S = 5.0  # between two tries whether the disk takes something
-_RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
+RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
 
 
@@ -236,7 +236,7 @@ class Runner(Scenes):
 
     def _check_training(self, params: dict[str, Any]) -> None:
         name, source = check_name(params["name"]), params["source"]
-        if name in _RESERVED:
+        if name in RESERVED:
             raise InvalidInput("object name", repr(name), "another one; this one is taken")
         if source["mesh"] is not None:
             self._check_object(source["mesh"])
@@ -252,9 +252,10 @@ class Runner(Scenes):
             case JobChanged(_, Job(kind="fetch_assets" | "add_object", state="done")):
                 self.ensure_demo_scene()
             case JobChanged(_, Job(kind="episode") as job) if job.is_finished:
-                # In the background: the jobs' thread must not wait for the simulation.
-                undo = self._undo_disturbances, (job.params["scene"],)
-                threading.Thread(target=undo[0], args=undo[1], name="undo-disturbances", daemon=True).start()
+                scene = job.params["scene"]
+                if self.jobs.needs(scene) is None:
+                    # In the background: the jobs' thread must not wait for the simulation.
+                    threading.Thread(target=self._undo_disturbances, args=(scene,), daemon=True).start()
             case _:
                 pass
 

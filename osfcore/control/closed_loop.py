@@ -313,8 +313,8 @@ class Episode:
             text = "The table looks like the goal." if self._number else "The table looks like the goal already."
             return "reached", text
         if self._number >= self.settings.steps:
-            text = f"All {self._number} pushes are done; the farthest object is still {100 * far.max():.1f} cm away."
-            return "out of steps", text
+            where = f"{100 * far.max():.1f} cm away from its place and by {np.rad2deg(turned.max()):.0f}° turned"
+            return "out of steps", f"All {self._number} pushes are done; objects are up to {where}."
         return None
 
     def _stepped(self) -> Stepped:

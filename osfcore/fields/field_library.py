@@ -67,6 +67,16 @@ class FieldLibrary:
         self._trained = None if data_dir is None else data_dir / "fields"
         self._shipped = shipped or Path(str(files("osfcore.fields") / "shipped"))
 
+    def stamp(self, name: str) -> tuple[int, int] | None:
+        """Changes when a field is trained, trained again or deleted; None for those that ship with the program."""
+        if self._trained is None:
+            return None
+        try:
+            status = (self._trained / name / FIELD_FILE).stat()
+        except OSError:
+            return None
+        return status.st_mtime_ns, status.st_size
+
     def folder(self, name: str) -> Path:
         """Where a trained field of that name belongs.
 

@@ -14,7 +14,7 @@ from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.problems import problem
+from app.api.problems import problem, too_large
 
 _UNSAFE_METHODS = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 _COMMON = "object-src 'none'; base-uri 'none'; frame-ancestors 'self'; form-action 'self'"
@@ -122,7 +122,7 @@ class SecurityMiddleware:
                 return
             if message["type"] == "http.response.start" and message["status"] == 413:
                 is_too_large = True
-                detail = f"The request is larger than {self._limit_of(path)} bytes."
+                detail = too_large(self._limit_of(path))
                 await problem(413, detail)(scope, receive, send_with_headers)
                 return
             await send_with_headers(message)

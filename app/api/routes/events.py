@@ -87,10 +87,10 @@ class Mailbox:
                 self.draft = event
             case CurrentScene(record):
                 self._current = None if record is None else record.id
-                self.is_scene_new, self.frames = True, None
+                self.is_scene_new, self.frames, self.look = True, None, None
             case SceneChanged(record):
                 self.is_scene_new = self.is_scene_new or record.id == self._current
-            case JobView(_, Looking() as look):
+            case JobView(job, Looking() as look) if job.params.get("scene") in (None, self._current):
                 self.look = look
             case FramesTaken():
                 self.frames = event if event.scene == self._current else self.frames
@@ -174,7 +174,7 @@ async def _follow(
                 yield ServerSentEvent(event="frame", raw_data=text)
         if mailbox.look is not None and (now >= look_at or mailbox.look.step.estimate is not None):
             look, mailbox.look, look_at = mailbox.look, None, now + LOOK_INTERVAL_S
-            text = services.event_texts.of(look, partial(_look, services, look))
+            text = await run_in_threadpool(services.event_texts.of, look, partial(_look, services, look))
             yield ServerSentEvent(event="look", raw_data=text)
         mailbox.arrived.clear()
         due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)

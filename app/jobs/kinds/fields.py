@@ -6,6 +6,7 @@ The other new one is kept with the job, so that it can be used all the same.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.storage.field_files import clear_workshop, install, open_workshop
-from osfcore.errors import CannotWrite
+from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
 from osfcore.io.files import write_atomically
 from osfcore.io.image_file import write_png
@@ -97,7 +98,8 @@ def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep
     step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
     if name in FieldLibrary(place.data_dir).names():
         yield replace(step, note=_COMPARING)
-        step = _compared(step, name, data, shop, place)
+        with contextlib.suppress(CorruptFile):  # a damaged one is replaced
+            step = _compared(step, name, data, shop, place)
     in_use = step.before_mask is None or step.psnr_mask is None or step.psnr_mask >= step.before_mask
     if in_use:
         install(shop, place.data_dir / "fields" / name)
@@ -158,10 +160,10 @@ def _train(
         if step.preview is not None:
             write_png(preview, step.preview)
             previews += 1
-        share = 0.94 * step.progress.done / max(step.progress.total, 1)  # the rest is measuring
+        share = step.progress.done / max(step.progress.total, 1)  # of training; before it is carved, after it measured
         yield replace(
             begin,
-            done=begin.done + round(share * train_s),
+            done=begin.done + _CARVE_S + round(share * (train_s - _CARVE_S - _MEASURE_S * params["images"])),
             note=step.progress.note,
             psnr_full=step.psnr_full,
             psnr_mask=step.psnr_mask,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 UPLOAD = "mesh"  # in the inputs of the job
 _MEMORY_BYTES = 4 << 30  # 200,000 triangles with the largest texture take 2.5 GB
-_CPU_S = 600  # of all threads; the largest sound mesh takes two minutes
+_CPU_S = 300  # of all threads; the largest sound mesh takes two minutes
 _STEPS = 4
 _LIKELY_M = (0.03, 0.6)  # longest side of most things on a table
 _UNITS = ((1.0, "metres"), (0.01, "centimetres"), (0.001, "millimetres"))

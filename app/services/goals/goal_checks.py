@@ -113,7 +113,8 @@ class GoalChecks:
 
     def _content(self, goal: GoalRecord, table: SceneRecord) -> ContentCheck:
         with self._one_at_a_time:
-            key = (goal.id, goal.photo, table.state.names)
+            stamps = tuple(self._fields.stamp(name) for name in table.state.names)
+            key = (goal.id, goal.photo, table.state.names, stamps)
             if key not in self._found:
                 photo = self._goals.image(goal.id).read_bytes()
                 answer = self._link.call(CheckPhoto(uuid.uuid4().hex, table.state, goal.camera, photo))

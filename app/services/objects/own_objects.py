@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.jobs.job import Job
 from app.jobs.kinds.objects import UPLOAD, MeshRefused
-from app.services.runner import Runner
+from app.services.runner import RESERVED, Runner
 from app.storage.uploads import save
 from osfcore.errors import CorruptFile, OsfError
 from osfcore.objects.catalogue import CATALOGUE
@@ -95,7 +95,7 @@ class OwnObjects:
     def _check(self, new: NewObject) -> None:
         new.check()
         is_coming = any(job.params["object"]["name"] == new.name for job in self._runner.jobs.live(KIND))
-        if is_coming or (self._runner.library.root / new.name).exists():
+        if is_coming or new.name in RESERVED or (self._runner.library.root / new.name).exists():
             raise ObjectTaken(new.name)
 
     def _queue(self, new: NewObject, folder: Path, file_name: str) -> Job:

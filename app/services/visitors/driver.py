@@ -47,6 +47,7 @@ class Driver:
         self._publish, self._grace_s = publish, grace_s
         self._lock = threading.Lock()
         self._streams: Counter[str] = Counter()  # a page that reconnects has two for a moment
+        self._absent: set[str] = set()  # drivers who are waited for
         self._driver: str | None = None
 
     def now(self) -> DriverChanged:
@@ -70,9 +71,11 @@ class Driver:
     def arrive(self, visitor: str) -> None:
         """A page has opened its stream; the first one drives."""
         with self._lock:
+            is_waited_for = self._driver in self._absent and bool(self._streams)
             self._streams[visitor] += 1
-            if self._driver not in self._streams:  # nobody drives, or somebody who never opened a page
+            if self._driver not in self._streams and not is_waited_for:  # nobody, or somebody who never opened a page
                 self._driver = visitor
+            self._absent.discard(visitor)
         self._publish(self.now())
 
     def leave(self, visitor: str) -> None:
@@ -84,18 +87,22 @@ class Driver:
             self._streams[visitor] -= 1
             if self._streams[visitor] <= 0:
                 del self._streams[visitor]
-            waits = self._driver is not None and self._driver not in self._streams and self._grace_s > 0
+            waits = visitor == self._driver and visitor not in self._streams and self._grace_s > 0
+            if waits:
+                self._absent.add(visitor)
         if waits:
-            timer = threading.Timer(self._grace_s, self._hand_over)
+            timer = threading.Timer(self._grace_s, self._hand_over, (visitor,))
             timer.daemon = True
             timer.start()
             self._publish(self.now())
         else:
             self._hand_over()
 
-    def _hand_over(self) -> None:
+    def _hand_over(self, absent: str | None = None) -> None:
+        """Let the page that came first drive if the driver has none; one that was waited for no longer is."""
         with self._lock:
-            if self._driver not in self._streams:
+            self._absent.discard(absent or "")
+            if self._driver not in self._streams and self._driver not in self._absent:
                 self._driver = next(iter(self._streams), None)
         self._publish(self.now())
 

@@ -117,7 +117,7 @@ class Outliner:
             try:
                 parts = np.concatenate(self._library.load_geometry(name).parts).astype(float)
                 self._hulls[name] = parts[ConvexHull(parts).vertices]
-            except (OsfError, QhullError):  # recognised by its field, but its mesh is not on this machine
+            except (OsfError, QhullError):  # recognised by its field, but its mesh is not on this machine, or not yet
                 signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-                self._hulls[name] = _UNKNOWN_M / 2 * signs
+                return _UNKNOWN_M / 2 * signs
         return self._hulls[name]

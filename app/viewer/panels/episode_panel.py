@@ -132,6 +132,8 @@ class EpisodePanel(Panel):
     def _is_latest(self, job: Job) -> bool:
         """One that waits does not take the view from one that runs."""
         mine = self._state.job
+        if job.is_finished:  # else one that is renamed would take the place of what is drawn
+            return mine is not None and mine.id == job.id
         return mine is None or mine.id == job.id or job.state == "running" or not self._state.is_live
 
     # The panel

@@ -175,7 +175,7 @@ def test_a_scene_is_held_only_by_the_running_job_that_names_it(open_jobs):
     until(lambda: jobs.get(job.id).done > 0)
     assert jobs.holder("s") is None
     jobs.change(job.id, {"scene": "s"})
-    assert jobs.holder("s") == job.id
+    assert jobs.holder("s").id == job.id
     jobs.pause(job.id)
     assert jobs.holder("s") is None
 

@@ -3,6 +3,7 @@ import pytest
 
 from app.services.disturber import Disturber
 from osfcore.errors import UnknownName
+from tests.app.conftest import until
 
 OBJECTS = ["006_mustard_bottle", "005_tomato_soup_can"]
 
@@ -70,6 +71,17 @@ def test_putting_the_scene_back_ends_it(disturb, service, scene, services, tmp_p
     service.post(f"/api/scenes/{scene['id']}/reset")
     np.testing.assert_array_equal(seen(services, scene, tmp_path), before)
     assert "45 %" in disturb("dim light")["text"]  # not undone: it was over already
+
+
+def test_the_end_of_an_episode_ends_it(disturb, scene, services, tmp_path):
+    jobs = services.runner.jobs
+    before = seen(services, scene, tmp_path)
+    disturb("dim light")
+    episode = jobs.submit("episode", {"scene": scene["id"]})
+    jobs.cancel(episode.id)
+    until(lambda: np.array_equal(seen(services, scene, tmp_path), before))
+    until(lambda: jobs.get(episode.id).is_finished)
+    jobs.forget(episode.id)
 
 
 def test_what_does_not_exist_is_told(services, service, scene):

@@ -107,7 +107,7 @@ def test_a_dying_simulation_is_told_and_the_scenes_live_on(open_runner):
 def test_scenes_have_a_limit(open_runner):
     runner = open_runner(demo_scene=False, max_scenes=1)
     runner.create_scene(names=(BOX,))
-    with pytest.raises(TooManyScenes, match="1 scenes"):
+    with pytest.raises(TooManyScenes, match="1 tables"):
         runner.create_scene(names=(BOX,))
 
 
@@ -184,7 +184,7 @@ def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
         lambda: runner.reset_scene(scene.id),
         lambda: runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0]))),
     ):
-        with pytest.raises(SceneHeld, match=job.id):
+        with pytest.raises(SceneHeld, match="data collection that runs is using this table"):
             command()
 
 
@@ -202,9 +202,7 @@ def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(o
     if state == "paused":
         runner.jobs.pause(busy.id)
         runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))  # hands may move things meanwhile
-    with pytest.raises(
-        SceneNeeded, match=f"needed by the data collection that is {state}; cancel that first"
-    ):
+    with pytest.raises(SceneNeeded, match=f"needed by the data collection that is {state}; cancel that first"):
         runner.delete_scene(scene.id)
     assert runner.scene(scene.id).id == scene.id
     runner.jobs.cancel(needs.id)

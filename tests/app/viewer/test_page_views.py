@@ -1,5 +1,7 @@
 """Views of single pages, with browsers that speak viser's protocol through the relay."""
 
+import time
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from app.episodes.replay_clock import ReplayClock
 from app.episodes.trajectory import read_trajectory
 from app.services.examples.stories import Stories
 from tests.app.conftest import until
+from tests.app.viewer.conftest import uuid_of
 
 STORY = "first"
 CAMERA = {
@@ -42,6 +45,13 @@ class Page:
     def __exit__(self, *_):
         self._socket.close()
         until(lambda: self._number not in self._clients())
+
+    def send(self, frame):
+        self._socket.send(frame)
+
+    @property
+    def camera(self):
+        return self._clients()[self._number].camera
 
     def own(self, path):
         """A node that this browser alone sees; None if there is none."""
@@ -88,6 +98,40 @@ def test_it_plays_to_the_end_by_itself_faster_if_wanted(live, course):
         pusher = until(lambda: page.own("/replay/pusher"))
         until(lambda: np.allclose(pusher.position, course.states[-1].pusher, atol=1e-5))
         ask(live, "page")
+
+
+def test_what_plays_goes_on_when_something_else_of_it_is_looked_at(live, course):
+    end_s = ReplayClock(course).length_s
+    replay = {"story": STORY, "at_s": end_s - 8.0, "plays": True, "speed": 4.0}
+    with Page(live, "page") as page:
+        ask(live, "page", replay)
+        pusher = until(lambda: page.own("/replay/pusher"))
+        deadline = time.monotonic() + 10.0
+        while not np.allclose(pusher.position, course.states[-1].pusher, atol=1e-5):
+            assert time.monotonic() < deadline  # begun anew each time it would never come to its end
+            ask(live, "page", replay, shows="beliefs")
+            ask(live, "page", replay)
+            time.sleep(0.1)
+        ask(live, "page")
+
+
+def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live):
+    button = live.services.viewer.server.gui.add_checkbox("Test", False)
+    driver = live.services.driver
+    press = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid_of(button), "updates": {"value": True}})
+    try:
+        driver.arrive("drives")
+        with Page(live, "watches") as page:
+            page.send(press)
+            page.send(msgspec.msgpack.encode(CAMERA | {"position": [2.0, 2.0, 2.0]}))
+            until(lambda: np.allclose(page.camera.position, 2.0))
+            assert not button.value
+            driver.take("watches")
+            page.send(press)
+            until(lambda: button.value)
+    finally:
+        driver.leave("drives")
+        button.remove()
 
 
 def test_what_was_asked_for_is_shown_once_the_view_opens_and_again_after_a_reload(live, course):

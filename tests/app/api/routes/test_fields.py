@@ -63,9 +63,9 @@ def test_an_upload_may_be_larger_than_other_requests_but_not_without_end(library
     assert len(archive) > 10_000
     limits = {"max_body_bytes": 2000, "max_upload_bytes": 10_000}
     with running(library, tmp_path / "limits", **limits) as small:
-        assert "10000 bytes" in is_problem(upload(small, archive), 413)["detail"]
+        assert "10 KB" in is_problem(upload(small, archive), 413)["detail"]
         assert is_problem(upload(small, b"x" * 9_000), 422)["detail"].startswith("The uploaded file")
-        assert "2000 bytes" in is_problem(small.post("/api/jobs", content=b"x" * 3000), 413)["detail"]
+        assert "2 KB" in is_problem(small.post("/api/jobs", content=b"x" * 3000), 413)["detail"]
         assert list((tmp_path / "limits" / "sets").iterdir()) == []
 
 

@@ -72,6 +72,7 @@ class Service:
 
     def __init__(self, error=None):
         self.error, self.scenes, self.goals, self.shown = error, [], [], None
+        self.all = tuple  # no goal is there already
 
     def create_scene(self, **asked):
         self.scenes.append(asked)

@@ -51,8 +51,14 @@ class Link:
 
 
 class Fields:
+    def __init__(self):
+        self.trained = {}
+
     def names(self):
         return ("x", "y")
+
+    def stamp(self, name):
+        return self.trained.get(name)
 
 
 @pytest.fixture
@@ -73,8 +79,13 @@ def goals(tmp_path):
 
 
 @pytest.fixture
-def checks(goals, link):
-    return GoalChecks(Runner(), Fields(), goals, link, lambda: LABELS)
+def fields():
+    return Fields()
+
+
+@pytest.fixture
+def checks(goals, link, fields):
+    return GoalChecks(Runner(), fields, goals, link, lambda: LABELS)
 
 
 @pytest.mark.parametrize(
@@ -108,6 +119,13 @@ def test_a_photo_is_looked_at_once_until_it_is_cropped(checks, link, goals):
     assert (order.photo, order.state.names, order.camera.width) == (b"PNG", ("x", "y"), 64)
     goals.replace(replace(goals.get("photo"), photo=PhotoRecord(100, 80, PhotoCrop(10, 0, 80))), b"PNG")
     checks.check("photo")
+    assert len(link.asked) == 2
+
+
+def test_a_photo_is_looked_at_again_with_another_field(checks, link, fields):
+    checks.check("photo", "s")
+    fields.trained["x"] = 1
+    checks.check("photo", "s")
     assert len(link.asked) == 2
 
 

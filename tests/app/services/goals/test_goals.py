@@ -188,7 +188,7 @@ def test_a_random_layout_is_asked_for_by_seed(goals, runner):
     assert (command.seed, command.moved, command.poses, made.source) == (7, 2, (), "drawn")
 
 
-@pytest.mark.parametrize("error", [OVERLAP, SceneHeld("s", "j"), ProcessUnavailable("simulation", "died")])
+@pytest.mark.parametrize("error", [OVERLAP, SceneHeld("episode"), ProcessUnavailable("simulation", "died")])
 def test_a_goal_that_cannot_be_made_is_told_and_not_kept(goals, runner, error):
     runner.error = error
     for call in (
@@ -262,7 +262,7 @@ def test_a_problem_is_told_and_goes_with_its_cause(goals, runner):
 
 
 @pytest.mark.parametrize(
-    "error", [SceneHeld("s", "j"), ProcessUnavailable("simulation", "x"), InternalError("simulation", ValueError())]
+    "error", [SceneHeld("episode"), ProcessUnavailable("simulation", "x"), InternalError("simulation", ValueError())]
 )
 def test_what_is_not_the_hands_fault_is_raised_and_changes_nothing(goals, runner, error):
     begun = goals.begin_draft()

@@ -1,7 +1,10 @@
+import time
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from app.services.visitors.driver import Driver, DriverChanged
+from tests.app.conftest import until
 
 
 def test_the_first_page_drives_and_all_are_told():
@@ -32,6 +35,27 @@ def test_a_page_that_reconnects_keeps_the_wheel():
     assert driver.now().visitors == 2
     driver.leave("a")
     assert driver.now() == DriverChanged("a", 2)
+
+
+def test_a_driver_whose_page_loads_again_keeps_the_wheel_and_one_who_left_does_not():
+    driver = Driver(lambda _: None, grace_s=0.3)
+    for page in "ab":
+        driver.arrive(page)
+    driver.leave("a")
+    assert driver.now() == DriverChanged("a", 1)
+    driver.arrive("a")
+    time.sleep(0.5)
+    assert driver.now() == DriverChanged("a", 2)
+    driver.leave("a")
+    until(lambda: driver.now() == DriverChanged("b", 1))
+
+
+def test_whoever_does_not_drive_may_not_and_programs_always_may():
+    driver = Driver(lambda _: None)
+    assert driver.may_drive("a")
+    for page in "ab":
+        driver.arrive(page)
+    assert [driver.may_drive(who) for who in ("a", "b", None)] == [True, False, True]
 
 
 def test_anybody_may_take_over():

@@ -211,7 +211,7 @@ def test_what_somebody_else_does_at_the_same_time_is_not_taken_for_the_push(room
     assert not room.gui.shows("/push/true_ways")
 
 
-@pytest.mark.parametrize("refusal", [MissingFields(["my_thing"]), SceneHeld("s", "j")])
+@pytest.mark.parametrize("refusal", [MissingFields(["my_thing"]), SceneHeld("episode")])
 def test_refusals_are_told_to_who_asked_and_in_the_panel(room, refusal):
     room.predict()
     room.refusal = refusal

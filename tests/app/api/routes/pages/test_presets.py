@@ -38,12 +38,28 @@ def test_a_preset_becomes_the_scene_that_is_shown_and_its_goal(service, services
     assert (np.linalg.norm(here - there, axis=1) > 0.05).sum() == one.moved
 
 
-def test_the_same_preset_is_the_same_table_again(service, made):
-    again = service.post("/api/presets/pair").json()
+def check_same_tables(some, others):
     for part in ("scene", "goal"):
-        assert again[part]["id"] != made.json()[part]["id"]
-        for here, there in zip(again[part]["objects"], made.json()[part]["objects"], strict=True):
+        for here, there in zip(some[part]["objects"], others[part]["objects"], strict=True):
             np.testing.assert_allclose(here["position"], there["position"], atol=1e-6)
+
+
+def test_the_same_preset_is_its_table_put_back(service, services, made):
+    scene = made.json()["scene"]["id"]
+    service.patch(f"/api/scenes/{scene}", json={"light": {"position": [0, 0, 1]}})
+    again = service.post("/api/presets/pair").json()
+    assert [again[part]["id"] for part in ("scene", "goal")] == [scene, made.json()["goal"]["id"]]
+    np.testing.assert_allclose(again["scene"]["light"]["position"], preset("pair").light.position, atol=1e-9)
+    check_same_tables(again, made.json())
+    assert services.runner.current == scene
+
+
+def test_where_its_table_is_gone_it_is_made_anew(service, made):
+    service.delete(f"/api/scenes/{made.json()['scene']['id']}")
+    again = service.post("/api/presets/pair").json()
+    assert again["scene"]["id"] != made.json()["scene"]["id"]
+    check_same_tables(again, made.json())
+    for part in ("scene", "goal"):
         service.delete(f"/api/{part}s/{again[part]['id']}")
 
 
