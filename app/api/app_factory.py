@@ -49,13 +49,14 @@ from app.processes.render_process import renderer_main
 from app.services.disturber import Disturber
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
+from app.services.examples.presets import OPENING, preset
 from app.services.fields import FieldCatalogue
 from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
 from app.services.predictions import Predictions
-from app.services.runner import Runner
+from app.services.runner import DemoScene, Runner
 from app.services.service_settings import Settings
 from app.services.visitors.driver import GRACE_S, Driver
 from app.services.visitors.look_outlines import Outliner
@@ -123,7 +124,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     async with AsyncExitStack() as stack:
         store = await run_in_threadpool(Store, settings.data_dir, settings.max_stored_events)
         stack.push_async_callback(run_in_threadpool, store.close)
-        runner = Runner(settings, store, AssetLibrary(settings.data_dir / "objects"))
+        opening = preset(OPENING)
+        demo = DemoScene(opening.objects, opening.seed, opening.light)
+        runner = Runner(settings, store, AssetLibrary(settings.data_dir / "objects"), demo)
         stack.push_async_callback(run_in_threadpool, runner.stop)
         await run_in_threadpool(runner.start)
         neural = ProcessClient(renderer_main, (settings.data_dir,), "neural renderer")

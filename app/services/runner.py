@@ -6,6 +6,7 @@ import contextlib
 import logging
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from app.storage.database import Store
 from app.storage.field_files import Leftover, remove_workshop, sweep, workshops
 from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.geometry.light import Light
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
 _PROBE_S = 5.0  # between two tries whether the disk takes something
@@ -40,14 +42,36 @@ RESERVED = ("table", "sets")  # the table's own field, and a path of the REST in
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class DemoScene:
+    """The first scene of a new service.
+
+    Attributes:
+        names: of its objects.
+        seed: of where they lie.
+        light: on it.
+    """
+
+    names: tuple[str, ...]
+    seed: int
+    light: Light
+
+
 class Runner(Scenes):
     """Scenes, jobs and their events.
 
     Methods that wait for the simulation block; those that only read answer from memory. Any thread may call them.
+
+    Args:
+        settings: of the service.
+        store: keeps scenes and jobs.
+        library: meshes of the objects.
+        demo: the first scene, if its objects are there; else it is a random one.
     """
 
-    def __init__(self, settings: Settings, store: Store, library: AssetLibrary) -> None:
+    def __init__(self, settings: Settings, store: Store, library: AssetLibrary, demo: DemoScene | None = None) -> None:
         super().__init__(settings, store, library)
+        self._demo = demo
         self._standby = Standby() if settings.standby else None
         self.jobs = Jobs(
             store,
@@ -224,7 +248,10 @@ class Runner(Scenes):
 
     def _make_demo_scene(self, count: int) -> None:
         try:
-            self.create_scene(count=count, seed=0)
+            if self._demo is not None and all(map(self.library.has, self._demo.names)):
+                self.create_scene(names=self._demo.names, seed=self._demo.seed, light=self._demo.light)
+            else:
+                self.create_scene(count=count, seed=0)
         except OsfError as error:
             self.hub.publish(Notice("warning", f"No first scene could be made. {error}"))
 

@@ -1,5 +1,6 @@
 // Runs in the 3D view's frame before its client. Where no graphics card draws, pictures cost the processor that also
-// looks and plans: they come without smoothed edges and no faster than the page allows (`framesPerSecond`).
+// looks and plans: they come without smoothed edges, no faster than the page allows (`framesPerSecond`), and only while
+// something moves.
 (() => {
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
@@ -18,24 +19,58 @@
     };
   }
 
-  function limitFrameRate() {
+  // After the last thing that changed the view: pictures at the page's pace, for what eases out and loads; then a few
+  // more, for what takes longer; then none.
+  const [LIVELY_MS, SLOW_MS] = [1500, 10_000];
+  const SLOW_INTERVAL_MS = 1000;
+
+  /** Calls `wake` whenever the view may change: messages of the service come through a worker, hands by events. */
+  function watchChanges(wake) {
+    const Native = window.Worker;
+    window.Worker = class extends Native {
+      constructor(...args) {
+        super(...args);
+        this.addEventListener("message", wake);
+      }
+    };
+    const inputs = ["pointerdown", "pointermove", "pointerup", "wheel", "keydown", "keyup", "resize", "focus", "load"];
+    for (const kind of inputs) window.addEventListener(kind, wake, { capture: true, passive: true });
+    document.addEventListener("visibilitychange", wake);
+    new MutationObserver(wake).observe(document, { childList: true, subtree: true }); // the client's own panels
+  }
+
+  function limitFrames() {
     const natively = window.requestAnimationFrame.bind(window);
     let waiting = new Map();
-    let last = 0;
-    let id = 0;
+    let [last, changed, timer, id] = [0, performance.now(), 0, 0];
     const draw = (now) => {
       const due = waiting;
       waiting = new Map();
       last = now;
+      timer = 0;
       for (const callback of due.values()) callback(now);
     };
+    const plan = () => {
+      const now = performance.now();
+      if (timer || !waiting.size || now - changed > SLOW_MS) return;
+      const interval = now - changed < LIVELY_MS ? 1000 / window.framesPerSecond : SLOW_INTERVAL_MS;
+      timer = setTimeout(() => natively(draw), Math.max(last + interval - now, 0));
+    };
     window.requestAnimationFrame = (callback) => {
-      const rest = last + 1000 / window.framesPerSecond - performance.now();
-      if (!waiting.size) setTimeout(() => natively(draw), Math.max(rest, 0));
       waiting.set((id += 1), callback);
+      plan();
       return id;
     };
     window.cancelAnimationFrame = (number) => waiting.delete(number);
+    watchChanges(() => {
+      const rests = performance.now() - changed > LIVELY_MS;
+      changed = performance.now();
+      if (rests) { // a slow picture may be far off
+        clearTimeout(timer);
+        timer = 0;
+      }
+      plan();
+    });
   }
 
   /** The client's notice of this covers a corner of the table; what it warns of is seen to here. */
@@ -54,6 +89,6 @@
   window.framesPerSecond = 12;
   if (!SOFTWARE.test(rendererName())) return;
   dropSmoothing();
-  limitFrameRate();
+  limitFrames();
   closeNotice();
 })();

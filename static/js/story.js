@@ -13,7 +13,7 @@ import { refreshScenes } from "./scenes.js";
 import { known, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
-import { isViewerShown, pace, replayStory, showLive } from "./viewer.js";
+import { isViewerShown, paceAgain, paceForStart, replayStory, showLive } from "./viewer.js";
 
 const TICK_MS = 80;
 const LENGTH_S = 11; // of a story; its replay is played as much faster as that takes
@@ -152,13 +152,13 @@ async function runLive() {
     showTab("objects");
     return toast(`${missing.map(labelOf).join(", ")} must be fetched first: press Fetch beside them.`, "warning");
   }
-  pace(true);
+  paceForStart();
   try {
     await layTable();
     closeStory();
     await startEpisode();
   } finally {
-    pace(LIVE.has(known("episode")?.state));
+    paceAgain();
   }
 }
 

@@ -6,7 +6,7 @@ import { Newest } from "./newest.js";
 import { current, known, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
-const [FRAMES_PER_S, FRAMES_WHILE_BUSY] = [12, 2]; // of a view that no graphics card draws
+const FRAMES_PER_S = { rest: 12, start: 0.3, run: 2 }; // of a view that no graphics card draws: before the first push, and then
 
 let replayed = null; // what is replayed, as the service was told last
 let shows = "meshes";
@@ -69,16 +69,21 @@ export function showLive() {
 }
 
 /** A processor that also draws the view has more time for the search while there is one. */
-export function pace(isBusy) {
-  byId("viewer").contentWindow.framesPerSecond = isBusy ? FRAMES_WHILE_BUSY : FRAMES_PER_S;
+function pace(job) {
+  const phase = !LIVE.has(job?.state) ? "rest" : job.done ? "run" : "start";
+  byId("viewer").contentWindow.framesPerSecond = FRAMES_PER_S[phase];
 }
+
+/** An episode is about to begin. */
+export const paceForStart = () => pace({ state: "queued", done: 0 });
+export const paceAgain = () => pace(known("episode"));
 
 /** `listener` is told when somebody wants the live table back. */
 export function setUpViewer(listener) {
   onLive = listener;
-  watch("episode", (job) => pace(LIVE.has(job?.state)));
+  watch("episode", pace);
   byId("viewer").addEventListener("load", () => {
-    pace(LIVE.has(known("episode")?.state));
+    paceAgain();
     if (replayed || shows !== "meshes") wish.ask(); // a service that was started again does not know
   });
   for (const what of ["episode", "estimate", "scene"]) watch(what, tellNothing);

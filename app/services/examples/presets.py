@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from app.jobs.job import SceneNeeded
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.goals.goals import Goals
 from app.services.runner import Runner
@@ -71,6 +72,10 @@ PRESETS = (
 )  # fmt: skip
 
 
+OPENING = "three"  # with which the page opens, as a story and as the first table of a new service
+_SAME_RAD = 1e-6
+
+
 def preset(name: str) -> Preset:
     """One of them.
 
@@ -94,19 +99,34 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     Raises:
         OsfError: if an object is not on this machine, or there are too many scenes or goals; then neither is left.
     """
-    for goal in goals.all():
-        with contextlib.suppress(OsfError):  # in use, or deleted: then another one
-            if goal.example == chosen.id and goal.scene and not runner.jobs.needs(goal.scene):
-                runner.reset_scene(goal.scene)
-                return runner.activate(goal.scene), goal
+    for made in goals.all():
+        if made.example == chosen.id and made.scene:
+            with contextlib.suppress(OsfError):  # in use, or deleted: then another one
+                return _put_back(made.scene, runner), made
     # Shown when all is there: the pages ask for its images then, and the goal's would wait behind them.
-    scene = runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
+    scene = _table_of(chosen, runner)
     try:
         goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light, chosen.id)
     except BaseException:
         runner.delete_scene(scene.id)
         raise
     return runner.activate(scene.id), goal
+
+
+def _put_back(scene: str, runner: Runner) -> SceneRecord:
+    if (job := runner.jobs.needs(scene)) is not None:
+        raise SceneNeeded(job)
+    runner.reset_scene(scene)
+    return runner.activate(scene)
+
+
+def _table_of(chosen: Preset, runner: Runner) -> SceneRecord:
+    """The table of a preset, not touched yet: that which a new service begins with, or another one."""
+    for scene in runner.scenes():
+        is_same = (scene.seed, scene.state.names, scene.revision) == (chosen.seed, chosen.objects, 1)
+        if is_same and scene.state.light.angle_to(chosen.light) < _SAME_RAD and runner.jobs.needs(scene.id) is None:
+            return scene
+    return runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
 
 
 def _light(azimuth_deg: float, elevation_deg: float) -> Light:

@@ -13,7 +13,7 @@ import pytest
 from app.jobs.job import JobChanged, SceneNeeded, TrainingAlready
 from app.processes.messages.scene_messages import DropScene, SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
-from app.services.runner import Runner
+from app.services.runner import DemoScene, Runner
 from app.services.scenes import SceneHeld, TooManyScenes
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore, Store
@@ -39,11 +39,11 @@ def open_runner(data_dir):
             runner.stop()
             store.close()
 
-    def open_runner(**settings):
+    def open_runner(demo=None, **settings):
         close()
         settings = Settings(data_dir=data_dir, **settings)
         store = Store(data_dir)
-        runner = Runner(settings, store, AssetLibrary(data_dir / "objects"))
+        runner = Runner(settings, store, AssetLibrary(data_dir / "objects"), demo)
         opened.append((runner, store))
         runner.events = []
         runner.hub.subscribe(runner.events.append)
@@ -65,6 +65,19 @@ def test_the_first_start_shows_a_scene_by_itself(open_runner):
     (record,) = runner.scenes()
     assert (record.seed, len(record.state.names)) == (0, 3)
     until(lambda: any(isinstance(event, CurrentScene) for event in runner.events))
+
+
+def test_the_first_scene_is_the_one_that_is_wished_for_where_its_objects_are_there(open_runner, data_dir):
+    light = Light.from_angles(1.0, 0.5)
+    runner = open_runner(DemoScene((BOX,), 5, light))
+    until(lambda: runner.current is not None)
+    (record,) = runner.scenes()
+    assert (record.seed, record.state.names) == (5, (BOX,))
+    assert record.state.light.angle_to(light) < 1e-6
+    runner.delete_scene(record.id)
+    runner = open_runner(DemoScene((BOX, "nowhere"), 5, light))
+    until(lambda: runner.current is not None)
+    assert runner.scenes()[0].seed == 0
 
 
 def test_without_objects_there_is_no_scene_until_some_come(open_runner, data_dir, tmp_path):

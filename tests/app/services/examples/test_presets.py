@@ -71,11 +71,11 @@ class Service:
     """A runner and goals in one, of which one thing may fail."""
 
     def __init__(self, error=None):
-        self.error, self.scenes, self.goals, self.shown = error, [], [], None
-        self.all = tuple  # no goal is there already
+        self.error, self.made, self.goals, self.shown = error, [], [], None
+        self.all = self.scenes = tuple  # nothing is there already
 
     def create_scene(self, **asked):
-        self.scenes.append(asked)
+        self.made.append(asked)
         return record("s")
 
     def activate(self, scene):
@@ -85,7 +85,7 @@ class Service:
 
     def delete_scene(self, scene):
         assert scene == "s"
-        self.scenes.pop()
+        self.made.pop()
 
     def draw(self, *asked):
         if self.error is not None:
@@ -100,7 +100,7 @@ def test_a_preset_is_asked_for_as_it_is_described(one):
     scene, goal = set_up(one, service, service)
     assert (scene.id, goal) == ("s", "goal")
     assert service.shown == "s"
-    (asked,) = service.scenes
+    (asked,) = service.made
     assert not asked["is_shown"]
     assert (asked["names"], asked["seed"]) == (one.objects, one.seed)
     np.testing.assert_array_equal(asked["light"].direction, one.light.direction)
@@ -121,5 +121,5 @@ def test_without_its_goal_no_table_is_left(error):
     service = Service(error)
     with pytest.raises(type(error)):
         set_up(PRESETS[0], service, service)
-    assert service.scenes == []
+    assert service.made == []
     assert service.shown is None

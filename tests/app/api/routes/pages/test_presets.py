@@ -54,6 +54,18 @@ def test_the_same_preset_is_its_table_put_back(service, services, made):
     assert services.runner.current == scene
 
 
+def test_a_table_that_is_the_presets_already_becomes_its_own_until_it_is_touched(service, services):
+    one = preset("pair")
+    asked = {"objects": list(one.objects), "seed": one.seed, "light": {"position": one.light.position.tolist()}}
+    touched, fresh = (service.post("/api/scenes", json=asked).json()["id"] for _ in range(2))
+    service.patch(f"/api/scenes/{touched}", json={"light": {"position": [0, 0, 1]}})
+    made = service.post("/api/presets/pair").json()
+    assert made["scene"]["id"] == services.runner.current == fresh
+    service.delete(f"/api/goals/{made['goal']['id']}")
+    for scene in (touched, fresh):
+        service.delete(f"/api/scenes/{scene}")
+
+
 def test_where_its_table_is_gone_it_is_made_anew(service, made):
     service.delete(f"/api/scenes/{made.json()['scene']['id']}")
     again = service.post("/api/presets/pair").json()
