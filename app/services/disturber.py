@@ -15,12 +15,14 @@ from osfcore.errors import InvalidInput, OsfError, OverlappingObjects
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 
 Kind = Literal["turn lamp", "dim light", "nudge object", "cover camera"]
 _TURN_RAD = np.deg2rad((60.0, 150.0))
 _ELEVATION_RAD = np.deg2rad((25.0, 60.0))
 _NUDGE_M = (0.04, 0.07)
+_AT_PUSHER_M = 0.22
 _PLACES = 16  # that a nudged object tries
 
 
@@ -76,7 +78,9 @@ class Disturber:
 
     def _nudge(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         state = record.state
-        for name in self._rng.permutation(state.names):
+        # Those at the pusher last: what happens to them could be its doing, so that nothing of it is told.
+        names = sorted(self._rng.permutation(state.names), key=lambda name: self._is_at_pusher(state, str(name)))
+        for name in names:
             pose = state.pose(str(name))
             for _ in range(_PLACES):
                 angle, length = self._rng.uniform(-np.pi, np.pi), self._rng.uniform(*_NUDGE_M)
@@ -90,6 +94,11 @@ class Disturber:
                     continue
                 return moved, f"{name} was moved by {100 * length:.0f} cm."
         raise NoRoomToNudge
+
+    @staticmethod
+    def _is_at_pusher(state: SceneState, name: str) -> bool:
+        here = state.pusher
+        return here is not None and bool(np.linalg.norm(state.pose(name).position[:2] - here[:2]) < _AT_PUSHER_M)
 
     def _dim(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         brightness = self._toggle(record.id, None).brightness

@@ -194,12 +194,12 @@ class Episode:
         now = self._estimate.state
         angle = lamp_moved(before.state.light, now.light)
         if angle is not None:
-            yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f} deg; its new place is known.")
+            yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f}°: found again.")
         names = moved_by_hand(expected, now)
         if names:
             self._planner.reset()
             self._before = None
-            yield self._noticed("object", f"Somebody moved {', '.join(names)}; found again.", names)
+            yield self._noticed("object", f"Somebody moved {', '.join(names)}: found again.", names)
 
     def _find_lost(self) -> Iterator[Event]:
         """Look anew for what has been doubted for some time, once the pusher has made room."""

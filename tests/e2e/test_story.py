@@ -96,7 +96,7 @@ def test_it_runs_live_with_what_was_prepared_and_notices_a_turned_lamp(page, ser
     assert first["goal"] < 5
     page.click("#fool-turn", timeout=WAIT_MS)
     until(lambda: "You: The lamp was moved" in page.inner_text("#noticed-large"))
-    until(lambda: "its new place is known" in page.inner_text("#noticed-large"))
+    until(lambda: "found again" in page.inner_text("#noticed-large"))
     page.click("#run-cancel")
     page.wait_for_selector("#ending:not([hidden])", timeout=WAIT_MS)
     assert "push" in page.inner_text("#ending-sum")
