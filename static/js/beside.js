@@ -16,7 +16,7 @@ import { act, tellFailure, toast } from "./toasts.js";
 
 const MOST = 100; // that are offered
 const SETTINGS = {
-  cost: "Cost", horizon: "Horizon, actions", samples: "Samples", temperature: "Temperature", steps: "Steps at most",
+  cost: "Cost", horizon: "Horizon, actions", samples: "Samples", temperature: "Temperature", steps: "Pushes at most",
   replan_every: "Replan every, actions", planning: "Plan", acting: "Act", despite_doubts: "Despite doubts",
 };
 let mine = null;

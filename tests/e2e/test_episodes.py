@@ -132,7 +132,7 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     page.go_back()
     until(lambda: page.get_attribute("#tab-episode", "aria-selected") == "true")
     page.fill("#timeline", "2")
-    until(lambda: "step=2" in page.url)
+    until(lambda: "step=2" in page.evaluate("location.search"))
     page.reload()
     until(lambda: page.input_value("#timeline") == "2")
     page.wait_for_selector('#goal-image[alt^="Goal: how it should look"]', state="attached", timeout=WAIT_MS)
@@ -225,6 +225,8 @@ def test_one_of_two_visitors_drives(page, browser, service):
         controls = other.locator(f"#panel-{tab}").locator("button, input, select")
         assert controls.count() > 0
         assert set(controls.and_(other.locator(":enabled")).evaluate_all("found => found.map(e => e.id)")) <= LOOKING
+    for button in ("story-run", "welcome-button", "more-pushes", "make-clip"):
+        assert other.eval_on_selector(f"#{button}", "button => button.matches(':disabled')")
     assert service.call("GET", "driver")["visitors"] == 2
     take.click()
     page.get_by_role("button", name="Take over").wait_for(timeout=WAIT_MS)

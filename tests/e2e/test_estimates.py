@@ -143,14 +143,14 @@ def test_mistakes_are_told_in_words(page, folder, tmp_path):
     write_observation(tmp_path / "bare", replace(read_observation(folder), masks=None))
     (tmp_path / "bare.zip").write_bytes(zipped(tmp_path / "bare"))
     page.set_input_files("#observation-file", tmp_path / "bare.zip")
-    page.wait_for_selector(".error-toast:has-text('masks of the first frame is missing')", timeout=WAIT_MS)
+    page.wait_for_selector(".beside-cause:has-text('masks of the first frame is missing')", timeout=WAIT_MS)
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "photo.png").write_bytes(b"x")
     page.set_input_files("#observation-folder", tmp_path / "empty")
-    page.wait_for_selector(".error-toast:has-text('holds no observation.json')", timeout=WAIT_MS)
+    page.wait_for_selector(".beside-cause:has-text('holds no observation.json')", timeout=WAIT_MS)
     page.select_option('#new-estimate select[name="mode"]', "goal")
     page.set_input_files("#observation-file", tmp_path / "bare.zip")
-    page.wait_for_selector(".error-toast:has-text('number of views of a goal is 4')", timeout=WAIT_MS)
+    page.wait_for_selector(".beside-cause:has-text('number of views of a goal is 4')", timeout=WAIT_MS)
 
 
 def test_every_control_has_a_name(page):

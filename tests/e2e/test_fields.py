@@ -118,13 +118,14 @@ def test_mistakes_are_told_in_words(page, tmp_path):
     (folder / "train" / "r_3.png").unlink()
     (tmp_path / "egg.zip").write_bytes(zipped(folder))
     page.set_input_files("#set-file", tmp_path / "egg.zip")
-    page.wait_for_selector(".error-toast:has-text('r_3.png')", timeout=WAIT_MS)
+    page.wait_for_selector(".beside-cause:has-text('r_3.png')", timeout=WAIT_MS)
     (tmp_path / "good.zip").write_bytes(zipped(write_set(tmp_path / "good")))
     page.set_input_files("#set-file", tmp_path / "good.zip")
     page.wait_for_selector("#set-overlay", timeout=WAIT_MS)
+    assert page.locator(".beside-cause").count() == 0  # what was wrong is settled
     page.fill('#new-field input[name="name"]', "../My Egg")
     page.click("#new-field [type=submit]")
-    page.wait_for_selector(".error-toast:has-text('lower-case letters')", timeout=WAIT_MS)
+    page.wait_for_selector(".beside-cause:has-text('lower-case letters')", timeout=WAIT_MS)
 
 
 def test_a_training_can_be_cancelled_from_its_card(page):

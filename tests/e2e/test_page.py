@@ -309,7 +309,7 @@ def test_page_without_objects_says_what_to_do(browser, tmp_path):
         page.click("#tab-scenes")
         assert page.is_visible("#no-objects")
         page.click("#new-scene [type=submit]")
-        page.wait_for_selector(".error-toast", timeout=WAIT_MS)  # the service says why not
+        page.wait_for_selector(".beside-cause", timeout=WAIT_MS)  # the service says why not
         page.close()
 
 

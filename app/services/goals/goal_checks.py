@@ -10,7 +10,7 @@ from typing import Literal
 
 from app.processes.messages.neural_messages import CheckPhoto
 from app.processes.messages.scene_messages import SceneRecord
-from app.processes.process_client import ProcessClient
+from app.processes.process_client import ProcessClient, ProcessUnavailable
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals.goals import Goals, NoTable
 from app.services.runner import Runner
@@ -95,7 +95,10 @@ class GoalChecks:
         Raises:
             GoalRefused: if so; otherwise as `check`.
         """
-        check = self.check(goal, scene)
+        try:
+            check = self.check(goal, scene)
+        except ProcessUnavailable:  # the episode looks at the photo itself, and refuses what it does not explain
+            return
         if check.is_refused:
             raise GoalRefused(check.text)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from app.processes.messages.neural_messages import CheckPhoto
+from app.processes.process_client import ProcessUnavailable
 from app.services.fields import MissingFields
 from app.services.goals.goal_checks import GoalChecks, GoalRefused
 from app.services.goals.goals import NoTable
@@ -43,10 +44,12 @@ class Link:
     """Answers what it is told to, and remembers what it was asked."""
 
     def __init__(self):
-        self.asked, self.verdict = [], "shown"
+        self.asked, self.verdict, self.error = [], "shown", None
 
     def call(self, order):
         self.asked.append(order)
+        if self.error is not None:
+            raise self.error
         return ContentCheck(self.verdict)
 
 
@@ -127,6 +130,11 @@ def test_a_photo_is_looked_at_again_with_another_field(checks, link, fields):
     fields.trained["x"] = 1
     checks.check("photo", "s")
     assert len(link.asked) == 2
+
+
+def test_where_nothing_can_look_at_photos_the_episode_has_to(checks, link):
+    link.error = ProcessUnavailable("neural renderer", "stopped unexpectedly")
+    checks.require("photo", "s")
 
 
 def test_a_goal_made_here_is_known_without_looking(checks, link):
