@@ -11,7 +11,7 @@ import viser
 from jaxtyping import Float
 
 from app.processes.messages.scene_messages import SceneRecord
-from app.viewer.nodes.atomic import Target, atomic
+from app.viewer.nodes.atomic import Target, atomic, put
 from app.viewer.nodes.label_layout import Label, separated
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.room import colour_of
@@ -33,7 +33,6 @@ LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
 LABEL_GAP_M = 0.01
 _NUDGE = 1e-7  # viser sends nothing that is as it was
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
-_STILL = 1e-6  # poses that differ by less are not sent again
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
 
@@ -131,11 +130,11 @@ class SceneNodes:
                     self._place_object(name, state.pose(name))
             self._place_labels()
             if state.pusher is not None:
-                _put(self._pusher, state.pusher)
+                put(self._pusher, state.pusher)
             if not self._is_light_held:
                 self._place_light(state.light.position)
                 if self._light_gizmo is not None:
-                    _put(self._light_gizmo, AT * state.light.position)
+                    put(self._light_gizmo, AT * state.light.position)
             self._draw_shadows()
         self._on_change()
 
@@ -303,7 +302,7 @@ class SceneNodes:
     def _follow(self, name: str, pose: Pose) -> None:
         body = self._bodies.get(name)
         if body is not None:
-            _put(body, pose.position, pose.quaternion)
+            put(body, pose.position, pose.quaternion)
 
     def _place_labels(self) -> None:
         anchors = [self._anchor(name) for name in self._labels]
@@ -311,7 +310,7 @@ class SceneNodes:
             return
         texts = [label.text for label in self._labels.values()]
         for label, anchor in zip(self._labels.values(), separated(np.array(anchors), texts), strict=True):
-            _put(label, anchor)
+            put(label, anchor)
 
     def _anchor(self, name: str) -> Float[np.ndarray, "3"]:
         """Above the top of an object [m]."""
@@ -322,14 +321,14 @@ class SceneNodes:
     def _place_object(self, name: str, pose: Pose) -> None:
         self._follow(name, pose)
         if name in self._gizmos:
-            _put(self._gizmos[name], pose.position, NO_TURN)
+            put(self._gizmos[name], pose.position, NO_TURN)
 
     def _draw_shadows(self) -> None:
         if self._bodies:
             self._shadows.show(self.state())
 
     def _place_light(self, position: np.ndarray) -> None:
-        _put(self._lamp, position)
+        put(self._lamp, position)
         self._marker.place(position)
 
     def _show_marker(self) -> None:
@@ -349,10 +348,3 @@ def light_toward(position: np.ndarray) -> Light | None:
     x, y, z = position / np.linalg.norm(position)
     lowest_rad = float(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))
     return Light.from_angles(float(np.arctan2(y, x)), max(float(np.arcsin(np.clip(z, -1, 1))), lowest_rad))
-
-
-def _put(node: viser.SceneNodeHandle, position: np.ndarray, quaternion: np.ndarray | None = None) -> None:
-    if np.abs(np.asarray(node.position) - position).max() > _STILL:
-        node.position = np.asarray(position, float)
-    if quaternion is not None and np.abs(np.asarray(node.wxyz) - quaternion).max() > _STILL:
-        node.wxyz = np.asarray(quaternion, float)
