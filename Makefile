@@ -64,6 +64,7 @@ bench: dev
 	$(BIN)/python -m tests.bench.bench_world
 	$(BIN)/python -m tests.bench.bench_service
 	$(BIN)/python -m tests.bench.bench_episode
+	$(BIN)/python -m tests.bench.bench_page
 
 clean:
 	rm -rf $(VENV) .cache .pytest_cache .ruff_cache .hypothesis test-artifacts
