@@ -163,6 +163,8 @@ class Episode:
         if step is None:
             return (yield from self._run_estimator(look, steps))
         yield Looking(self._number, look, step)
+        what = "first frame" if look == "first" else "goal image"
+        yield self._noticed("prepared", f"The estimate of the {what} was prepared with this example.")
         return step.estimate
 
     def _check_objects(self, names: tuple[str, ...]) -> None:

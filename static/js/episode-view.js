@@ -25,6 +25,7 @@ let noting = 0;
 let isLive = true; // whether the 3D view is left on the live table
 
 const NOTE_MS = 300;
+const PREPARED = "What it found in table and photo was prepared with this example; from the first push on, all is live.";
 const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
 const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
 const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
@@ -106,8 +107,9 @@ function drawHead(episode) {
   byId("shown-title").title = episode.objects.map(labelOf).join(", ");
   byId("shown-outcome").textContent = text;
   byId("shown-outcome").dataset.state = state;
-  byId("shown-text").textContent = inWords(episode.text ?? "");
-  byId("shown-text").hidden = !episode.text;
+  const isPrepared = episode.notices.some(({ matter }) => matter === "prepared");
+  byId("shown-text").textContent = inWords(episode.text ?? "") || (isPrepared ? PREPARED : "");
+  byId("shown-text").hidden = !byId("shown-text").textContent;
   byId("shown-error").textContent = inWords(episode.error ?? "");
   byId("shown-error").hidden = !episode.error;
   byId("close-shown").hidden = LIVE.has(episode.status);

@@ -94,6 +94,7 @@ def test_it_runs_live_with_what_was_prepared_and_notices_a_turned_lamp(page, ser
     first = service.call("GET", f"episodes/{episode['id']}")["steps"][0]["seconds"]
     assert first["first"] < 5  # a look takes eleven
     assert first["goal"] < 5
+    until(lambda: "prepared with this example" in page.inner_text("#shown-text"))
     page.click("#fool-turn", timeout=WAIT_MS)
     until(lambda: "You: The lamp was moved" in page.inner_text("#noticed-large"))
     until(lambda: "found again" in page.inner_text("#noticed-large"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, Field
 
@@ -13,6 +13,7 @@ from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.services.episodes import AskedEpisode, flat
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
+from osfcore.control.events import Matter
 
 
 def _between(bounds: tuple[float, float], text: str) -> Any:  # noqa: ANN401  what pydantic's Field returns
@@ -117,7 +118,7 @@ class NoticeOut(BaseModel):
     """Something that was noticed on the way."""
 
     step: int
-    matter: str = Field(description='"goal", "lamp", "object", "lost", "found" or "stalled".')
+    matter: str = Field(description=f"One of {', '.join(get_args(Matter))}.")
     text: str
 
 

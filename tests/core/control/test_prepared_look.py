@@ -6,7 +6,7 @@ import pytest
 
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import GoalFound, Looking, Stepped
+from osfcore.control.events import GoalFound, Looking, Noticed, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.control.prepared_look import PreparedLook, PreparedLooks, prepared_from_json, prepared_to_json
 from osfcore.errors import InvalidInput
@@ -54,8 +54,10 @@ def test_an_episode_takes_what_fits_and_looks_itself_for_the_rest(world, goal, p
     pose = world.truth().pose(CAN)
     world.move_object(CAN, Pose(pose.position + [0.0, 0.05, 0.0], pose.quaternion))
     episode = Episode(world, KNOWN, goal, SMALL, np.random.default_rng(0), prepared=prepared)
-    looks = {"first": 0, "goal": 0, "next": 0}
+    looks, prepared_of = {"first": 0, "goal": 0, "next": 0}, []
     for event in episode.run():
+        if isinstance(event, Noticed) and event.matter == "prepared":
+            prepared_of.append(event.text)
         if isinstance(event, Looking):
             looks[event.look] += 1
         if isinstance(event, Stepped):
@@ -64,6 +66,7 @@ def test_an_episode_takes_what_fits_and_looks_itself_for_the_rest(world, goal, p
             np.testing.assert_allclose(event.goal.pose(CAN).position, pose.position, atol=1e-6)
     assert looks["first"] > 5
     assert looks["goal"] == 1
+    assert prepared_of == ["The estimate of the goal image was prepared with this example."]
     truth = world.truth()
     np.testing.assert_allclose(event.estimate.state.poses.position, truth.poses.position, atol=3e-3)
 
