@@ -76,8 +76,7 @@ def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[Train
 
 
 def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep]:
-    name, mesh = params["name"], params["source"]["mesh"]
-    images = params["images"]
+    name, mesh, images = params["name"], params["source"]["mesh"], _image_count(params, place)
     collect_s = _START_S + round(_TAKE_S * images) if mesh else _START_S
     train_s = _CARVE_S + max(1, round(60 * params["minutes"])) + round(_MEASURE_S * images)
     compare_s = round(_COMPARE_S * images) if name in FieldLibrary(place.data_dir).names() else 0
@@ -92,7 +91,8 @@ def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep
     step = replace(step, done=collect_s)
     if not (shop / METRICS_FILE).is_file():  # it is written last
         begin = step
-        for step in _train(params, data, shop / FIELD_FILE, place.folder / PREVIEW, begin, train_s):
+        files = data, shop / FIELD_FILE, place.folder / PREVIEW
+        for step in _train(params, files, begin, train_s - _CARVE_S - round(_MEASURE_S * images)):
             yield step
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
     step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
@@ -128,6 +128,13 @@ def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobC
     )
 
 
+def _image_count(params: dict[str, Any], place: JobContext) -> int:
+    """How many images are taken, or are in the uploaded set."""
+    if params["source"]["mesh"]:
+        return int(params["images"])
+    return len(list((place.data_dir / "sets" / params["source"]["set"] / "images").glob("*/*.png")))
+
+
 def _order(params: dict[str, Any], place: JobContext) -> dict[str, Any]:
     """What an earlier run must have been about for this one to go on from it: the same order of the same mesh."""
     mesh = params["source"]["mesh"]
@@ -149,11 +156,13 @@ def _collect(
 
 
 def _train(
-    params: dict[str, Any], data: Path, out: Path, preview: Path, begin: TrainingStep, train_s: int
+    params: dict[str, Any], files: tuple[Path, Path, Path], begin: TrainingStep, train_s: int
 ) -> Iterator[TrainingStep]:
+    """Train for about `train_s`; `files` are the images, the field and a preview of it."""
     from osfcore.fields.training.kiloosf_training import train_field
     from osfcore.fields.training.recipes import TrainField
 
+    data, out, preview = files
     config = TrainField(data, out, minutes=params["minutes"], seed=params["seed"], hollow=params["hollow"])
     previews = 0
     for step in train_field(config):
@@ -163,7 +172,7 @@ def _train(
         share = step.progress.done / max(step.progress.total, 1)  # of training; before it is carved, after it measured
         yield replace(
             begin,
-            done=begin.done + _CARVE_S + round(share * (train_s - _CARVE_S - _MEASURE_S * params["images"])),
+            done=begin.done + _CARVE_S + round(share * train_s),
             note=step.progress.note,
             psnr_full=step.psnr_full,
             psnr_mask=step.psnr_mask,
