@@ -10,7 +10,7 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -31,6 +31,7 @@ _TRACKED = f"/episode/estimate/{TRACKED}"
 _HIDDEN = {  # below the root of what is on view
     "meshes": (_TRACKED,), "fields": (_TRACKED,), "beliefs": ("/objects", "/shadows", "/names"),
 }  # fmt: skip
+_BY_PAGE = "page"
 Shows = Literal["meshes", "fields", "beliefs"]
 _MOST_PAGES = 200  # that are remembered; those that asked longest ago are forgotten
 _log = logging.getLogger(__name__)
@@ -75,7 +76,6 @@ class _Page:
         since: when it asked, by the monotonic clock [s].
         client: the browser's view, once it is open.
         nodes: that replay.
-        hidden: invisible nodes of the browser's own, in the places of those that it shall not see.
         shown: the file that they replay, and when it was last written.
         is_due: whether there is something to draw.
     """
@@ -84,7 +84,6 @@ class _Page:
     since: float = 0.0
     client: viser.ClientHandle | None = None
     nodes: ReplayNodes | None = None
-    hidden: dict[str, viser.SceneNodeHandle] = field(default_factory=dict)
     shown: tuple[Path, int] | None = None
     is_due: bool = False
 
@@ -145,7 +144,7 @@ class PageViews(Panel):
             return
         with self._thread.changed:
             known = self._pages.setdefault(page, _Page())
-            known.client, known.nodes, known.shown, known.hidden, known.is_due = client, None, None, {}, True
+            known.client, known.nodes, known.shown, known.is_due = client, None, None, True
             self._thread.wake()
 
     def remove_client(self, client: viser.ClientHandle) -> None:
@@ -154,7 +153,6 @@ class PageViews(Panel):
             for known in self._pages.values():
                 if known.client is client:
                     known.client = known.nodes = known.shown = None
-                    known.hidden = {}
 
     def seen(self, client: int) -> tuple[SceneState, str]:
         """What a browser shows now, and the root of its nodes. Any thread may call."""
@@ -190,7 +188,9 @@ class PageViews(Panel):
         elif page.nodes is not None:
             self._close(page)
         root = ROOT if wish.replay is not None else ""
-        self._hide(page, client, {f"{root}{path}" for path in _HIDDEN[wish.shows]})
+        hidden = self.neural.hidden(client.client_id)
+        if hidden is not None:
+            hidden.hide(_BY_PAGE, {f"{root}{path}" for path in _HIDDEN[wish.shows]})
         self.neural.switch(client.client_id, is_on=wish.shows == "fields")
         self.neural.view_moved(client.client_id)
 
@@ -207,18 +207,10 @@ class PageViews(Panel):
 
     @staticmethod
     def _close(page: _Page) -> None:
-        """Back to the live table; what was hidden below the replay goes with it."""
+        """Back to the live table."""
         if page.nodes is not None:
             page.nodes.remove()
-            page.hidden = {path: node for path, node in page.hidden.items() if not path.startswith(ROOT)}
         page.nodes = page.shown = None
-
-    @staticmethod
-    def _hide(page: _Page, client: viser.ClientHandle, paths: set[str]) -> None:
-        for path in set(page.hidden) - paths:
-            page.hidden.pop(path).remove()
-        for path in paths - set(page.hidden):
-            page.hidden[path] = client.scene.add_frame(path, show_axes=False, visible=False)
 
     def _opened(self, page: _Page, wish: Replay, client: viser.ClientHandle) -> ReplayNodes:
         """The nodes for a wish; an episode that goes on is read again once there is more of it."""

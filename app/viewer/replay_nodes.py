@@ -7,6 +7,7 @@ import viser
 from app.episodes.replay_clock import Moment, ReplayClock
 from app.episodes.trajectory import LookFrame, Round, Trajectory
 from app.viewer.nodes.episode_nodes import EpisodeNodes
+from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.nodes.scene_nodes import LIVE_NODES, SceneNodes
 from osfcore.control.events import Looking
 from osfcore.estimation.steps import EstimateStep
@@ -31,10 +32,12 @@ class ReplayNodes:
         self._client = client
         # Invisible nodes of a browser's own take the places of those that all browsers see, with all below them.
         self._hidden = [client.scene.add_frame(path, show_axes=False, visible=False) for path in LIVE_NODES]
-        self._root = client.scene.add_frame(ROOT, show_axes=False)
+        # What is hidden as a whole needs a node of its own.
+        self._root, *_ = (client.scene.add_frame(f"{ROOT}{path}", show_axes=False) for path in ("", "/objects"))
         self._table = SceneNodes(client, library, root=ROOT)
         self._table.show_names(is_on=False)
         self._episode = EpisodeNodes(client, library, self._table.names, root=f"{ROOT}/episode")
+        client.scene.add_frame(f"{ROOT}/episode/estimate/{TRACKED}", show_axes=False)
         self._table.begin(trajectory.states[0])
         self.follow(trajectory)
 

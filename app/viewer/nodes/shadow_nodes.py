@@ -46,13 +46,16 @@ class ShadowNodes:
     def __init__(self, scene: viser.SceneApi, library: AssetLibrary, path: str) -> None:
         self._library = library
         self._parts: dict[str, list[np.ndarray]] = {}
+        self._is_on = False
         self._node = scene.add_mesh_simple(
             path, *_NOTHING, side="double", visible=False, cast_shadow=False, receive_shadow=False
         )
 
     def show(self, state: SceneState | None) -> None:
         """Draw the shadows of a state, or none."""
-        self._node.visible = state is not None
+        if self._is_on != (state is not None):  # else it may be hidden, and stay so
+            self._is_on = not self._is_on
+            self._node.visible = self._is_on
         if state is None:
             return
         vertices, faces = shadow_mesh(self._bodies(state), state.light.position)

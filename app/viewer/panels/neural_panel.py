@@ -14,6 +14,7 @@ import viser
 from app.processes.messages.neural_messages import DrawnView, DrawView, NeuralAnswer
 from app.processes.process_client import ProcessClient
 from app.processes.render_cameras import view_camera
+from app.viewer.nodes.hidden_nodes import HiddenNodes
 from app.viewer.panels.panel import Panel
 from app.viewer.panels.refinement import STEPS, Refinement, RenderTicket
 from osfcore.errors import OsfError
@@ -25,6 +26,7 @@ _TELL_AFTER_S = 1.0
 _NOTHING_M = 100.0  # depth where a ray meets nothing
 _BEHIND_M = 0.003  # pictures lie that much farther away, so that what stands on the table is not half in it
 _JPEG_QUALITY = {False: 75, True: 92}  # by whether a picture is sharp
+_NEURAL = "neural pictures"
 _log = logging.getLogger(__name__)
 Seen = Callable[[int], tuple[SceneState, str]]
 
@@ -50,6 +52,7 @@ class ClientView:
     """One browser, and the picture on view. All but `is_on` belongs to the thread of `NeuralPanel`.
 
     Attributes:
+        hidden: what this browser does not see, for whatever reason.
         is_on: whether neural pictures are switched on.
     """
 
@@ -59,7 +62,7 @@ class ClientView:
         self.refinement = Refinement()
         self.answers: list[_Answer] = []
         self.waiting_since: float | None = None  # for a first picture
-        self._hidden: dict[str, viser.SceneNodeHandle] = {}
+        self.hidden = HiddenNodes(client)
         self._waiting: viser.NotificationHandle | None = None
         self._meshes: tuple[str, ...] = ()
         self._is_clear = True
@@ -96,13 +99,13 @@ class ClientView:
         self.client.scene.set_background_image(picture.image, "jpeg", jpeg_quality=quality, depth=depth)
         # Of a replay, which stands in place of the live table, the same nodes lie below its own.
         parts = ("/pusher", "/shadows", *(f"/objects/{name}" for name in names))
-        self._hide({"/table", *(f"{root}{part}" for part in parts)})
+        self.hidden.hide(_NEURAL, {"/table", *(f"{root}{part}" for part in parts)})
         self._stop_waiting()
         self._is_clear = False
 
     def clear(self) -> None:
         """Back to meshes."""
-        self._hide(set())
+        self.hidden.hide(_NEURAL, ())
         self.client.scene.set_background_image(None)
         self._stop_waiting()
         self.tell_meshes(())
@@ -133,13 +136,6 @@ class ClientView:
         if self._waiting is not None:
             self._waiting.remove()
             self._waiting = None
-
-    def _hide(self, paths: set[str]) -> None:
-        """Hide nodes in this browser alone: its own, invisible node of the same name takes their place."""
-        for path in set(self._hidden) - paths:
-            self._hidden.pop(path).remove()
-        for path in paths - set(self._hidden):
-            self._hidden[path] = self.client.scene.add_frame(path, show_axes=False, visible=False)
 
 
 class NeuralPanel(Panel):
@@ -173,6 +169,12 @@ class NeuralPanel(Panel):
         """Forget a browser that has left."""
         with self._thread.changed:
             self._views.pop(client.client_id, None)
+
+    def hidden(self, client: int) -> HiddenNodes | None:
+        """What one browser does not see; None once it has left. Any thread may call."""
+        with self._thread.changed:
+            view = self._views.get(client)
+        return None if view is None else view.hidden
 
     def switch(self, client: int, *, is_on: bool) -> None:
         """Switch neural pictures on or off in one browser. Any thread may call."""

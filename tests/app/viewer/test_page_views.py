@@ -100,6 +100,22 @@ def test_it_plays_to_the_end_by_itself_faster_if_wanted(live, course):
         ask(live, "page")
 
 
+def test_a_replay_shows_beliefs_alone_and_goes_on_with_meshes(live, course):
+    replay, name = {"story": STORY, "at_s": ReplayClock(course).step_s[0]}, f"/replay/objects/{course.names[0]}"
+    with Page(live, "page") as page:
+        ask(live, "page", replay)
+        body = until(lambda: page.own(name))
+        ask(live, "page", replay, shows="beliefs")
+        until(lambda: page.hides("/replay/objects") and page.hides("/replay/shadows"))
+        assert not page.hides("/replay/episode/estimate/tracked")
+        ask(live, "page", {**replay, "at_s": ReplayClock(course).step_s[-1]}, shows="meshes")
+        until(lambda: not page.hides("/replay/objects") and page.hides("/replay/episode/estimate/tracked"))
+        assert page.own(name) is body  # the same node, which follows
+        until(lambda: np.allclose(body.position, course.states[-1].poses.position[0], atol=1e-5))
+        ask(live, "page")
+        until(lambda: page.own("/objects") is None)
+
+
 def test_what_plays_goes_on_when_something_else_of_it_is_looked_at(live, course):
     end_s = ReplayClock(course).length_s
     replay = {"story": STORY, "at_s": end_s - 8.0, "plays": True, "speed": 4.0}

@@ -112,7 +112,7 @@ def test_from_a_mesh_to_a_field_that_can_be_seen_and_deleted(service, services):
 def test_from_a_set_to_a_field_that_needs_a_mesh_for_scenes(service, archive):
     made = upload(service, archive).json()
     accepted = train(service, "my_mug", {"set": made["id"]})
-    assert "needs image set" in is_problem(service.delete(f"/api/fields/sets/{made['id']}"), 409)["detail"]
+    assert "needs these images" in is_problem(service.delete(f"/api/fields/sets/{made['id']}"), 409)["detail"]
     job = finished(service, accepted.headers["location"], 240)
     assert (job["state"], job["error"]) == ("done", None)
     field = service.get("/api/fields/my_mug").json()

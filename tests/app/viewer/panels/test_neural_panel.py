@@ -40,7 +40,9 @@ class Browser:
     def __init__(self):
         eye = Camera.look_at("eye", (0.9, -0.9, 0.9), (0, 0, 0)).T_world_camera
         self.camera = Node(position=eye.position, wxyz=eye.quaternion, fov=0.8, aspect=1.5, image_height=600)
-        self.scene = SimpleNamespace(set_background_image=self._show, add_frame=self._hide)
+        self.scene = SimpleNamespace(
+            set_background_image=self._show, add_frame=self._hide, get_handle_by_name=self._own
+        )
         self.notifications, self.pictures, self.hidden = [], [], {}
 
     def _show(self, image, format="auto", *, jpeg_quality=None, depth=None):
@@ -51,6 +53,10 @@ class Browser:
         assert not visible
         self.hidden[path] = Node()
         return self.hidden[path]
+
+    def _own(self, path):
+        node = self.hidden.get(path)
+        return None if node is None or node.is_removed else node
 
     def add_notification(self, title, body, **_):
         self.notifications.append(Node(title=title, body=body))
