@@ -128,8 +128,8 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
 def use_one_thread() -> None:
     """Let torch work in one thread, for the rollouts of a planner.
 
-    They are thousands of small products: with two threads a plan takes as long on an idle machine of two cores, and
-    1.4 times as long beside a page that draws the 3D view on the other one. Renderer and estimator have threads of
+    They are thousands of small products: a second thread hardly helps on an idle machine, and where the other core is
+    busy, with a page that draws the 3D view, say, each product waits for it. Renderer and estimator have threads of
     their own.
     """
     import torch

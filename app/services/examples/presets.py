@@ -104,11 +104,13 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
             with contextlib.suppress(OsfError):  # in use, or deleted: then another one
                 return _put_back(made.scene, runner), made
     # Shown when all is there: the pages ask for its images then, and the goal's would wait behind them.
-    scene = _table_of(chosen, runner)
+    there = _untouched(chosen, runner)
+    scene = there or runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
     try:
         goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light, chosen.id)
     except BaseException:
-        runner.delete_scene(scene.id)
+        if there is None:
+            runner.delete_scene(scene.id)
         raise
     return runner.activate(scene.id), goal
 
@@ -120,13 +122,13 @@ def _put_back(scene: str, runner: Runner) -> SceneRecord:
     return runner.activate(scene)
 
 
-def _table_of(chosen: Preset, runner: Runner) -> SceneRecord:
-    """The table of a preset, not touched yet: that which a new service begins with, or another one."""
+def _untouched(chosen: Preset, runner: Runner) -> SceneRecord | None:
+    """The table of a preset that is there already, such as that of a new service, if nobody has changed it."""
     for scene in runner.scenes():
         is_same = (scene.seed, scene.state.names, scene.revision) == (chosen.seed, chosen.objects, 1)
         if is_same and scene.state.light.angle_to(chosen.light) < _SAME_RAD and runner.jobs.needs(scene.id) is None:
             return scene
-    return runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
+    return None
 
 
 def _light(azimuth_deg: float, elevation_deg: float) -> Light:

@@ -87,3 +87,8 @@ def test_what_cannot_be_made_is_told_and_leaves_nothing(service, services, monke
     monkeypatch.setattr(services.goals, "draw", refuse)
     assert is_problem(service.post("/api/presets/pair"), 422)["detail"] == "There is no room."
     assert service.get("/api/scenes").json()["scenes"] == before["scenes"]
+    one = preset("pair")
+    asked = {"objects": list(one.objects), "seed": one.seed, "light": {"position": one.light.position.tolist()}}
+    there = service.post("/api/scenes", json=asked).json()["id"]
+    is_problem(service.post("/api/presets/pair"), 422)
+    assert service.delete(f"/api/scenes/{there}").is_success  # what was there before is still there
