@@ -3,12 +3,14 @@
 import contextlib
 import http.client
 import json
+import multiprocessing
 import os
 import resource
 import shutil
 import socket
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import uvicorn
@@ -31,6 +33,22 @@ def until(condition, timeout_s=20.0):
             return value
         time.sleep(0.02)
     pytest.fail(f"did not happen within {timeout_s:g} s")
+
+
+def newest_child(name):
+    """Process id of the child of that name that was started last, 0 where none runs.
+
+    By its time of start: process ids begin again at 1 once the largest was given.
+    """
+
+    def start_ticks(pid):
+        try:
+            return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[19])
+        except OSError:
+            return 0  # ended meanwhile
+
+    pids = [child.pid for child in multiprocessing.active_children() if child.name == name]
+    return max(pids, key=start_ticks, default=0)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,3 @@
-import multiprocessing
 import os
 import queue
 import signal
@@ -24,7 +23,7 @@ from app.processes.messages.scene_messages import TakeImage
 from app.storage.database import CannotStore, Store
 from app.storage.field_files import workshop
 from osfcore.errors import UnknownName
-from tests.app.conftest import full_disk, until
+from tests.app.conftest import full_disk, newest_child, until
 
 TABLE = ("collect_table", {"images": 60, "size": 16, "seed": 0})
 LONG = ("collect_table", {"images": 5000, "size": 16, "seed": 0})
@@ -56,7 +55,7 @@ def open_jobs(store, data_dir):
 
 def pid_of_job():
     """Of the job process that was started last."""
-    return max(child.pid for child in multiprocessing.active_children() if child.name == "osf-job")
+    return newest_child("osf-job")
 
 
 def until_state(jobs, job, *states):
