@@ -72,6 +72,8 @@ class AssetsFetch:
         chosen = self.names or source.names()
         is_work = any(self.force or not library.has(name) for name in chosen)
         with worker_pool(self.workers if is_work else 1) as executor:
+            if executor is not None:  # while this one downloads, so that the first episode need not wait for compilers
+                executor.submit(_compile)
             follow(fetch(chosen, source, library, executor, force=self.force))
         return {"objects": list(chosen), "available": list(library.names()), "data_dir": str(self.data_dir)}
 
@@ -131,6 +133,12 @@ class Assets:
     def run(self) -> dict[str, Any]:
         """Do what was chosen."""
         return self.action.run()
+
+
+def _compile() -> None:
+    from app.jobs.kinds.rehearsal import rehearse
+
+    rehearse()
 
 
 def _library(data_dir: Path) -> AssetLibrary:
