@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 ROOMS = (
     "osfcore.errors",
     "osfcore.progress",
+    "osfcore.random_streams",
     "osfcore.geometry",
     "osfcore.io",
     "osfcore.objects",

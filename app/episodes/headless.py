@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from app.episodes.file_names import RECORDING_FILE
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import EpisodeOrder, SimulatedTable, given
@@ -16,6 +14,7 @@ from osfcore.control.events import ActionExecuted, Event, GoalFound, Looking, No
 from osfcore.control.scene_models import load_scene_models
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 
 _FOUND = {
     "first": "Knows where everything is",
@@ -63,7 +62,7 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         symmetries = {name: assets.info(name).symmetry for name in begin.world.names}
         about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries)
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
-        rng = np.random.default_rng([order.seed, 1])
+        rng = stream_rng(order.seed, Stream.EPISODE)
         done, note = 0, ""
         for event in Episode(begin.world, models, begin.goal, order.settings, rng).run():
             record.take(event)

@@ -203,7 +203,7 @@ class EpisodeRecord:
         if about.goal is not None and about.moved:  # else there is nothing to score
             task = RearrangementTask(0, self._start, about.goal, about.moved)
             score = score_of(task, self._table.truth(), about.symmetries)
-            report["score"], report["success_2cm"] = encode(score), score.is_success()
+            report["score"], report["success_2cm"] = score.to_json(), score.is_success()
         return report
 
 

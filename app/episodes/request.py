@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,10 @@ from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
 from osfcore.geometry.light import Light
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import SceneState, shifted_poses
 from osfcore.io.files import reading_png
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.goal_layouts import random_goal
+from osfcore.world.goal_layouts import arranged_goal, random_goal
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
@@ -38,8 +39,8 @@ class EpisodeOrder:
         goal: PNG of how the table should look, from the goal camera; None for a random goal.
         moved: how many objects a random goal moves; as the seed will have it if None.
         light: on the table; as the seed will have it if None.
-        goal_seed: of a random goal; the same as that of the scene if None.
-        goal_light: in a random goal's image; that of the table if None.
+        shifts_m: instead of a random goal: objects that lie elsewhere in it, and how far along x and y.
+        goal_light: in the goal's image; that of the table if None.
         goal_side: of that image [px].
         settings: how it goes.
         device: that computes.
@@ -53,7 +54,7 @@ class EpisodeOrder:
     goal: Path | None = None
     moved: int | None = None
     light: Light | None = None
-    goal_seed: int | None = None
+    shifts_m: Mapping[str, tuple[float, float]] | None = None
     goal_light: Light | None = None
     goal_side: int = DEFAULT_IMAGE_SIDE
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
@@ -122,7 +123,11 @@ def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
             raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
         return Given(world, goal, None, ())
     start, camera = world.truth(), goal_camera(order.goal_side)
-    task = random_goal(world, order.seed if order.goal_seed is None else order.goal_seed, order.moved)
+    if order.shifts_m is None:
+        task = random_goal(world, order.seed, order.moved)
+    else:
+        arranged = arranged_goal(world, shifted_poses(start, order.shifts_m))
+        task = replace(arranged, pusher=None), tuple(order.shifts_m)
     if order.goal_light is not None:
         world.set_light(order.goal_light)
     image = world.render((camera,), with_pusher=False).images[0]

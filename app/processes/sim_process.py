@@ -51,6 +51,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S, check_action
 from osfcore.io.image_file import encode_jpeg, encode_png, to_uint8
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from osfcore.world.tabletop import Tabletop
@@ -193,7 +194,7 @@ class Simulation:
             if command.poses is None:
                 world.arrange(command.seed)
             else:
-                light = command.light or Light.random(np.random.default_rng(command.seed))
+                light = command.light or Light.random(stream_rng(command.seed, Stream.LIGHT))
                 world.load(SceneState(command.names or (), command.poses, light, None))
         except BaseException:
             world.close()
@@ -280,12 +281,8 @@ class Simulation:
         return self._report(self._record(scene), states, interval_s or STEP_S / max(len(states), 1))
 
     def _report(self, record: SceneRecord, states: tuple[SceneState, ...] = (), interval_s: float = 0.0) -> SceneRecord:
-        changed = replace(
-            record,
-            state=self._world(record.id).truth(),
-            time_s=self._time_s(record.id),
-            revision=self._record(record.id).revision + 1,
-        )
+        state, time_s = self._world(record.id).truth(), self._time_s(record.id)
+        changed = replace(record, state=state, time_s=time_s, revision=self._record(record.id).revision + 1)
         self._tell(changed, states, interval_s)
         return changed
 

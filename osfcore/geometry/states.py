@@ -5,6 +5,7 @@ Letters: V views, N objects, h w pixels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,6 +69,14 @@ class SceneState:
         if name not in self.names:
             raise UnknownName("object in the scene", name, self.names)
         return self.names.index(name)
+
+
+def shifted_poses(state: SceneState, shifts_m: Mapping[str, tuple[float, float]]) -> dict[str, Pose]:
+    """Poses of some objects, each moved along x and y from where it is in a state, lying as it lies."""
+    return {
+        name: Pose(state.pose(name).position + np.array([*shift, 0.0]), state.pose(name).quaternion)
+        for name, shift in shifts_m.items()
+    }
 
 
 @dataclass(frozen=True, eq=False, slots=True)

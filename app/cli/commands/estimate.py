@@ -42,14 +42,13 @@ class Estimate:
 
     def run(self) -> dict[str, Any]:
         """Estimate; the result is what state.json holds, and how long it took."""
-        import numpy as np
-
         from app.jobs.kinds.estimates import load_models, steps_of
         from osfcore.errors import check_seed
         from osfcore.io.observation_file import read_observation
         from osfcore.io.state_file import estimated_to_json, read_estimated, write_estimated
+        from osfcore.random_streams import Stream, stream_rng
 
-        rng = np.random.default_rng(check_seed(self.seed))
+        rng = stream_rng(check_seed(self.seed), Stream.FIRST_FRAME)
         self._check_places()
         if self.goal and self.prior is None:
             raise InvalidInput("--prior", "missing", "given: how the objects lie now")

@@ -21,6 +21,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import ObjectJson, camera_from_json
+from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
@@ -102,7 +103,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     target = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
     about = About(params["seed"], settings, target, _moved(start, target), models.symmetries)
     record = EpisodeRecord(place.folder, world, about)
-    rng = np.random.default_rng([params["seed"], 1])
+    rng = stream_rng(params["seed"], Stream.EPISODE)
     inputs = place.folder / INPUTS
     prepared = _prepared(inputs / PREPARED_FILE)
     wanted = _goal(goal, names, inputs)

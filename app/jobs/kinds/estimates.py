@@ -19,6 +19,7 @@ from app.jobs.job import INPUTS
 from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import StateJson, state_to_json
+from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
@@ -73,7 +74,7 @@ def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimati
     mode: Mode = params["mode"]
     prior = None if mode == "first" else read_estimated(inputs / PRIOR).state
     models = load_models(place.data_dir, observation.names)
-    rng = np.random.default_rng(params["seed"])
+    rng = stream_rng(params["seed"], Stream.FIRST_FRAME)
     for number, step in enumerate(steps_of(mode, models, observation, prior, rng), 1):
         progress = _progress_of(number, step)
         _keep(place.folder / STEPS, progress, step.state)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.light import Light
+from osfcore.geometry.states import shifted_poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +30,7 @@ class Preset:
         seed: of where they lie.
         azimuth_deg: of the light, from +x toward +y.
         elevation_deg: of the light, above the table.
-        goal_seed: of the random layout that the goal shows.
-        moved: objects that lie elsewhere in it.
+        shifts_m: objects that lie elsewhere in the goal, and how far along x and y.
         goal_angles_deg: azimuth and elevation of the light in the goal image; None for the same light.
     """
 
@@ -40,8 +41,7 @@ class Preset:
     seed: int
     azimuth_deg: float
     elevation_deg: float
-    goal_seed: int
-    moved: int
+    shifts_m: Mapping[str, tuple[float, float]]
     goal_angles_deg: tuple[float, float] | None = field(default=None)
 
     @property
@@ -58,17 +58,23 @@ class Preset:
 # Of the ten objects that are fetched by default.
 PRESETS = (
     Preset("first", "First push", "Two objects, one of them in the wrong place.",
-           ("006_mustard_bottle", "007_tuna_fish_can"), 11, 60, 55, 1, 1),
+           ("006_mustard_bottle", "007_tuna_fish_can"), 11, 60, 55,
+           {"006_mustard_bottle": (-0.0886, 0.0285)}),
     Preset("pair", "Both of them", "Two objects that both have to move.",
-           ("003_cracker_box", "005_tomato_soup_can"), 12, 200, 50, 2, 2),
+           ("003_cracker_box", "005_tomato_soup_can"), 12, 200, 50,
+           {"003_cracker_box": (0.0134, 0.0976), "005_tomato_soup_can": (0.0798, 0.1213)}),
     Preset("three", "Three things", "Three objects, two in the wrong place.",
-           ("006_mustard_bottle", "010_potted_meat_can", "008_pudding_box"), 13, 320, 45, 3, 2),
+           ("006_mustard_bottle", "010_potted_meat_can", "008_pudding_box"), 13, 320, 45,
+           {"008_pudding_box": (-0.0145, -0.1745), "010_potted_meat_can": (0.0755, 0.0429)}),
     Preset("low-sun", "Low sun", "Light from 15° above the table: shadows longer than the objects.",
-           ("009_gelatin_box", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15, 4, 2),
+           ("009_gelatin_box", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15,
+           {"009_gelatin_box": (0.1965, 0.0144), "005_tomato_soup_can": (-0.1316, -0.0733)}),
     Preset("other-light", "Another light", "The photo was taken under a lamp from the other side.",
-           ("004_sugar_box", "009_gelatin_box", "006_mustard_bottle"), 15, 40, 30, 5, 2, (220, 30)),
+           ("004_sugar_box", "009_gelatin_box", "006_mustard_bottle"), 15, 40, 30,
+           {"009_gelatin_box": (0.0183, -0.0797), "006_mustard_bottle": (-0.0692, 0.103)}, (220, 30)),
     Preset("four", "Four at once", "Four objects close together, two in the wrong place.",
-           ("003_cracker_box", "005_tomato_soup_can", "010_potted_meat_can", "006_mustard_bottle"), 16, 280, 35, 6, 2),
+           ("003_cracker_box", "005_tomato_soup_can", "010_potted_meat_can", "006_mustard_bottle"), 16, 280, 35,
+           {"003_cracker_box": (0.0532, 0.1033), "006_mustard_bottle": (-0.0963, -0.0301)}),
 )  # fmt: skip
 
 
@@ -107,7 +113,8 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     there = _untouched(chosen, runner)
     scene = there or runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
     try:
-        goal = goals.draw(scene.id, chosen.goal_seed, chosen.moved, chosen.title, chosen.goal_light, chosen.id)
+        poses = tuple(shifted_poses(scene.state, chosen.shifts_m).items())
+        goal = goals.compose(scene.id, poses, chosen.title, chosen.goal_light, chosen.id)
     except BaseException:
         if there is None:
             runner.delete_scene(scene.id)

@@ -46,8 +46,8 @@ def record_story(preset: Preset, data_dir: Path, out: Path) -> Iterator[EpisodeS
     """
     folder = out / ".episode"
     order = EpisodeOrder(
-        folder, data_dir, preset.objects, seed=preset.seed, moved=preset.moved, light=preset.light,
-        goal_seed=preset.goal_seed, goal_light=preset.goal_light, goal_side=GOAL_SIDE,
+        folder, data_dir, preset.objects, seed=preset.seed, light=preset.light,
+        shifts_m=preset.shifts_m, goal_light=preset.goal_light, goal_side=GOAL_SIDE,
     )  # fmt: skip
     seen: Observation | None = None
     goal: GoalFound | None = None

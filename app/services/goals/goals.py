@@ -179,7 +179,9 @@ class Goals:
         self._runner.hub.publish(GoalsChanged())
         return record
 
-    def compose(self, scene: str | None, poses: Poses, name: str, light: Light | None = None) -> GoalRecord:
+    def compose(
+        self, scene: str | None, poses: Poses, name: str, light: Light | None = None, example: str | None = None
+    ) -> GoalRecord:
         """Keep a goal in which objects of a scene lie elsewhere.
 
         Args:
@@ -187,22 +189,18 @@ class Goals:
             poses: of the objects that lie elsewhere; they come to rest as if let go.
             name: for people.
             light: in which it is seen; None for the scene's.
+            example: whose goal it is; None if it is anybody's own.
 
         Raises:
             NoTable, UnknownName: if there is no such scene or object.
             SceneHeld: if a job uses the scene.
             OsfError: if objects would overlap or lie beside the table; or as `receive`.
         """
-        return self._made("composed", ComposeGoal(self._scene(scene), poses, light=light, size=GOAL_SIDE), name)
+        command = ComposeGoal(self._scene(scene), poses, light=light, size=GOAL_SIDE)
+        return self._made("composed", command, name, example)
 
     def draw(
-        self,
-        scene: str | None,
-        seed: int,
-        moved: int | None,
-        name: str,
-        light: Light | None = None,
-        example: str | None = None,
+        self, scene: str | None, seed: int, moved: int | None, name: str, light: Light | None = None
     ) -> GoalRecord:
         """Keep a goal in which some objects of a scene lie elsewhere at random.
 
@@ -212,7 +210,6 @@ class Goals:
             moved: how many objects lie elsewhere; None to draw the number too.
             name: for people.
             light: in which it is seen; None for the scene's.
-            example: whose goal it is; None if it is anybody's own.
 
         Raises:
             NoTable, UnknownName: if there is no such scene.
@@ -220,7 +217,7 @@ class Goals:
             OsfError: if there is no room, or as `receive`.
         """
         command = ComposeGoal(self._scene(scene), seed=seed, moved=moved, light=light, size=GOAL_SIDE)
-        return self._made("drawn", command, name, example)
+        return self._made("drawn", command, name)
 
     def _made(self, source: Source, command: ComposeGoal, name: str, example: str | None = None) -> GoalRecord:
         made = self._runner.compose(command)

@@ -27,6 +27,7 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import DEFAULT_NAMES
+from osfcore.random_streams import Stream, stream_rng
 
 _FIRST_SCENE = 700_000  # no figure of accuracy is measured on these scenes
 _MOST_SCENES = 10_000
@@ -124,7 +125,7 @@ def bench_estimate(config: BenchEstimate, fields: FieldLibrary, assets: AssetLib
     goal: list[float] = []
     for number in range(config.scenes):
         yield BenchEstimateStep(number, config.scenes, f"Estimating (scene {number + 1} of {config.scenes})")
-        scene, rng = _Scene(config, assets, names, number), np.random.default_rng([config.seed, number])
+        scene, rng = _Scene(config, assets, names, number), stream_rng(config.seed, Stream.BENCHMARK, number)
         start, seconds = _timed(estimate_first(models, scene.first, rng, config.effort))
         first.append(seconds)
         expected = start.state

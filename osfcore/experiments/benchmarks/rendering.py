@@ -30,6 +30,7 @@ from osfcore.io.image_file import to_uint8
 from osfcore.metrics.image_errors import psnr
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import EXACT, PLANNING, Quality, SceneBatch
 from osfcore.world.imaging.tiny_renderer import TinyScene
@@ -172,7 +173,7 @@ class _Stage:
     def __init__(self, config: BenchRender, fields: FieldLibrary, assets: AssetLibrary) -> None:
         available = measurable(fields, assets)
         self._config = config
-        self._rng = np.random.default_rng(config.seed)
+        self._rng = stream_rng(config.seed, Stream.BENCHMARK)
         count = max(OBJECTS, *config.counts)
         # Where there are too few objects, some stand there more than once: copies under names of their own.
         self._names = tuple(f"{available[i % len(available)]} {i // len(available)}" for i in range(count))

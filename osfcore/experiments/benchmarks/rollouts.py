@@ -17,6 +17,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_CENTRE_Z_M
+from osfcore.random_streams import Stream, stream_rng
 
 SEQUENCES, HORIZON = 1000, 10
 BENCH_NAMES = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle")
@@ -57,7 +58,7 @@ def bench_rollouts(
     """
     names = tuple(sorted(shapes))[: len(BENCH_NAMES)]
     model = PushModel(network, {name: shapes[name] for name in names}, device)
-    state, actions = _scene(names, shapes), _paths(np.random.default_rng(0))
+    state, actions = _scene(names, shapes), _paths(stream_rng(0, Stream.BENCHMARK))
     rollouts = model.rollout(state, actions)  # warm
     seconds = []
     for _ in range(_REPEATS):

@@ -1,9 +1,9 @@
 """How good predictions of pushes are: open loop over episodes that nothing was trained on.
 
-Episodes of both policies with two, three, four and six objects are collected once into the output folder, from seeds
-that training does not use. Windows of up to 30 actions are rolled out by the network, by a quasi-static model and by
-nobody (everything stays), and scored for objects that truly moved. Pairs of objects that never meet in training are
-scored apart, and so are objects that a second network has never seen.
+Episodes of both policies with two, three, four and six objects are collected once into the output folder, from random
+streams that no other collection uses. Windows of up to 30 actions are rolled out by the network, by a quasi-static
+model and by nobody (everything stays), and scored for objects that truly moved. Pairs of objects that never meet in
+training are scored apart, and so are objects that a second network has never seen.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from osfcore.dynamics.network_weights import read_metrics, read_network, shipped
 from osfcore.dynamics.push_models import load_shapes, network_path
 from osfcore.dynamics.shapes.object_shapes import ObjectShape
-from osfcore.errors import MAX_SEED, InvalidInput, MissingAssets
+from osfcore.errors import InvalidInput, MissingAssets, check_seed
 from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, rollout_rate
 from osfcore.experiments.dynamics.plots import write_gallery, write_plots
 from osfcore.experiments.dynamics.report import DynamicsReport, Scored, report_json
@@ -27,13 +27,13 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.io.push_file import read_pushes
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_seed
 from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
 
 REPORT_FILE = "dynamics.json"
 MAX_TASKS = 10_000
 COUNTS = (2, 3, 4, 6)  # objects in a scene
 _STEPS = 50
-_SEEDS = 1_000_000  # ours begin here: training data is collected with smaller ones
 _OTHERS = 2  # objects beside unseen ones
 _UNSEEN = "unseen"
 
@@ -135,8 +135,7 @@ def _checked(config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrar
     """The objects; at least as many as the largest scene of three policies needs."""
     if not 1 <= config.tasks <= MAX_TASKS:
         raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
-    if not 0 <= config.seed <= MAX_SEED - _SEEDS:
-        raise InvalidInput("seed", config.seed, f"between 0 and {MAX_SEED - _SEEDS}")
+    check_seed(config.seed)
     if config.names is None:
         names = tuple(name for name in fields.names() if assets.has(name))
     else:
@@ -170,7 +169,7 @@ def _collect(config: EvaluateDynamics, entry: _Set, assets: AssetLibrary, execut
     path = _path(config, entry)
     if path.exists():
         return
-    seed = _SEEDS + config.seed * 100 + COUNTS.index(entry.objects) * 2 + (entry.policy == "paper")
+    seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
     collection = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)  # pyright: ignore[reportArgumentType]
     for step in collect_pushes(collection, assets, executor):
         yield step.note

@@ -18,6 +18,7 @@ from osfcore.geometry.cameras import SCENE_CENTRE, Camera, default_cameras, goal
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 
 FIRST_SCENE = 500_000  # bad cases begin with scenes from this number on, which no other part uses
 _FEW_PX = 6  # that remain of an object's mask
@@ -106,7 +107,8 @@ def bad_case(available: Sequence[str], count: int, seed: int, number: int, libra
     """
     kind = KINDS[number % len(KINDS)]
     draw = draw_scene(available, count, seed, FIRST_SCENE + number)
-    scene = _Scene(draw, tuple(available), library, default_cameras(size), np.random.default_rng([draw.seed, 3]))
+    rng = stream_rng(draw.seed, Stream.SPOILED_INPUT)
+    scene = _Scene(draw, tuple(available), library, default_cameras(size), rng)
     return _MAKERS[kind](scene)
 
 

@@ -21,6 +21,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.collection.policies import DirectedPolicy
 from osfcore.world.goal_layouts import SHIFT_M
 from osfcore.world.scene_request import SceneRequest
@@ -32,7 +33,6 @@ Absence = Literal["", "off the table", "out of view"]
 _LAYOUTS = 10  # arrangements that are tried where objects do not fit
 _EPISODES = 100  # in which chance may fail to push anything
 _PLACES = 100  # that a goal tries for an object
-_EPISODE, _GOAL = 1, 2  # what else the draw's seed decides
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -111,7 +111,7 @@ def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, s
     with opened(draw, library) as world:
         start = world.truth()
         for attempt in range(_EPISODES):
-            states = _pushes(world, start, np.random.default_rng([draw.seed, _EPISODE, attempt]), steps)
+            states = _pushes(world, start, stream_rng(draw.seed, Stream.MEASURED_PUSHES, attempt), steps)
             places = np.stack([state.poses.position[:, :2] for state in states])
             moved = np.linalg.norm(places - start.poses.position[:, :2], axis=2).max(axis=0)
             if moved.max() >= PUSHED_M or attempt == _EPISODES - 1:
@@ -140,7 +140,7 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
     with opened(draw, library) as world:
         start = world.truth()
         for count in range(1, len(draw.names) + 1):
-            rng = np.random.default_rng([draw.seed, _GOAL, count])
+            rng = stream_rng(draw.seed, Stream.MEASURED_GOAL, count)
             world.restore(start)
             world.set_light(Light.random(rng, HARSH_ELEVATION_DEG))
             chosen = [draw.names[int(n)] for n in rng.permutation(len(draw.names))[:count]]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.objective.object_models import ObjectModels
@@ -18,6 +16,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 
 WARM_SCENE = 900_000  # number of a scene that no figure is measured on
 _FIRST = FirstFrameConfig(
@@ -50,7 +49,7 @@ def warm_models(
     models = ObjectModels({name: fields.load(name) for name in names}, fields.load_table())
     for name in names:
         models.resting(name)
-    rng = np.random.default_rng(0)
+    rng = stream_rng(0, Stream.BENCHMARK)
     observation = first_frame(draw, library, default_cameras(size)).observation
     state = last_estimate(estimate_first(models, observation, rng, _FIRST)).state
     last_estimate(estimate_next(models, replace(observation, masks=None), state, rng, _NEXT))

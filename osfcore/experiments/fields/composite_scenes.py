@@ -16,6 +16,7 @@ from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.image_file import to_uint8
 from osfcore.metrics.image_errors import psnr
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import EXACT, Quality, SceneBatch
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer
@@ -70,7 +71,7 @@ class Draw:
 
     Attributes:
         names: its objects.
-        light: at least 10 deg above the table.
+        light: above the table.
         seed: of the arrangement.
     """
 
@@ -79,7 +80,14 @@ class Draw:
     seed: int
 
 
-def draw_scene(available: Sequence[str], count: int, seed: int, number: int) -> Draw:
+def draw_scene(
+    available: Sequence[str],
+    count: int,
+    seed: int,
+    number: int,
+    stream: Stream = Stream.SCENE,
+    min_elevation_deg: float = HARSH_ELEVATION_DEG,
+) -> Draw:
     """One of many random scenes; it does not depend on the others.
 
     Args:
@@ -87,9 +95,11 @@ def draw_scene(available: Sequence[str], count: int, seed: int, number: int) -> 
         count: objects in the scene.
         seed: of all the scenes.
         number: which of them.
+        stream: that they are drawn from.
+        min_elevation_deg: of their lights.
     """
-    rng = np.random.default_rng([seed, number])
-    light = Light.random(rng, HARSH_ELEVATION_DEG)
+    rng = stream_rng(seed, stream, number)
+    light = Light.random(rng, min_elevation_deg)
     arrangement = int(rng.integers(1 << 31))
     chosen = rng.permutation(len(available))[:count]
     return Draw(tuple(available[int(i)] for i in chosen), light, arrangement)

@@ -35,6 +35,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer
 from osfcore.world.imaging.traced_mesh import TracedMesh
 
@@ -162,8 +163,8 @@ def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -
     counts: dict[Split, int] = {"train": images - test, "test": test}
     done = 0
     try:
-        for stream, (split, count) in enumerate(counts.items()):
-            rng = np.random.default_rng([seed, stream])
+        for part, (split, count) in enumerate(counts.items()):
+            rng = stream_rng(seed, Stream.COLLECTED_IMAGES, part)
             folder = partial / split
             folder.mkdir(parents=True)
             annotations = []

@@ -6,8 +6,6 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera, image_side
 from osfcore.geometry.states import MAX_OBJECTS, Observation
@@ -15,6 +13,7 @@ from osfcore.io.files import folder_at_once, write_json
 from osfcore.io.observation_file import write_observation
 from osfcore.io.scene_file import Scene, scene_to_json
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
@@ -87,7 +86,7 @@ def _names(config: CollectObservation, library: AssetLibrary, known: Collection[
     most = min(len(choice), MAX_OBJECTS)
     if not 1 <= config.objects <= most:
         raise InvalidInput("number of objects", config.objects, f"between 1 and {most}")
-    rng = np.random.default_rng([config.seed, 1])
+    rng = stream_rng(config.seed, Stream.COLLECTED_NAMES)
     return tuple(choice[i] for i in rng.choice(len(choice), config.objects, replace=False))
 
 

@@ -19,6 +19,7 @@ from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.io.image_file import to_uint8
 from osfcore.io.push_file import EpisodeFolder, PushEpisode, load_episode, save_episode
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.collection.disturbed_states import disturbed
 from osfcore.world.collection.policies import DirectedPolicy, PaperPolicy, PolicyName
 from osfcore.world.scene_request import SceneRequest
@@ -192,20 +193,20 @@ def _episodes(
     """Run the missing episodes, here or in the executor, a few at a time."""
     if executor is None:
         for index in missing:
-            yield load_episode(_run_episode(config, root, index, folder.path(index)))
+            yield _kept(folder.path(index), _run_episode(config, root, index))
         return
-    running: set[Future[Path]] = set()
+    running: dict[Future[PushEpisode], int] = {}
     try:
         while True:
             for index in missing:
-                running.add(executor.submit(_run_episode, config, root, index, folder.path(index)))
+                running[executor.submit(_run_episode, config, root, index)] = index
                 if len(running) >= in_flight:
                     break
             if not running:
                 return
-            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
-                yield load_episode(future.result())
+                yield _kept(folder.path(running.pop(future)), future.result())
     finally:
         for future in running:
             future.cancel()
@@ -218,12 +219,18 @@ def _tabletop(root: Path, objects: int, names: tuple[str, ...] | None, renderer:
     return Tabletop(AssetLibrary(root), cameras=default_cameras()[:1], request=request, renderer=renderer)
 
 
-def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> Path:
-    """Simulate one episode, which depends on nothing but the settings and its index, and save it."""
-    seed = int(np.random.SeedSequence((config.seed, index)).generate_state(1)[0])
+def _kept(path: Path, episode: PushEpisode) -> PushEpisode:
+    """Save an episode here: whoever simulated it may be on another machine."""
+    save_episode(path, episode)
+    return episode
+
+
+def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
+    """Simulate one episode, which depends on nothing but the settings and its index."""
+    seed = stream_seed(config.seed, Stream.COLLECTED_SCENE, index)
     world = _tabletop(root, config.objects, config.names, config.renderer)
     world.arrange(seed)
-    rng = np.random.default_rng((config.seed, index, 1))
+    rng = stream_rng(config.seed, Stream.COLLECTED_POLICY, index)
     policy = PaperPolicy(rng) if config.policy == "paper" else DirectedPolicy(world.assets, rng)
     states, contacts, actions, within = [world.truth()], [], [], []
     frames = [_frame(world, config)]
@@ -247,10 +254,10 @@ def _run_episode(config: CollectPushes, root: Path, index: int, path: Path) -> P
         frames=np.concatenate(frames) if config.images else None,
     )
     if config.disturb:
-        substeps = disturbed(episode, world.models, np.random.default_rng((config.seed, index, 2)), config.disturb)
+        disturbance = stream_rng(config.seed, Stream.COLLECTED_DISTURBANCE, index)
+        substeps = disturbed(episode, world.models, disturbance, config.disturb)
         episode = replace(episode, disturbed=substeps)
-    save_episode(path, episode)
-    return path
+    return episode
 
 
 def _pusher(state: SceneState) -> np.ndarray:

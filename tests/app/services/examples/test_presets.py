@@ -1,4 +1,5 @@
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ from app.services.scenes import TooManyScenes
 from app.storage.database import CannotStore
 from osfcore.errors import UnknownName
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.poses import rotation_angle
+from osfcore.geometry.poses import Pose, rotation_angle
+from osfcore.geometry.states import SceneState, shifted_poses
 from osfcore.objects.catalogue import DEFAULT_NAMES
-from osfcore.world.goal_layouts import random_goal
+from osfcore.world.goal_layouts import arranged_goal
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.app.storage.test_database import record
@@ -38,7 +40,8 @@ def test_every_object_can_be_recognised_as_shipped(one):
     fields = FieldLibrary(None)
     assert [name for name in one.objects if not fields.has(name)] == []
     assert len(set(one.objects)) == len(one.objects)
-    assert 1 <= one.moved <= len(one.objects)
+    assert one.shifts_m
+    assert set(one.shifts_m) <= set(one.objects)
 
 
 @each
@@ -59,12 +62,11 @@ def test_the_goal_differs_from_the_table_for_as_many_objects_as_it_says(one, lib
     with contextlib.closing(Tabletop(library, request=SceneRequest(names=one.objects, light=one.light))) as world:
         world.arrange(one.seed)
         start = world.truth()
-        goal, moved = random_goal(world, one.goal_seed, one.moved)
+        goal = arranged_goal(world, shifted_poses(start, one.shifts_m))
     shift_m = np.linalg.norm(goal.poses.position - start.poses.position, axis=1)
     turn_rad = rotation_angle(goal.poses.quaternion, start.poses.quaternion)
     elsewhere = {n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > STAYS_M or rad > STAYS_RAD}
-    assert elsewhere == set(moved)
-    assert len(moved) == one.moved
+    assert elsewhere == set(one.shifts_m)
 
 
 class Service:
@@ -76,7 +78,9 @@ class Service:
 
     def create_scene(self, **asked):
         self.made.append(asked)
-        return record("s")
+        count = len(asked["names"])
+        poses = Pose(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)))
+        return replace(record("s"), state=SceneState(asked["names"], poses, asked["light"], None))
 
     def activate(self, scene):
         assert self.goals, "pages would ask for images while the goal is still being drawn"
@@ -87,7 +91,7 @@ class Service:
         assert scene == "s"
         self.made.pop()
 
-    def draw(self, *asked):
+    def compose(self, *asked):
         if self.error is not None:
             raise self.error
         self.goals.append(asked)
@@ -104,8 +108,10 @@ def test_a_preset_is_asked_for_as_it_is_described(one):
     assert not asked["is_shown"]
     assert (asked["names"], asked["seed"]) == (one.objects, one.seed)
     np.testing.assert_array_equal(asked["light"].direction, one.light.direction)
-    (drawn,) = service.goals
-    assert drawn[:4] == ("s", one.goal_seed, one.moved, one.title)
+    ((asked_of, poses, title, light, example),) = service.goals
+    assert (asked_of, title, example) == ("s", one.title, one.id)
+    assert (light is None) == (one.goal_light is None)
+    assert [name for name, _ in poses] == list(one.shifts_m)
 
 
 @pytest.mark.parametrize(

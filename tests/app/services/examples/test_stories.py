@@ -25,7 +25,7 @@ def test_a_story_tells_of_its_example_what_its_course_shows(preset):
     stories = Stories()
     told, course = stories.told(preset.id), read_trajectory(stories.trajectory(preset.id))
     assert told["objects"] == list(course.names) == list(preset.objects)
-    assert len(told["moved"]) == preset.moved
+    assert len(told["moved"]) == len(preset.shifts_m)
     assert told["step_s"] == pytest.approx(ReplayClock(course).step_s, abs=1e-3)
     assert len(told["left_mm"]) == len(told["step_s"]) == len(course.rounds)
     assert told["pushes"] == len(course.states) - 1

@@ -23,7 +23,8 @@ from tests.core.experiments.solids import SOLIDS
 
 @pytest.fixture(scope="module")
 def truth(library):
-    return simulate(draw_scene(SOLIDS, 3, 5, 0), library, default_cameras(64))
+    draw = replace(draw_scene(SOLIDS, 3, 5, 0), light=Light.from_angles(1.0, 0.6))  # casts shadows in every view
+    return simulate(draw, library, default_cameras(64))
 
 
 def test_scenes_are_random_harsh_and_independent_of_each_other():

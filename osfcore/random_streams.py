@@ -1,0 +1,61 @@
+"""Independent random streams from one seed, one for each purpose.
+
+A generator seeded with a list is no such stream: numpy pads its entropy with zeros, so that `[seed, n]` and
+`[seed, n, 0]`, and a bare `seed` and `[seed, 0]`, draw the same numbers. Spawn keys are mixed in behind the padding,
+and each purpose has a tag of its own in them. What has a single stream keeps the one without a key: a world's own
+`reset(seed)`, and the training of a network.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, unique
+
+import numpy as np
+
+
+@unique
+class Stream(IntEnum):
+    """What a stream is drawn for. A value, once given, is never given to another purpose."""
+
+    SCENE = 1  # objects, light and arrangement of scenes that fields and estimates are measured on
+    FIRST_FRAME = 2
+    TRACKING = 3
+    MEASURED_PUSHES = 4  # pushes along which tracking is measured
+    MEASURED_GOAL = 5  # goals whose estimates are measured
+    SPOILED_INPUT = 6
+    TASK_SCENE = 7  # objects, light and arrangement of a rearrangement task
+    TASK_GOAL = 8  # where its objects shall lie
+    TASK_GOAL_LIGHT = 9
+    EPISODE = 10  # estimates and plans of Algorithm 1
+    ORACLE = 11
+    GOAL_LAYOUT = 12  # random goals of people
+    COLLECTED_SCENE = 13
+    COLLECTED_POLICY = 14
+    COLLECTED_DISTURBANCE = 15
+    COLLECTED_IMAGES = 16
+    COLLECTED_NAMES = 17
+    HELD_OUT_PUSHES = 18  # the seed of a collection that predictions are measured on
+    BENCHMARK = 19
+    LIGHT = 20  # of scenes whose objects lie where a person wants them
+    BOOTSTRAP = 21
+    FACTOR_LIGHT = 22
+
+
+def _sequence(seed: int, stream: Stream, numbers: tuple[int, ...]) -> np.random.SeedSequence:
+    return np.random.SeedSequence(seed, spawn_key=(int(stream), *numbers))
+
+
+def stream_rng(seed: int, stream: Stream, *numbers: int) -> np.random.Generator:
+    """The generator of one stream.
+
+    Args:
+        seed: of everything random, 0 or more.
+        stream: what is drawn.
+        numbers: which of several, such as task and attempt.
+    """
+    return np.random.default_rng(_sequence(seed, stream, numbers))
+
+
+def stream_seed(seed: int, stream: Stream, *numbers: int) -> int:
+    """A 31-bit seed that is drawn from one stream, for whatever takes a seed instead of a generator."""
+    return int(_sequence(seed, stream, numbers).generate_state(1)[0] >> 1)
