@@ -76,11 +76,17 @@ class Physics:
 
     Args:
         models: the objects that take part, by name.
+        friction_factor: on the friction of the objects.
+        mass_factor: on their masses and moments of inertia.
     """
 
-    def __init__(self, models: Mapping[str, BodyModel]) -> None:
+    def __init__(
+        self, models: Mapping[str, BodyModel], *, friction_factor: float = 1.0, mass_factor: float = 1.0
+    ) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
         self._models = dict(models)
+        self._friction = friction_factor * OBJECT_FRICTION
+        self._mass_factor = mass_factor
         self._build()
 
     def _build(self) -> None:
@@ -138,9 +144,10 @@ class Physics:
         # A visual shape of its own keeps Bullet from reading the file again for one.
         visual = pybullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001, physicsClientId=self._client)
         away = [10.0 * (1 + len(self._bodies)), 0.0, 50.0]
-        uid = pybullet.createMultiBody(model.mass_kg, shape, visual, away, physicsClientId=self._client)
-        self._dynamics(uid, OBJECT_FRICTION)
-        pybullet.changeDynamics(uid, -1, localInertiaDiagonal=model.moments.tolist(), physicsClientId=self._client)
+        mass_kg, moments = self._mass_factor * model.mass_kg, self._mass_factor * model.moments
+        uid = pybullet.createMultiBody(mass_kg, shape, visual, away, physicsClientId=self._client)
+        self._dynamics(uid, self._friction)
+        pybullet.changeDynamics(uid, -1, localInertiaDiagonal=moments.tolist(), physicsClientId=self._client)
         return _Body(uid, model.T_object_inertial, model.T_object_inertial.inverse())
 
     def reset(self) -> None:

@@ -21,6 +21,7 @@ from osfcore.geometry.states import Observation, SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M, check_action
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.conditions import Conditions
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer, masks_of
 from osfcore.world.imaging.tiny_renderer import TinyScene
 from osfcore.world.imaging.traced_mesh import TracedMesh
@@ -42,6 +43,7 @@ class Tabletop:
         request: what `reset` puts on the table.
         renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used).
         executor: takes the views of an observation side by side, if given; threads serve.
+        conditions: lamp and table, of which "tiny" knows nothing, and contacts; the usual ones if None.
 
     Raises:
         UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
@@ -55,6 +57,7 @@ class Tabletop:
         request: SceneRequest | None = None,
         renderer: Renderer = "embree",
         executor: Executor | None = None,
+        conditions: Conditions | None = None,
     ) -> None:
         if renderer not in ("embree", "tiny"):
             raise InvalidInput("renderer", repr(renderer), '"embree" or "tiny"')
@@ -64,6 +67,7 @@ class Tabletop:
         check_request(library, self._request)
         self._renderer: Renderer = renderer
         self._executor = executor
+        self._conditions = conditions or Conditions()
         self._assets: dict[str, ObjectAsset] = {}
         self._models: dict[str, BodyModel] = {}
         self._meshes: dict[str, TracedMesh] = {}
@@ -305,10 +309,9 @@ class Tabletop:
             if self._tiny is None:
                 self._tiny = TinyScene(self.assets)
             return self._tiny.render(state, cameras)
-        for name in self._names:
-            if name not in self._meshes:
-                self._meshes[name] = TracedMesh(self._asset(name).mesh)
-        return RayTracer(self._meshes, executor=self._executor).render(state, cameras)
+        self._meshes |= {name: TracedMesh(self._asset(name).mesh) for name in self._names if name not in self._meshes}
+        lamp, table = self._conditions.lamp, self._conditions.table
+        return RayTracer(self._meshes, lamp=lamp, table=table, executor=self._executor).render(state, cameras)
 
     def _asset(self, name: str) -> ObjectAsset:
         if name not in self._assets:
@@ -320,11 +323,10 @@ class Tabletop:
         return self._bodies.step(velocity)
 
     def _load_objects(self, names: tuple[str, ...]) -> None:
-        for name in names:
-            if name not in self._models:
-                self._models[name] = body_model(self._asset(name))
+        self._models |= {name: body_model(self._asset(name)) for name in names if name not in self._models}
         self.close()
-        self._physics = Physics({name: self._models[name] for name in names})
+        models, c = {name: self._models[name] for name in names}, self._conditions
+        self._physics = Physics(models, friction_factor=c.friction_factor, mass_factor=c.mass_factor)
         self._names = names
 
     def _place_all(self, state: SceneState) -> None:

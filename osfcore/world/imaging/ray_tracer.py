@@ -18,15 +18,15 @@ from jaxtyping import Bool, Float
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.world.imaging.optics import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp, lambert
+from osfcore.world.imaging.optics import Lamp, TableSurface, lambert
+from osfcore.world.imaging.shot import Body, Shot
 from osfcore.world.imaging.traced_mesh import NO_HIT, TracedMesh, into_frame
+from osfcore.world.imaging.traced_table import open_table, see_table
 from osfcore.world.pusher_body import pusher_mesh
 
 DEFAULT_SAMPLES = 3  # samples along each side of a pixel, in images of 96 pixels and more
 _SMALL_SIDE = 96  # below, bodies may be thinner than a pixel: corners miss them and three samples are too few
 _BIAS_M = np.float32(5e-4)  # shadow rays start this far above curved facets, which smooth normals make look round
-_CHUNK = 1 << 17  # samples traced at once, to bound memory at large image sizes
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,47 +44,28 @@ class Picture:
     depth: Float[np.ndarray, "h w"]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Body:
-    """A mesh at its place in one scene."""
-
-    mesh: TracedMesh
-    pose: Pose
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Shot:
-    """One view to trace: who, from where, under which light."""
-
-    bodies: tuple[_Body, ...]
-    light: Float[np.ndarray, "3"]
-    camera: Camera
-    lamp: Lamp
-    has_table: bool
-    samples: int
-    sharp: bool
-
-    @property
-    def origin(self) -> Float[np.ndarray, "3"]:
-        """Centre of projection [m], float32."""
-        return self.camera.T_world_camera.position.astype(np.float32)
-
-
 class RayTracer:
     """Traces views of scenes made of known meshes.
 
     Args:
         meshes: the objects that scenes may name.
-        lamp: strengths of ambient and diffuse light.
+        lamp: strengths of ambient and diffuse light, and their colour; the usual ones if None.
+        table: what the table looks like; the usual one if None.
         executor: traces the views of one call side by side, if given (threads serve: Embree releases the GIL).
     """
 
     def __init__(
-        self, meshes: Mapping[str, TracedMesh], *, lamp: Lamp | None = None, executor: Executor | None = None
+        self,
+        meshes: Mapping[str, TracedMesh],
+        *,
+        lamp: Lamp | None = None,
+        table: TableSurface | None = None,
+        executor: Executor | None = None,
     ) -> None:
         self._meshes = dict(meshes)
         self._pusher = TracedMesh(pusher_mesh())
         self._lamp = lamp or Lamp()
+        self._table = table or TableSurface()
         self._executor = executor
 
     def render(
@@ -101,11 +82,12 @@ class RayTracer:
         Raises:
             KeyError: if the state names an object without mesh.
         """
-        bodies = [_Body(self._meshes[name], state.poses[i]) for i, name in enumerate(state.names)]
+        bodies = [Body(self._meshes[name], state.poses[i]) for i, name in enumerate(state.names)]
         if state.pusher is not None:
-            bodies.append(_Body(self._pusher, Pose(state.pusher, Pose.identity().quaternion)))
+            bodies.append(Body(self._pusher, Pose(state.pusher, Pose.identity().quaternion)))
         light = state.light.direction.astype(np.float32)
-        shots = [_Shot(tuple(bodies), light, c, self._lamp, True, samples or _samples_for(c), sharp) for c in cameras]
+        lamp, table = self._lamp, self._table
+        shots = [Shot(tuple(bodies), light, c, lamp, table, samples or _samples_for(c), sharp) for c in cameras]
         mapped = map(_trace, shots) if self._executor is None else self._executor.map(_trace, shots)
         return tuple(mapped)
 
@@ -120,9 +102,9 @@ class RayTracer:
             camera: a view, in the object's frame.
             samples: samples along each side of a pixel.
         """
-        bodies = (_Body(self._meshes[name], Pose.identity()),)
+        bodies = (Body(self._meshes[name], Pose.identity()),)
         light = np.asarray(light_direction, np.float32)
-        return _trace(_Shot(bodies, light, camera, self._lamp, False, samples, False))
+        return _trace(Shot(bodies, light, camera, self._lamp, None, samples, False))
 
 
 def _samples_for(camera: Camera) -> int:
@@ -141,21 +123,21 @@ def masks_of(picture: Picture, count: int) -> Bool[np.ndarray, "N h w"]:
     return winner & (coverage >= 0.5)
 
 
-def _trace(shot: _Shot) -> Picture:
+def _trace(shot: Shot) -> Picture:
     """One view: closed-form table first, then grids of samples where something happens."""
     height, width = shot.camera.height, shot.camera.width
     near_body = np.ones((height, width), bool) if shot.sharp else _near_bodies(shot)
     rgb = np.zeros((height, width, 3), np.float32)
     depth = np.full((height, width), np.inf, np.float32)
     coverage = np.zeros((len(shot.bodies), height, width), np.float32)
-    if shot.has_table:
-        busy = _open_table(shot, near_body, rgb, depth)
+    if shot.table is not None:
+        busy = open_table(shot, near_body, rgb, depth)
         _sampled(shot, busy & ~near_body, (), rgb, depth, coverage)
     _sampled(shot, near_body, tuple(range(len(shot.bodies))), rgb, depth, coverage)
     return Picture(rgb, coverage, depth)
 
 
-def _near_bodies(shot: _Shot) -> Bool[np.ndarray, "h w"]:
+def _near_bodies(shot: Shot) -> Bool[np.ndarray, "h w"]:
     """Pixels that a body may cover: those with a corner on one, and their neighbours."""
     height, width = shot.camera.height, shot.camera.width
     on_body = np.zeros((height + 1, width + 1), bool)
@@ -167,7 +149,7 @@ def _near_bodies(shot: _Shot) -> Bool[np.ndarray, "h w"]:
                 on_body[top : bottom + 1, left : right + 1] = True
                 continue
             y, x = np.mgrid[top : bottom + 1, left : right + 1]
-            directions = _directions(shot, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32))
+            directions = shot.directions(np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32))
             origins = np.broadcast_to(shot.origin, directions.shape)
             hit = body.mesh.occludes(*into_frame(body.pose, origins, directions))
             on_body[top : bottom + 1, left : right + 1] |= hit.reshape(x.shape)
@@ -175,28 +157,13 @@ def _near_bodies(shot: _Shot) -> Bool[np.ndarray, "h w"]:
     return cv2.dilate(pixels.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
-def _screen_box(body: _Body, camera: Camera) -> tuple[int, int, int, int] | None:
+def _screen_box(body: Body, camera: Camera) -> tuple[int, int, int, int] | None:
     T_camera_object = camera.T_world_camera.inverse() @ body.pose
     return body.mesh.screen_box(T_camera_object, camera.intrinsics, camera.width, camera.height)
 
 
-def _open_table(shot: _Shot, near_body: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> Bool[np.ndarray, "h w"]:
-    """Fill pixels without body from their four corners; return those whose corners disagree."""
-    height, width = near_body.shape
-    y, x = np.mgrid[: height + 1, : width + 1]
-    directions = _directions(shot, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32))
-    kind, colour, distance = _table(shot, directions)
-    kind = kind.reshape(height + 1, width + 1)
-    corners = np.stack([kind[:-1, :-1], kind[:-1, 1:], kind[1:, :-1], kind[1:, 1:]])
-    busy = (corners[1] != corners[0]) | (corners[2] != corners[0]) | (corners[3] != corners[0])
-    rgb[:] = colour.reshape(height + 1, width + 1, 3)[:-1, :-1]
-    distance = distance.reshape(height + 1, width + 1)
-    depth[:] = (distance[:-1, :-1] + distance[:-1, 1:] + distance[1:, :-1] + distance[1:, 1:]) / 4
-    return busy
-
-
 def _sampled(
-    shot: _Shot,
+    shot: Shot,
     pixels: Bool[np.ndarray, "h w"],
     visible: tuple[int, ...],
     rgb: np.ndarray,
@@ -204,69 +171,23 @@ def _sampled(
     coverage: np.ndarray,
 ) -> None:
     """Fill the chosen pixels with the mean of a grid of samples; `visible` are the bodies they may show."""
-    rows, columns = np.nonzero(pixels)
-    side = shot.samples
-    offsets = (np.arange(side) + 0.5) / side
-    grid = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-    per_chunk = max(_CHUNK // side**2, 1)
-    for start in range(0, len(rows), per_chunk):
-        r, c = rows[start : start + per_chunk], columns[start : start + per_chunk]
-        points = (np.stack([c, r], axis=-1)[:, None] + grid).reshape(-1, 2).astype(np.float32)
-        colour, z, owner = _shade(shot, points, visible)
-        rgb[r, c] = _pixel_means(colour, len(r))
+    for samples in shot.sampled(pixels):
+        chosen = samples.rows, samples.columns
+        colour, z, owner = _shade(shot, samples.points, visible)
+        rgb[chosen] = samples.means(colour)
         hit = np.isfinite(z)
-        share = _pixel_means(hit[:, None].astype(np.float32), len(r))[:, 0]
-        total = _pixel_means(np.where(hit, z, 0)[:, None], len(r))[:, 0]
-        depth[r, c] = np.where(share > 0, total / np.maximum(share, 1e-6), np.inf)
+        share = samples.means(hit[:, None].astype(np.float32))[:, 0]
+        total = samples.means(np.where(hit, z, 0)[:, None])[:, 0]
+        depth[chosen] = np.where(share > 0, total / np.maximum(share, 1e-6), np.inf)
         owned = owner[:, None] == np.array(visible)
-        coverage[visible, r[:, None], c[:, None]] = _pixel_means(owned.astype(np.float32), len(r))
-
-
-def _pixel_means(samples: Float[np.ndarray, "S C"], pixels: int) -> Float[np.ndarray, "P C"]:
-    """Means over each pixel's samples, as a matrix product: numpy reduces short axes slowly."""
-    channels = samples.shape[1]
-    per_pixel = len(samples) // pixels
-    average = np.tile(np.eye(channels, dtype=np.float32), (per_pixel, 1)) / np.float32(per_pixel)
-    return samples.reshape(pixels, per_pixel * channels) @ average
-
-
-def _directions(shot: _Shot, points: Float[np.ndarray, "S 2"]) -> Float[np.ndarray, "S 3"]:
-    """World directions through pixel coordinates, scaled so that the ray parameter is the depth along z."""
-    inverse = np.linalg.inv(shot.camera.intrinsics)
-    to_world = quaternion_to_matrix(shot.camera.T_world_camera.quaternion) @ inverse
-    homogeneous = np.concatenate([points, np.ones((len(points), 1), np.float32)], axis=1)
-    return homogeneous @ to_world.T.astype(np.float32)
-
-
-def _table(
-    shot: _Shot, directions: Float[np.ndarray, "S 3"]
-) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]]:
-    """Background (kind -1), shadowed (0) or lit (1) table along rays; its radiance; its depth [m]."""
-    origin = shot.origin
-    falling = directions[:, 2] < -1e-9
-    depth = np.where(falling, -origin[2] / np.where(falling, directions[:, 2], -1), np.inf).astype(np.float32)
-    if origin[2] <= 0:  # a camera below the table sees no table
-        depth[:] = np.inf
-    reach = np.where(falling, depth, 0) if origin[2] > 0 else np.zeros_like(depth)
-    points = origin + reach[:, None] * directions
-    half = TABLE_SIDE_M / 2
-    on_table = np.isfinite(depth) & (np.abs(points[:, 0]) <= half) & (np.abs(points[:, 1]) <= half)
-    kind = np.full(len(depth), -1.0, np.float32)
-    kind[on_table] = _lit(shot, points[on_table], None)
-    colour = np.empty((len(depth), 3), np.float32)
-    colour[:] = BACKGROUND_RADIANCE
-    count = int(on_table.sum())
-    albedo = np.broadcast_to(np.array(TABLE_ALBEDO, np.float32), (count, 3))
-    cosine = np.full(count, shot.light[2], np.float32)
-    colour[on_table] = lambert(albedo, cosine, kind[on_table], shot.lamp)
-    return kind, colour, np.where(on_table, depth, np.inf).astype(np.float32)
+        coverage[visible, samples.rows[:, None], samples.columns[:, None]] = samples.means(owned.astype(np.float32))
 
 
 def _shade(
-    shot: _Shot, points: Float[np.ndarray, "S 2"], visible: tuple[int, ...]
+    shot: Shot, points: Float[np.ndarray, "S 2"], visible: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"], np.ndarray]:
     """Radiance, depth and owner (index of the body, or -1) of the samples at pixel coordinates."""
-    directions = _directions(shot, points)
+    directions = shot.directions(points)
     nearest = np.full(len(points), NO_HIT, np.float32)
     owner = np.full(len(points), -1)
     face = np.zeros(len(points), np.int64)
@@ -284,13 +205,12 @@ def _shade(
         face[chosen], barycentric[chosen] = hit_face[closer], hit_uv[closer]
     colour = np.zeros((len(points), 3), np.float32)
     depth = np.full(len(points), np.inf, np.float32)
-    if shot.has_table:
-        # Bodies stand on the table, so it is only seen where no body was hit.
+    if shot.table is not None:
+        # Bodies stand on the table, so it is only seen where no body was hit, or below the table.
+        owner[(owner >= 0) & ~_above_table(shot, directions, nearest)] = -1
         open_rays = np.nonzero(owner < 0)[0]
-        _, colour[open_rays], depth[open_rays] = _table(shot, directions[open_rays])
-        below = (owner >= 0) & ~_above_table(shot, directions, nearest)
-        owner[below] = -1
-        _, colour[below], depth[below] = _table(shot, directions[below])
+        seen = see_table(shot, directions[open_rays])
+        colour[open_rays], depth[open_rays] = seen.colour, seen.depth
     for i in visible:
         mine = np.nonzero(owner == i)[0]
         if len(mine):
@@ -299,13 +219,13 @@ def _shade(
     return colour, depth, owner
 
 
-def _above_table(shot: _Shot, directions: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, "S"]:
+def _above_table(shot: Shot, directions: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, "S"]:
     """Whether hits lie above the table's plane: a body that sinks a fraction of a millimetre does not shine through."""
     z = shot.origin[2] + np.where(distance < NO_HIT, distance, 0) * directions[:, 2]
     return z > -1e-4 if shot.origin[2] > 0 else np.ones(len(z), bool)
 
 
-def _inside_box(shot: _Shot, index: int, points: Float[np.ndarray, "S 2"]) -> np.ndarray:
+def _inside_box(shot: Shot, index: int, points: Float[np.ndarray, "S 2"]) -> np.ndarray:
     box = _screen_box(shot.bodies[index], shot.camera)
     if box is None:
         return np.zeros(0, np.int64)
@@ -315,7 +235,7 @@ def _inside_box(shot: _Shot, index: int, points: Float[np.ndarray, "S 2"]) -> np
 
 
 def _body_colour(
-    shot: _Shot, index: int, directions: np.ndarray, distance: np.ndarray, face: np.ndarray, barycentric: np.ndarray
+    shot: Shot, index: int, directions: np.ndarray, distance: np.ndarray, face: np.ndarray, barycentric: np.ndarray
 ) -> Float[np.ndarray, "S 3"]:
     """Radiance of hits on one body."""
     body = shot.bodies[index]
@@ -328,23 +248,5 @@ def _body_colour(
     visible = np.zeros(len(distance), np.float32)
     facing = np.nonzero(cosine > 0)[0]
     points = shot.origin + distance[facing, None] * directions[facing] + _BIAS_M * normals[facing]
-    visible[facing] = _lit(shot, points, index)
+    visible[facing] = shot.lit(points, index)
     return lambert(albedo, cosine, visible, shot.lamp)
-
-
-def _lit(shot: _Shot, points: Float[np.ndarray, "S 3"], receiver: int | None) -> Float[np.ndarray, "S"]:
-    """1 where the light reaches world points, 0 where a body stands in the way (the receiver itself included)."""
-    lit = np.ones(len(points), np.float32)
-    for i, body in enumerate(shot.bodies):
-        if i == receiver:
-            candidates = np.nonzero(lit)[0]
-        else:  # only points whose ray toward the light passes through the body's bounding sphere
-            to_centre = body.pose.position.astype(np.float32) - points
-            along = to_centre @ shot.light
-            across2 = np.einsum("ij,ij->i", to_centre, to_centre) - along**2
-            candidates = np.nonzero((lit > 0) & (across2 < body.mesh.radius_m**2) & (along > -body.mesh.radius_m))[0]
-        if len(candidates):
-            light = np.broadcast_to(shot.light, (len(candidates), 3))
-            blocked = body.mesh.occludes(*into_frame(body.pose, points[candidates], light))
-            lit[candidates[blocked]] = 0
-    return lit

@@ -58,16 +58,35 @@ def test_pose_is_of_the_object_frame_not_of_the_centre_of_mass():
     simulation.close()
 
 
-def test_sliding_box_stops_by_coulomb_friction(physics):
-    """v^2 / (2 mu g) with mu = 0.5 * 1.0: from 0.3 m/s, 9.2 mm. The pusher lets go of the box at that speed."""
+def pushed_and_let_go(physics: Physics) -> tuple[float, float]:
+    """Where the pusher lets go of the box at full speed, and how far it then slides [m]."""
     physics.place("box", Pose(np.array([0.0, 0, 0.02]), LEVEL))
     settle(physics, ("box",))
     physics.place_pusher(np.array([-0.04 - PUSHER_RADIUS_M - 0.001, 0, PUSHER_CENTRE_Z_M]))
     for _ in range(SUBSTEPS):
         physics.step(np.array([MAX_SPEED_M_S, 0, 0]))
-    released = physics.pose("box").position[0]
+    released = float(physics.pose("box").position[0])
     settle(physics, ("box",))
-    assert physics.pose("box").position[0] - released == pytest.approx(0.3**2 / (2 * 0.5 * 9.81), abs=0.002)
+    return released, float(physics.pose("box").position[0]) - released
+
+
+@pytest.mark.parametrize(("friction", "mass"), [(1, 1), (0.5, 1), (2, 1), (1, 0.5), (1, 2)])
+def test_sliding_box_stops_by_coulomb_friction_whatever_its_mass(friction, mass):
+    """v^2 / (2 mu g) with mu = 0.5 * 1.0 and a factor: from 0.3 m/s, 9.2 mm with the factor 1."""
+    simulation = Physics({"box": body_model(BOX)}, friction_factor=friction, mass_factor=mass)
+    slid = pushed_and_let_go(simulation)[1]
+    simulation.close()
+    assert slid == pytest.approx(0.3**2 / (2 * friction * 0.5 * 9.81), rel=0.1)
+
+
+def test_a_box_heavier_than_the_pusher_yields_more_slowly():
+    """Three times its mass: no object is, but only then does a mass show where everything is pushed."""
+    ends = []
+    for mass in (1, 1000):
+        simulation = Physics({"box": body_model(BOX)}, mass_factor=mass)
+        ends.append(pushed_and_let_go(simulation)[0])
+        simulation.close()
+    assert 0.002 < ends[0] - ends[1] < 0.02
 
 
 def test_a_box_in_the_air_goes_on_as_it_was_thrown(physics):

@@ -100,6 +100,17 @@ def test_images_are_linear_in_ambient_and_diffuse():
     np.testing.assert_allclose(both.rgb[inner], (0.3 * ambient.rgb + 0.6 * diffuse.rgb)[inner], atol=1e-6)
 
 
+def test_intensity_and_colour_scale_whatever_the_lamp_reaches():
+    state = box_state(Light.from_angles(1.0, np.deg2rad(40)), pusher=np.array([0.1, 0.0, PUSHER_CENTRE_Z_M]))
+    camera, colour = default_cameras(96)[:1], (1.0, 0.85, 0.65)
+    (usual,), (warm,) = (tracer(lamp).render(state, camera) for lamp in (Lamp(), Lamp(intensity=1.5, colour=colour)))
+    pure = usual.coverage.max(axis=0) > 0.999
+    pure |= np.all(np.abs(usual.rgb - table_radiance(40)) < 1e-5, axis=-1)
+    np.testing.assert_allclose(warm.rgb[pure], 1.5 * np.array(colour) * usual.rgb[pure], atol=1e-5)
+    beyond = np.isinf(usual.depth)
+    np.testing.assert_array_equal(warm.rgb[beyond], usual.rgb[beyond])
+
+
 def test_box_top_has_lambert_radiance_and_true_depth():
     light = Light.from_angles(0.3, np.deg2rad(50))
     (picture,) = tracer().render(box_state(light), (above(128),))

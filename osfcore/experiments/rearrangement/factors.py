@@ -1,0 +1,216 @@
+"""Factors of variation, one at a time: worlds that differ in one thing from what the method takes for granted.
+
+The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 10
+deg and more above the table; a table of one known colour; exact calibration; linear images without noise; exact masks;
+friction as the dynamics were trained on. Objects that nothing was trained on are no factor here but a choice of names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.goal import GoalImage
+from osfcore.errors import UnknownName
+from osfcore.experiments.rearrangement.sensor import CameraError, ImageChange, received, resized_masks
+from osfcore.geometry.cameras import Camera, default_cameras
+from osfcore.geometry.light import Light
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.metrics.success import RearrangementTask
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.conditions import Conditions
+from osfcore.world.imaging.optics import Lamp, TableSurface
+from osfcore.world.imaging.wood import wooden_texture
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
+
+_SAME_RAD = 1e-6
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Factor:
+    """How a world differs from the usual one; by default in nothing.
+
+    Attributes:
+        conditions: lamp, table and contacts.
+        has_wooden_table: the table is of wood, another one for each world.
+        camera_turn_rad: by which every camera is turned, each about an axis of its own [rad].
+        camera_shift_m: by which every camera is moved, each in a direction of its own [m].
+        image: what becomes of every image.
+        mask_radius_px: by which masks reach too far [px], or not far enough where it is negative.
+        light_elevation_deg: between which the light stands above the table [deg]; None leaves it where it is.
+    """
+
+    conditions: Conditions = field(default_factory=Conditions)
+    has_wooden_table: bool = False
+    camera_turn_rad: float = 0.0
+    camera_shift_m: float = 0.0
+    image: ImageChange = "none"
+    mask_radius_px: int = 0
+    light_elevation_deg: tuple[float, float] | None = None
+
+    def light(self, light: Light, rng: np.random.Generator) -> Light:
+        """A light as high as the factor has them, at the same azimuth."""
+        if self.light_elevation_deg is None:
+            return light
+        x, y, _ = light.direction
+        return Light.from_angles(float(np.arctan2(y, x)), float(np.deg2rad(rng.uniform(*self.light_elevation_deg))))
+
+    def task(self, task: RearrangementTask, rng: np.random.Generator) -> RearrangementTask:
+        """A task under such lights; where start and goal share one, they still do."""
+        start = self.light(task.start.light, rng)
+        is_same = task.goal.light.angle_to(task.start.light) < _SAME_RAD
+        goal = start if is_same else self.light(task.goal.light, rng)
+        return replace(task, start=replace(task.start, light=start), goal=replace(task.goal, light=goal))
+
+
+def _lamp(
+    *, ambient: float | None = None, intensity: float = 1.0, colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Factor:
+    """A factor of the lamp; a share of ambient light takes from the diffuse light."""
+    lamp = Lamp(intensity=intensity, colour=colour)
+    if ambient is not None:
+        lamp = replace(lamp, ambient=ambient, diffuse=1 - ambient)
+    return Factor(Conditions(lamp=lamp))
+
+
+FACTORS: Mapping[str, Factor] = MappingProxyType(
+    {
+        "light_low": Factor(light_elevation_deg=(5.0, 10.0)),
+        "intensity_0.5": _lamp(intensity=0.5),
+        "intensity_1.5": _lamp(intensity=1.5),
+        "ambient_0.1": _lamp(ambient=0.1),
+        "ambient_0.5": _lamp(ambient=0.5),
+        "light_coloured": _lamp(colour=(1.0, 0.85, 0.65)),
+        "table_colour": Factor(Conditions(table=TableSurface((0.36, 0.44, 0.54)))),
+        "table_wood": Factor(has_wooden_table=True),
+        "camera_shifted": Factor(camera_turn_rad=float(np.deg2rad(0.3)), camera_shift_m=0.003),
+        "noise_2": Factor(image="noise"),
+        "jpeg_80": Factor(image="jpeg"),
+        "srgb_8bit": Factor(image="srgb_8bit"),
+        "srgb_8bit_decoded": Factor(image="srgb_8bit_decoded"),
+        "masks_eroded_2": Factor(mask_radius_px=-2),
+        "masks_dilated_2": Factor(mask_radius_px=2),
+        "friction_0.5": Factor(Conditions(friction_factor=0.5)),
+        "friction_2": Factor(Conditions(friction_factor=2.0)),
+        "mass_0.5": Factor(Conditions(mass_factor=0.5)),
+        "mass_2": Factor(Conditions(mass_factor=2.0)),
+    }
+)
+
+
+def factor_named(name: str) -> Factor:
+    """One of the factors.
+
+    Raises:
+        UnknownName: if there is none of that name.
+    """
+    if name not in FACTORS:
+        raise UnknownName("factor of variation", name, FACTORS)
+    return FACTORS[name]
+
+
+class VariedWorld:
+    """A simulated tabletop under a factor: a `World` for the method, with the truth for whoever scores it.
+
+    What a factor leaves to chance but for noise (wood, errors of the cameras) is drawn once, when the world is made.
+
+    Args:
+        library: where the objects' meshes are.
+        factor: what differs.
+        rng: draws what the factor leaves to chance.
+        cameras: what `observe` looks through, as they are calibrated.
+        request: what `reset` puts on the table.
+        executor: takes the views of an observation side by side, if given; threads serve.
+
+    Raises:
+        UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
+    """
+
+    def __init__(
+        self,
+        library: AssetLibrary,
+        factor: Factor,
+        rng: np.random.Generator,
+        *,
+        cameras: tuple[Camera, ...] | None = None,
+        request: SceneRequest | None = None,
+        executor: Executor | None = None,
+    ) -> None:
+        self.cameras = default_cameras() if cameras is None else cameras
+        self._factor, self._rng = factor, rng
+        errors = [CameraError.random(rng, factor.camera_turn_rad, factor.camera_shift_m) for _ in self.cameras]
+        self._goal_error = CameraError.random(rng, factor.camera_turn_rad, factor.camera_shift_m)
+        conditions = factor.conditions
+        if factor.has_wooden_table:
+            conditions = replace(conditions, table=TableSurface(texture=wooden_texture(rng)))
+        standing = tuple(error.applied(camera) for error, camera in zip(errors, self.cameras, strict=True))
+        self._world = Tabletop(library, cameras=standing, request=request, executor=executor, conditions=conditions)
+
+    # The World protocol
+
+    def reset(self, seed: int) -> Observation:
+        """A new random scene at rest.
+
+        Raises:
+            NoRoom: if the objects do not fit side by side.
+        """
+        self._world.arrange(seed)
+        self._world.set_light(self._factor.light(self._world.truth().light, self._rng))
+        return self.observe()
+
+    def observe(self, *, masks: bool = False) -> Observation:
+        """One image per camera, as the method gets them, with the cameras as they are calibrated."""
+        return self._received(self._world.observe(masks=masks), self.cameras)
+
+    def act(self, action: Float[np.ndarray, "3"]) -> None:
+        """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s.
+
+        Raises:
+            InvalidInput: if the action is outside its limits; the world is unchanged.
+        """
+        self._world.act(action)
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self._world.close()
+
+    # What only a simulator can do
+
+    def goal_image(self, state: SceneState, camera: Camera) -> GoalImage:
+        """A state as a camera shows it to the method, without the pusher; the table is left like that.
+
+        Args:
+            state: put on the table, as by `restore`.
+            camera: as it is calibrated; all goals are taken with the same error.
+        """
+        self.restore(state)
+        standing = self._goal_error.applied(camera)
+        taken = self._world.render((standing,), with_pusher=False)
+        return GoalImage(camera, self._received(taken, (camera,)).images[0])
+
+    def restore(self, state: SceneState) -> None:
+        """Put back a state, its light as well.
+
+        Raises:
+            UnknownName, MissingAssets: if an object is not in the library.
+        """
+        self._world.restore(state)
+
+    def truth(self) -> SceneState:
+        """The true state, for scores; the method must not see it."""
+        return self._world.truth()
+
+    def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
+        """The present state under the factor's lamp and on its table, but by ideal cameras, for scores and pictures."""
+        return self._world.render(cameras, masks=masks, with_pusher=with_pusher)
+
+    def _received(self, taken: Observation, cameras: tuple[Camera, ...]) -> Observation:
+        images = np.stack([received(image, self._factor.image, self._rng) for image in taken.images])
+        masks = None if taken.masks is None else resized_masks(taken.masks, self._factor.mask_radius_px)
+        return replace(taken, cameras=cameras, images=images, masks=masks)

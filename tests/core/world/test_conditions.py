@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
+from osfcore.world.conditions import Conditions
+from osfcore.world.imaging.optics import Lamp, TableSurface
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
+
+FLAT = 1  # the seed of a scene in which the box lies flat
+CAMERAS = default_cameras(48)
+PUSHES = [np.array(action) for action in ([0.3, 0.0, 0], [-0.3, 0.2, 0], [0.0, -0.3, 0], [0.3, 0.3, 0])]
+
+
+def world_with(library, conditions: Conditions | None, **given) -> Tabletop:
+    return Tabletop(library, cameras=CAMERAS, conditions=conditions, **given)
+
+
+def test_default_conditions_are_no_conditions_to_the_last_bit(library):
+    images, states = [], []
+    for conditions in (None, Conditions()):
+        world = world_with(library, conditions)
+        world.arrange(3)
+        for push in PUSHES:
+            world.act(push)
+        images.append(world.observe().images)
+        states.append(world.truth())
+        world.close()
+    np.testing.assert_array_equal(*images)
+    np.testing.assert_array_equal(*(state.poses.position for state in states))
+    np.testing.assert_array_equal(*(state.poses.quaternion for state in states))
+
+
+def test_a_world_is_seen_under_its_lamp_and_on_its_table(library):
+    usual, dim, blue = (
+        world_with(library, c)
+        for c in (None, Conditions(lamp=Lamp(intensity=0.5)), Conditions(table=TableSurface((0.2, 0.3, 0.6))))
+    )
+    for world in (usual, dim, blue):
+        world.arrange(0)
+    a, b, c = ([p.rgb[p.coverage.max(axis=0) > 0.999] for p in w.pictures(CAMERAS)] for w in (usual, dim, blue))
+    for mine, halved, same in zip(a, b, c, strict=True):
+        np.testing.assert_allclose(halved, 0.5 * mine, atol=1e-6)
+        np.testing.assert_array_equal(same, mine)  # no light goes from the table to objects
+    open_table = blue.observe().images[0, -1, 24]
+    np.testing.assert_allclose(open_table[0] / open_table[2], 1 / 3, rtol=1e-3)
+    for world in (usual, dim, blue):
+        world.close()
+
+
+def slide_m(library, conditions: Conditions) -> float:
+    """How far a flat box goes on after a push at full speed."""
+    world = world_with(library, conditions, request=SceneRequest(names=("009_gelatin_box",)))
+    world.arrange(FLAT)
+    state = world.truth()
+    assert state.poses.position[0, 2] < 0.02
+    behind = np.array([*state.poses.position[0, :2] - [0.07, 0], PUSHER_CENTRE_Z_M])
+    world.restore(replace(state, pusher=behind))
+    world.act(np.array([0.3, 0, 0]))
+    released = world.truth().poses.position[0, :2]
+    for _ in world.settle():
+        pass
+    slid = np.linalg.norm(world.truth().poses.position[0, :2] - released)
+    world.close()
+    return float(slid)
+
+
+def test_objects_slide_farther_on_less_friction(library):
+    """In proportion, as Coulomb has it."""
+    half, usual, double = (slide_m(library, Conditions(friction_factor=factor)) for factor in (0.5, 1.0, 2.0))
+    assert half == pytest.approx(2 * usual, rel=0.25)
+    assert usual == pytest.approx(2 * double, rel=0.25)
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
+def test_factors_that_no_world_has_are_refused(factor):
+    with pytest.raises(InvalidInput, match="friction"):
+        Conditions(friction_factor=factor)
+    with pytest.raises(InvalidInput, match="mass"):
+        Conditions(mass_factor=factor)
