@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.estimators import Estimators
 from osfcore.control.events import (
     ActionExecuted,
     Event,
@@ -75,6 +76,7 @@ class Episode:
         rng: draws everything.
         start: what is known of the first frame already; without it, it is estimated from images with masks.
         prepared: estimates that are used in place of new ones where they explain the images.
+        estimators: how everything is estimated.
     """
 
     settings: EpisodeSettings
@@ -88,11 +90,12 @@ class Episode:
         rng: np.random.Generator,
         start: EstimatedState | None = None,
         prepared: PreparedLooks | None = None,
+        estimators: Estimators | None = None,
     ) -> None:
         self.settings = settings
         self._world, self._models, self._target, self._rng = world, models, goal, rng
         self._planner = MPPIPlanner(models.dynamics.rollout, PushProposals(models.shapes), settings.plan)
-        self._start, self._prepared = start, prepared
+        self._start, self._prepared, self._how = start, prepared, estimators or Estimators()
         self._number = 0
         self._progress, self._sight = ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
@@ -136,7 +139,7 @@ class Episode:
         observation = yield from self._observe(masks=self._start is None)
         self._check_objects(observation.names)
         if self._start is None:
-            steps = estimate_first(self._models.appearance, observation, self._rng)
+            steps = estimate_first(self._models.appearance, observation, self._rng, self._how.first)
             self._estimate = yield from self._look("first", observation, steps)
         else:
             self._estimate = self._start
@@ -186,7 +189,7 @@ class Episode:
         before = self._estimate
         expected = before.state if self._expected is None else self._expected
         models = self._models.appearance
-        steps = estimate_next(models, observation, expected, self._rng, usual=self._usual)
+        steps = estimate_next(models, observation, expected, self._rng, self._how.later, usual=self._usual)
         self._estimate = (yield from self._run_estimator("next", steps)).with_pusher(observation.pusher)
         yield from self._noticed_changes(before, expected)
         yield from self._find_lost()
@@ -216,7 +219,7 @@ class Episode:
         if self.settings.acting:
             yield from self._retreat()
         observation = yield from self._observe()
-        steps = relocalize(self._models.appearance, observation, self._estimate, self._rng)
+        steps = relocalize(self._models.appearance, observation, self._estimate, self._rng, self._how.goal)
         self._estimate = (yield from self._run_estimator("search", steps)).with_pusher(observation.pusher)
         self._planner.reset()
         self._before = None
@@ -238,14 +241,14 @@ class Episode:
         target, state, estimate, doubts = self._target, self._estimate.state, None, ""
         if isinstance(target, GoalImage):
             seen = target.observed(state.names)
-            steps = estimate_goal(self._models.appearance, seen, state)
+            steps = estimate_goal(self._models.appearance, seen, state, self._how.goal)
             estimate = yield from self._look("goal", seen, steps)
             estimate = prefer_current_poses(self._models.appearance, target, estimate, state)
             goal, doubts = PoseGoal(estimate.state.names, estimate.state.poses), estimate.reason
             light, camera, image = estimate.state.light, target.camera, target.image
         else:
             goal, light, camera = target, state.light, goal_camera()
-            image = self._rendered(replace(state, poses=_in_order(target, state.names)), camera, light)
+            image = self._rendered(replace(state, poses=target.poses_of(state.names)), camera, light)
         self._goal = snap_near_goals(goal, state, self._models.symmetries)
         self._light, self._camera, self._image = light, camera, image
         yield GoalFound(self._goal, image, camera, estimate)
@@ -338,10 +341,6 @@ class Episode:
 
     def _finished(self, outcome: Outcome, text: str) -> Finished:
         return Finished(self._number, outcome, text, self._estimate.state)
-
-
-def _in_order(goal: PoseGoal, names: tuple[str, ...]) -> Pose:
-    return goal.poses[[goal.names.index(name) for name in names]]
 
 
 def _future(futures: Rollouts, step: int, state: SceneState) -> SceneState:

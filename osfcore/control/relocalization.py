@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import estimate_next
@@ -17,7 +17,11 @@ from osfcore.geometry.states import Observation, SceneState
 
 
 def relocalize(
-    models: ObjectModels, observation: Observation, last: EstimatedState, rng: np.random.Generator
+    models: ObjectModels,
+    observation: Observation,
+    last: EstimatedState,
+    rng: np.random.Generator,
+    config: GoalImageConfig | None = None,
 ) -> Iterator[EstimateStep]:
     """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
 
@@ -26,6 +30,7 @@ def relocalize(
         observation: all views, at best without anything in front.
         last: the estimate whose doubted objects are looked for.
         rng: of the search.
+        config: how the one image is searched.
     """
     state = last.state
     lost = [n for n, doubt in enumerate(last.doubts) if doubt]
@@ -35,7 +40,7 @@ def relocalize(
         observation.time_s,
     )  # fmt: skip
     first_frame = None
-    for step in estimate_goal(models, alone, state):
+    for step in estimate_goal(models, alone, state, config):
         first_frame = step.estimate
         yield replace(step, estimate=None)
     assert first_frame is not None, "the last step brings the estimate"

@@ -32,7 +32,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
-_LIGHT_RAD = 0.03  # the first spread of the light, where it was searched before
+_LIGHT_RAD, _UNKNOWN_RAD = 0.03, 0.6  # the first spread of the light, where it was searched before and where not
 _HYPOTHESES = 3  # orientations of each object that the whole images choose from
 _RANKED_SHARP = 100
 _SHOWN = 24  # candidates of a ranking that are shown
@@ -50,8 +50,9 @@ class FirstFrameConfig:
         joint_generations: likewise.
         coarse_iterations: of Gauss-Newton at half the resolution.
         fine_iterations: at full resolution.
-        light: "search" for a search of the hemisphere before CMA, "cma" for CMA alone from overhead as in the paper,
-            "overhead" to hold it there (to measure what knowing the light is worth).
+        light: "search" for a search of the hemisphere before CMA, "cma" for CMA alone from overhead as in the paper.
+        held_light: unit vector toward a light that is not estimated, to measure what knowing it is worth; None to
+            estimate it.
     """
 
     starts: int = 3
@@ -61,7 +62,8 @@ class FirstFrameConfig:
     joint_generations: int = 5
     coarse_iterations: int = 3
     fine_iterations: int = 3
-    light: Literal["search", "cma", "overhead"] = "search"
+    light: Literal["search", "cma"] = "search"
+    held_light: tuple[float, float, float] | None = None
 
 
 def estimate_first(
@@ -109,6 +111,7 @@ class _FirstFrameEstimator:
         refinements = config.coarse_iterations + config.fine_iterations
         self._reporter = StepReporter(3 * len(self._names) + searches + refinements + 2)
         self._rivals: dict[int, float] = {}
+        self._held = None if config.held_light is None else np.array(config.held_light)
 
     def steps(self) -> Iterator[EstimateStep]:
         parts = [_visible_part(self._coarse, n) for n in range(len(self._names))]
@@ -117,9 +120,12 @@ class _FirstFrameEstimator:
         for name, part in zip(self._names, parts, strict=True):
             starts.append(initial_poses(self._models, name, part))
             yield self._ranking_step("orientations", f"{name}: how it may lie", starts, OVERHEAD)
-        light = OVERHEAD
-        if self._config.light == "search":
+        light = self._held
+        if light is None and self._config.light == "search":
             light = search_light(self._models, self._rough, self._coarse, self._initial_guess(starts, OVERHEAD))
+        if light is None:
+            light = OVERHEAD
+        else:
             yield self._ranking_step("light", "Shading and shadows", starts, light)
             for n, name in enumerate(self._names):
                 starts[n] = self._rerank(n, starts[n], light)
@@ -142,7 +148,7 @@ class _FirstFrameEstimator:
         self, parts: list[ObjectView], starts: list[RankedPoses], light: np.ndarray
     ) -> Iterator[EstimateStep]:  # returns the refined starts
         """MultistartCMA of each object's pose by the masked loss (eq. 5), the light held."""
-        population, brightness = self._config.population, self._config.light == "cma"
+        population, brightness = self._config.population, self._held is None and self._config.light == "cma"
         searches = [
             MultistartCMA(
                 self._models, name, part, own, light, population=population, rng=self._rng, any_brightness=brightness
@@ -167,7 +173,7 @@ class _FirstFrameEstimator:
     def _search_jointly(self, params: SceneParameters) -> Iterator[EstimateStep]:  # returns the guess
         """CMA-ES over all poses and the light by the photometric loss of whole images (eq. 6)."""
         config = self._config
-        spread = {"search": _LIGHT_RAD, "cma": 0.6, "overhead": 0.0}[config.light]
+        spread = 0.0 if self._held is not None else {"search": _LIGHT_RAD, "cma": _UNKNOWN_RAD}[config.light]
         scales = np.array([*([SHIFT_M / 2] * 3 + [TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
         search = CMAES(scales, config.joint_population, self._rng)
         best, least = params, np.inf
@@ -188,7 +194,7 @@ class _FirstFrameEstimator:
     def _refine(self, params: SceneParameters) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Gauss-Newton over all poses and the light, coarse to fine."""
         config = self._config
-        light = None if config.light == "overhead" else self._middle
+        light = None if self._held is not None else self._middle
         at = GaussNewtonState.at(params)
         rounds = (self._middle, config.coarse_iterations), (self._fine, config.fine_iterations)
         for views, iterations in rounds:
@@ -212,8 +218,8 @@ class _FirstFrameEstimator:
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
         fit = evaluate_fit(self._models, self._fine, at.params)
         estimate = estimate_with_uncertainty(
-            at.params, at.normals, fit, self._rivals, light_held=self._config.light == "overhead"
-        )
+            at.params, at.normals, fit, self._rivals, light_held=self._held is not None
+        )  # fmt: skip
         return self._reporter.finish(at, estimate)
 
     def _initial_guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:

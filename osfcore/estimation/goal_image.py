@@ -53,12 +53,14 @@ class GoalImageConfig:
         planar_iterations: of Gauss-Newton over position and yaw.
         free_iterations: of Gauss-Newton over whole poses.
         widen_all: match every object again in all resting orientations, also where none is doubted.
+        held_light: unit vector toward a light that is not estimated; None to estimate it.
     """
 
     side: int = FINE_SIDE
     planar_iterations: int = 5
     free_iterations: int = 8
     widen_all: bool = False
+    held_light: tuple[float, float, float] | None = None
 
 
 def estimate_goal(
@@ -97,6 +99,7 @@ class _GoalImageEstimator:
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, config.side)
+        self._light_views = self._middle if config.held_light is None else None  # in which the light is refined
         comparison = len(self._names) + config.free_iterations
         self._refinement = config.planar_iterations + _FINE_PLANAR + _COMPARISONS * comparison  # steps
         self._pass = count_of_scenes(len(self._names)) + self._refinement
@@ -190,7 +193,9 @@ class _GoalImageEstimator:
         for n, found in enumerate(matches):
             if len(found.scores):
                 positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
-        return SceneParameters(self._names, positions, quaternions, self._prior.light.direction, None)
+        held = self._config.held_light
+        light = self._prior.light.direction if held is None else np.array(held)
+        return SceneParameters(self._names, positions, quaternions, light, None)
 
     def _assemble(
         self, params: SceneParameters, matches: list[TemplateMatches]
@@ -211,7 +216,7 @@ class _GoalImageEstimator:
             (self._fine, PLANAR_PARAMETERS, _FINE_PLANAR),
         ):
             for step in gauss_newton(
-                self._models, views, at, iterations=iterations, numbers=numbers, light=self._middle
+                self._models, views, at, iterations=iterations, numbers=numbers, light=self._light_views
             ):
                 at = step
                 yield self._reporter.refinement("On the table", at)
@@ -253,7 +258,7 @@ class _GoalImageEstimator:
         at = replace(at, dampings=GaussNewtonState.at(at.params).dampings)
         sweeps = self._config.free_iterations
         for step in gauss_newton(
-            self._models, self._fine, at, iterations=sweeps, light=self._middle, until_settled=True
+            self._models, self._fine, at, iterations=sweeps, light=self._light_views, until_settled=True
         ):
             at = step
             yield self._reporter.refinement("The last millimetres", at)
@@ -267,7 +272,8 @@ class _GoalImageEstimator:
         """The estimate with its uncertainty; heights are checked, since one view hardly shows depth."""
         fit, poses = evaluate_fit(self._models, self._fine, at.params), at.params.state().poses
         lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
-        return estimate_with_uncertainty(at.params, at.normals, fit, rivals, lowest=lowest)
+        held = self._config.held_light is not None
+        return estimate_with_uncertainty(at.params, at.normals, fit, rivals, lowest=lowest, light_held=held)
 
     def _step(
         self,

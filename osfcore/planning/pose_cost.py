@@ -60,10 +60,13 @@ class PoseGoal:
         positions, quaternions = ([getattr(pose, part) for pose in every] for part in ("position", "quaternion"))
         return PoseGoal(self.names, Pose(np.array(positions), np.array(quaternions)))
 
+    def poses_of(self, names: tuple[str, ...]) -> Pose:
+        """The poses of objects in another order."""
+        return self.poses[[self.names.index(name) for name in names]]
+
     def offsets_m(self, state: SceneState) -> Float[np.ndarray, "N 2"]:
         """How far each object has to go, horizontally, in the order of the state [m]."""
-        order = [self.names.index(name) for name in state.names]
-        return self.poses.position[order, :2] - state.poses.position[:, :2]
+        return self.poses_of(state.names).position[:, :2] - state.poses.position[:, :2]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

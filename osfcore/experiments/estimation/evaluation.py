@@ -1,6 +1,6 @@
 """How good estimators are: first frames, tracking without masks, goals, ablations and spoiled inputs.
 
-Each task is a random scene of the ten default objects under a hidden light that stands 10 degrees or higher. First
+Each task is a random scene of known objects under a hidden light that stands 10 degrees or higher. First
 frames show it to four cameras with masks. Tracks follow 20 steps of pushes without masks, each estimate starting from
 the last one. Goals show some objects elsewhere under another light to the goal camera. Nothing of the truth ever
 reaches an estimator. Each finished part of a task is kept, so that an evaluation can be killed, resumed and run in
@@ -26,7 +26,6 @@ from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import write_json
 from osfcore.io.json_codec import decode
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.objects.catalogue import DEFAULT_NAMES
 
 REPORT_FILE = "report.json"
 _Results = dict[str, list[TaskResult]]
@@ -120,7 +119,10 @@ def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrar
         if part not in PARTS:
             raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
     image_side(config.size)
-    names = tuple(dict.fromkeys(DEFAULT_NAMES if config.names is None else config.names))
+    known = tuple(name for name in fields.names() if assets.has(name))
+    if config.names is None and not known:
+        raise MissingAssets(list(fields.names()))
+    names = known if config.names is None else tuple(dict.fromkeys(config.names))
     for name in names:
         fields.info(name)  # raises UnknownName
     missing = [name for name in names if not assets.has(name)]

@@ -43,6 +43,7 @@ from osfcore.io.json_codec import decode, encode
 from osfcore.io.state_file import estimated_from_json, estimated_to_json
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.types import Quality, SceneBatch
 
 FORMAT = 1  # of the kept results; rises when figures come to mean something else
@@ -50,6 +51,7 @@ Part = Literal["first", "track", "goal", "ablations"]
 PARTS: tuple[Part, ...] = ("first", "track", "goal", "ablations")
 VIEWS: dict[int, tuple[int, ...]] = {1: (0,), 2: (0, 2)}  # cameras that an ablation keeps: two face each other
 _SHOWN_QUALITY = Quality(samples_per_side=2)
+_OVERHEAD = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class EvaluateEstimate:
         seed: of scenes and searches.
         parts: what to measure; first frames are measured in any case, since everything else begins with them.
         bad: number of spoiled inputs.
-        names: objects to draw from, or None for the ten default ones.
+        names: objects to draw from; all that have a field and a mesh if None.
         steps: of an episode.
         size: side of the images [px].
         effort: of first frames.
@@ -116,7 +118,7 @@ class TaskRunner:
 
     def fixed_light(self, number: int) -> TaskResult:
         """The first frame with the light held overhead."""
-        effort = replace(self._config.effort, light="overhead")
+        effort = replace(self._config.effort, held_light=_OVERHEAD)
         return self._first("fixed_light", number, effort, range(len(self._cameras)))
 
     def few_views(self, number: int, views: int) -> TaskResult:
@@ -174,7 +176,7 @@ class TaskRunner:
         if kept is None:
             models = self._models
             frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views))
-            steps = estimate_first(models, frame.observation, np.random.default_rng([draw.seed, 4]), effort)
+            steps = estimate_first(models, frame.observation, stream_rng(draw.seed, Stream.FIRST_FRAME), effort)
             score, estimate = self._timed(steps, frame)
             state = None if estimate is None else estimated_to_json(estimate)
             figures = {"score": encode(score), "state": state}
@@ -194,7 +196,7 @@ class TaskRunner:
             self._models,
             self._meshes(draw.names),
             start,
-            np.random.default_rng([draw.seed, 5]),
+            stream_rng(draw.seed, Stream.TRACKING),
         )
         rows: dict[str, Any] = {key: [] for key in ("position_mm", "rotation_deg", "doubted", "seconds")}
         states = []
@@ -237,7 +239,7 @@ class TaskRunner:
         return TaskResult({"scores": scores, "moved": moved}, tuple(shown))
 
     def _spoiled(self, case: BadCase, seed: int) -> TaskResult:
-        models, config, rng = self._models, self._config, np.random.default_rng([seed, 4])
+        models, config, rng = self._models, self._config, stream_rng(seed, Stream.FIRST_FRAME)
         began, estimate, refused = time.perf_counter(), None, ""
         try:
             if case.start is None:

@@ -23,6 +23,8 @@ from osfcore.experiments.estimation.scores import (
 from osfcore.experiments.estimation.spoiled_inputs import BadScore, summary
 
 DRIFT_STEPS = (5, 10, 15, 20)
+_OF = ("median", "mean", "p90", "p95")
+_MOVED_M = 0.01
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,6 +66,7 @@ class EstimateReport:
         return {
             "tasks": len(self.first),
             **_frames(self.first, "first"),
+            "by_object": _by_object(self.first),
             **_uncertainty(self.first),
             **_goals(self.goals),
             "flagged_good": flagged_good,
@@ -82,17 +85,39 @@ def _frames(frames: Sequence[FrameScore], what: str) -> dict[str, Any]:
     return {
         "objects_total": sum(len(frame.names) for frame in frames),
         "frac_1cm_5deg": share_right(frames),
-        "position_mm_median": median(position),
-        "position_mm_p90": quantile(position, 0.9),
-        "rotation_deg_median": median(rotation),
-        "rotation_deg_p90": quantile(rotation, 0.9),
-        "adds_mm_median": median(o.adds_mm for o in objects),
-        "light_deg_median": median(frame.light_deg for frame in frames),
-        f"{what}_s_median": median(frame.seconds for frame in frames),
-        f"{what}_s_p90": quantile((frame.seconds for frame in frames), 0.9),
+        **_spread("position_mm", position),
+        **_spread("rotation_deg", rotation),
+        **_spread("adds_mm", [o.adds_mm for o in objects]),
+        **_spread("light_deg", [frame.light_deg for frame in frames if frame.light_deg is not None]),
+        **_spread(f"{what}_s", [frame.seconds for frame in frames]),
         f"{what}_refused": sum(bool(frame.refused) for frame in frames),
         f"{what}_out_of_view": sum(bool(o.absent) for o in objects),
     }
+
+
+def _spread(what: str, values: Sequence[float]) -> dict[str, float | None]:
+    """Median, mean and tails."""
+    return {
+        f"{what}_median": median(values),
+        f"{what}_mean": float(np.mean(values)) if len(values) else None,
+        f"{what}_p90": quantile(values, 0.9),
+        f"{what}_p95": quantile(values, 0.95),
+    }
+
+
+def _by_object(frames: Sequence[FrameScore]) -> dict[str, dict[str, Any]]:
+    """Of each object: how often it was seen, how often it was right, and its errors."""
+    rows: dict[str, dict[str, Any]] = {}
+    for name in sorted({name for frame in frames for name in frame.names}):
+        own = [o for o in objects_of(frames) if o.name == name]
+        shown = sum(name in frame.names for frame in frames)
+        rows[name] = {
+            "frames": shown,
+            "frac_1cm_5deg": sum(o.is_right for o in own) / shown,
+            **_spread("position_mm", [o.position_mm for o in own]),
+            **_spread("rotation_deg", [o.rotation_deg for o in own]),
+        }
+    return rows
 
 
 def _uncertainty(frames: Sequence[FrameScore]) -> dict[str, Any]:
@@ -114,8 +139,9 @@ def _goals(goals: Sequence[Sequence[FrameScore]] | None) -> dict[str, Any]:
     by_moved: dict[str, float | None] = {}
     for moved in range(max((len(task) for task in goals or ()), default=0)):
         by_moved[str(moved + 1)] = share_right([task[moved] for task in goals or () if len(task) > moved])
-    keys = ("frac_1cm_5deg", "position_mm_median", "rotation_deg_median", "light_deg_median", "objects_total")
-    own = ("goal_s_median", "goal_refused", "goal_out_of_view")
+    errors = [f"{what}_{of}" for what in ("position_mm", "rotation_deg", "light_deg") for of in _OF]
+    keys = ("frac_1cm_5deg", "objects_total", *errors)
+    own = (*(f"goal_s_{of}" for of in _OF), "goal_refused", "goal_out_of_view")
     if goals is None:
         return {**dict.fromkeys([f"goal_{key}" for key in keys] + list(own)), "goal_frac_1cm_5deg_by_moved": None}
     return {
@@ -133,8 +159,9 @@ def _tracks(tracks: Sequence[TrackScore] | None) -> dict[str, Any]:
     cameras are left out of drift and losses and counted here, as pairs of object and step.
     """
     keys = (
-        "refine_hz", "refine_s_median", "refine_s_p90", "track_episodes", "track_lost", "track_lost_from_wrong_start",
+        "refine_hz", *(f"refine_s_{of}" for of in _OF), "track_episodes", "track_lost", "track_lost_from_wrong_start",
         "track_objects_lost", "track_frac_1cm_5deg", "track_off_table", "track_out_of_view", "drift_mm", "drift_deg",
+        "track_moved", "track_resting",
     )  # fmt: skip
     if tracks is None:
         return dict.fromkeys(keys)
@@ -146,9 +173,10 @@ def _tracks(tracks: Sequence[TrackScore] | None) -> dict[str, Any]:
     absent = [why for track in tracks for row in track.absent for why in row]
     right = [is_right(p, r) for track in tracks for step in range(len(track.seconds)) for p, r in _seen(track, step)]
     values = (
-        1 / typical if typical else None, typical, quantile(seconds, 0.9), len(tracks), sum(map(bool, lost)),
+        1 / typical if typical else None, *_spread("", seconds).values(), len(tracks), sum(map(bool, lost)),
         sum(excused), sum(map(len, lost)), sum(right) / len(right) if right else None,
         absent.count("off the table"), absent.count("out of view"), drift(tracks, 0), drift(tracks, 1),
+        _apart(tracks, has_moved=True), _apart(tracks, has_moved=False),
     )  # fmt: skip
     return dict(zip(keys, values, strict=True))
 
@@ -168,6 +196,20 @@ def errors_at(tracks: Iterable[TrackScore], step: int, which: int) -> list[float
         which: 0 for position [mm], 1 for rotation [deg].
     """
     return [pair[which] for track in tracks if len(track.seconds) >= step for pair in _seen(track, step - 1)]
+
+
+def _apart(tracks: Sequence[TrackScore], *, has_moved: bool) -> dict[str, float | None]:
+    """Errors over all steps of the objects that were pushed at least 1 cm away in their episode, or of all others."""
+    rows = [
+        (track.position_mm[step][n], track.rotation_deg[step][n])
+        for track in tracks
+        for n, way_m in enumerate(track.moved_m)
+        if (way_m >= _MOVED_M) == has_moved
+        for step in range(len(track.seconds))
+        if not track.absent[step][n]
+    ]
+    position, rotation = ([row[k] for row in rows] for k in (0, 1))
+    return {**_spread("position_mm", position), **_spread("rotation_deg", rotation)}
 
 
 def _seen(track: TrackScore, step: int) -> list[tuple[float, float]]:

@@ -95,7 +95,9 @@ def test_one_view_and_the_pusher_in_it(models):
 @pytest.mark.slow
 def test_a_light_held_overhead_stays_there(models):
     state = scene({BOX: lying(models, BOX, 30, 0.0, -0.03)}, (0, 0, 1.0))
-    steps = steps_of(models, observe(models, state, default_cameras(64)[:2]), replace(QUICK, light="overhead"))
+    steps = steps_of(
+        models, observe(models, state, default_cameras(64)[:2]), replace(QUICK, held_light=(0.0, 0.0, 1.0))
+    )
     for step in steps:
         np.testing.assert_allclose(step.state.light.direction, [0, 0, 1], atol=1e-12)
     estimate = steps[-1].estimate

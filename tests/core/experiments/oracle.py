@@ -47,7 +47,9 @@ class Oracle:
             self.refuses -= 1
             raise InvalidInput("masks", "missing", "given")
         assert observation.masks is not None
-        yield from self._answer(f"first {effort.light} {len(observation.cameras)}", observation)
+        yield from self._answer(
+            f"first {'held' if effort.held_light else effort.light} {len(observation.cameras)}", observation
+        )
 
     def next(self, _models, observation, expected, _rng, _effort):
         assert observation.masks is None

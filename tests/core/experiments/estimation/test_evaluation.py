@@ -6,7 +6,6 @@ import pytest
 import osfcore.experiments.estimation.parts as parts
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.estimation.evaluation import REPORT_FILE, evaluate_estimate
-from osfcore.experiments.estimation.parts import EvaluateEstimate
 from osfcore.objects.asset_library import AssetLibrary
 from tests.core.experiments.oracle import SHIFT_M, Oracle
 from tests.core.experiments.quick import quick
@@ -152,6 +151,4 @@ def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library
             next(evaluate_estimate(wrong, solids, library))
     with pytest.raises(MissingAssets, match=SOLIDS[0]):
         next(evaluate_estimate(config, solids, AssetLibrary(tmp_path / "none")))
-    with pytest.raises(UnknownName, match="002_master_chef_can"):  # the default ones are asked for as they are
-        next(evaluate_estimate(EvaluateEstimate(tmp_path / "out"), solids, library))
     assert not (tmp_path / "out").exists()

@@ -73,7 +73,7 @@ def test_ablations_see_fewer_cameras_or_hold_the_light(runner, oracle):
     runner.fixed_light(0)
     for views in VIEWS:
         runner.few_views(0, views)
-    assert [what for what, _ in oracle.asked] == ["first overhead 4", "first search 1", "first search 2"]
+    assert [what for what, _ in oracle.asked] == ["first held 4", "first search 1", "first search 2"]
     one, other = (default_cameras()[n] for n in VIEWS[2])
     forward = [rotate(camera.T_world_camera.quaternion, np.array([0, 0, 1.0])) for camera in (one, other)]
     assert forward[0][:2] @ forward[1][:2] < 0  # they face each other
