@@ -1,4 +1,4 @@
-"""Worker processes for commands that take `--workers`."""
+"""Worker processes for commands that take `--workers`, and Dask clusters for those that take `--cluster`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,29 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, OsfError, WorkerDied
 
 MAX_WORKERS = 256
+_ANSWERS_WITHIN_S = 10
 
 
 @contextmanager
-def worker_pool(workers: int) -> Iterator[Executor | None]:
+def worker_pool(workers: int, cluster: str | None = None) -> Iterator[Executor | None]:
     """Processes that share the work; None, which means this process alone, for one.
 
+    Args:
+        workers: processes of this machine.
+        cluster: address of a Dask scheduler whose workers share the work instead.
+
     Raises:
-        InvalidInput: if the number is out of range.
+        InvalidInput: if the number is out of range, or nothing answers at the address.
+        OsfError: if Dask is not installed.
+        WorkerDied: if a piece of work has ended several workers of the cluster.
     """
+    if cluster is not None:
+        with _cluster(cluster) as executor:
+            yield executor
+        return
     if not 1 <= workers <= MAX_WORKERS:
         raise InvalidInput("number of workers", workers, f"between 1 and {MAX_WORKERS}")
     executor = _processes(workers) if workers > 1 else None
@@ -31,6 +42,25 @@ def worker_pool(workers: int) -> Iterator[Executor | None]:
     finally:
         if executor is not None:
             executor.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+        from distributed.scheduler import KilledWorker
+    except ImportError:
+        raise OsfError("--cluster needs Dask; 'pip install osf-manipulation[cluster]' brings it.") from None
+    try:
+        client = Client(address, timeout=_ANSWERS_WITHIN_S, set_as_default=False)
+    except (OSError, ValueError):
+        allowed = "that of a running Dask scheduler, such as tcp://127.0.0.1:8786 ('dask scheduler' tells its own)"
+        raise InvalidInput("address of the cluster", address, allowed) from None
+    with client:
+        try:
+            yield client.get_executor()
+        except KilledWorker as error:
+            raise WorkerDied("sharing the work of the cluster") from error
 
 
 def _processes(workers: int) -> Executor | None:

@@ -12,6 +12,8 @@ from app.cli.progress_bar import follow
 from app.cli.workers import worker_pool
 from app.storage.paths import default_data_dir
 
+_IN_FLIGHT = 64  # episodes that a cluster is given at once
+
 
 @dataclass(frozen=True)
 class CollectObjectCommand:
@@ -81,6 +83,8 @@ class CollectPushesCommand:
     """Uniform random velocities, or a pusher that seeks sustained contact."""
     workers: int = 2
     """Processes that simulate side by side; the content does not depend on it."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers simulate instead; they need the same data folder."""
     seed: int = 0
     """Of everything."""
     images: bool = False
@@ -103,8 +107,9 @@ class CollectPushesCommand:
 
         config = CollectPushes(self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images,
                                self.renderer, self.names, self.disturb)  # fmt: skip
-        with worker_pool(self.workers) as executor:
-            last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, self.workers + 2))
+        in_flight = self.workers + 2 if self.cluster is None else _IN_FLIGHT
+        with worker_pool(self.workers, self.cluster) as executor:
+            last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, in_flight))
         result: dict[str, Any] = {"out": str(self.out), "episodes": self.episodes, "steps": self.steps}
         if last is not None:
             result |= {

@@ -1,28 +1,36 @@
-"""Figures and pictures of an evaluation of planning."""
+"""Figures and pictures of an evaluation of rearrangement."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from osfcore.experiments.charts import Axis, Chart, cumulative, write_charts
+from osfcore.experiments.statistics import compare_means, compare_shares, mean_interval, share_interval
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.inspection.contact_sheet import contact_sheet
 from osfcore.io.image_file import write_png
-from osfcore.metrics.success import OTHERS_M, SUCCESS_DEG, SUCCESS_M, RearrangementScore
+from osfcore.io.json_codec import decode
+from osfcore.metrics.success import SUCCESS_M, ObjectScore, RearrangementScore
 
 CURVE_MM = (5, 10, 15, 20, 30, 40, 60, 80, 100)
+_LOOSE_DEG = 15.0
 _NEVER_MM = 1e6  # the error of a task in which something else was pushed away
 _CHART_MM, _CHART_6D = 60.0, 0.6
 _PER_ROW = 10
+_TESTS: dict[str, Callable[[RearrangementScore], bool]] = {
+    "success_tight": RearrangementScore.is_tight,
+    "success_2cm": RearrangementScore.is_success,
+    "success_2cm_15deg": lambda score: score.is_success(SUCCESS_M, _LOOSE_DEG),
+}
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class MpcReport:
     """Results of all tasks, in their order.
 
@@ -34,55 +42,129 @@ class MpcReport:
     ours: tuple[TaskResult, ...]
     oracle: tuple[TaskResult, ...]
 
+    @cached_property
+    def overruled(self) -> list[RearrangementScore]:
+        """How our tables ended, where doubts about the goal were overruled."""
+        return scores_of(self.ours, "score")
+
+    @cached_property
+    def nothing(self) -> list[RearrangementScore]:
+        """How they are without any action."""
+        return scores_of(self.ours, "noaction")
+
+    @cached_property
+    def shipped(self) -> list[RearrangementScore]:
+        """How our tables end as it ships: nothing is moved where the goal is doubted."""
+        trio = zip(self.ours, self.overruled, self.nothing, strict=True)
+        return [nothing if result.figures["goal_doubt"] else overruled for result, overruled, nothing in trio]
+
+    @cached_property
+    def told_truth(self) -> list[RearrangementScore]:
+        """How the oracle's tables ended."""
+        return scores_of(self.oracle, "score")
+
     def to_json(self) -> dict[str, Any]:
         """All figures; lengths in mm, angles in degrees, shares in [0, 1]."""
-        scores, oracle = scores_of(self.ours, "score"), scores_of(self.oracle, "score")
-        nothing = scores_of(self.ours, "noaction")
-        success = [score.is_success() for score in scores]
-        strict = [score.is_success(SUCCESS_M, SUCCESS_DEG) for score in scores]
-        by_moved = {
-            str(count): _mean([score.is_success() for score in scores if score.moved == count])
-            for count in sorted({score.moved for score in scores})
-        }
+        scores, nothing = self.shipped, self.nothing
         final = [score.moved_mm for score in scores]
+        is_curve = {str(mm): _mean([score.is_success(mm / 1000) for score in scores]) for mm in CURVE_MM}
         return {
             "tasks": len(scores),
-            "success_2cm": _mean(success),
-            "success_2cm_interval": [round(end, 3) for end in interval(sum(success), len(success))],
-            "success_2cm_15deg": _mean(strict),
-            "success_by_moved": by_moved,
-            "success_curve": {
-                str(mm): _mean([score.is_success(mm / 1000) for score in scores]) for mm in CURVE_MM
-            },
+            **_figures(scores, ""),
+            **_figures(self.told_truth, "oracle_"),
+            **_figures(nothing, "noaction_"),
+            **{f"{key}_overruled": _mean([test(s) for s in self.overruled]) for key, test in _TESTS.items()},
+            "refused": sum(bool(result.figures["goal_doubt"]) for result in self.ours),
+            "success_by_moved": self._by_moved("success_2cm"),
+            "success_tight_by_moved": self._by_moved("success_tight"),
+            "success_curve": is_curve,
             "final_mm_mean": _rounded(np.mean(final), 2),
             "final_mm_median": _rounded(np.median(final), 2),
             "final_deg_median": _rounded(np.median([score.moved_deg for score in scores]), 2),
-            "pose6d_mean": _rounded(np.mean([score.pose6d for score in scores]), 4),
-            "replan_s_median": self._median("plan_s"),
-            "estimate_s_median": self._median("estimate_s"),
-            "first_s_median": self._median("first_s"),
-            "goal_s_median": self._median("goal_s"),
-            "episode_s_median": self._median("episode_s"),
-            "steps_median": self._median("steps"),
-            "goals_doubted": sum(bool(result.figures["goal_doubt"]) for result in self.ours),
-            "goal_mm_median": self._median("goal_mm"),
-            "oracle_success_2cm": _mean([score.is_success() for score in oracle]) if oracle else None,
-            "oracle_success_2cm_15deg": (
-                _mean([score.is_success(SUCCESS_M, SUCCESS_DEG) for score in oracle]) if oracle else None
-            ),
-            "oracle_final_mm_mean": _rounded(np.mean([score.moved_mm for score in oracle]), 2) if oracle else None,
-            "noaction_success_2cm": _mean([score.is_success() for score in nothing]),
             "start_mm_mean": _rounded(np.mean([score.moved_mm for score in nothing]), 1),
-        }  # fmt: skip
+            "oracle_final_mm_mean": _mean_of([score.moved_mm for score in self.told_truth]),
+            "seconds_robot_median": self._robot_s(),
+            **{f"{told}_s_median": self._median(f"{key}_s") for told, key in _STAGES.items()},
+            "steps_median": self._median("steps"),
+            **{f"{key}_median": self._median(key) for key in ("goal_mm", "first_mm", "first_deg", "light_deg")},
+            "against_noaction": self._against(nothing),
+            "against_oracle": self._against(self.told_truth) if self.oracle else None,
+            "by_object": _by_object(scores),
+            "rejected_layouts": self._rejected(),
+        }
+
+    def _by_moved(self, key: str) -> dict[str, float]:
+        counts = sorted({len(score.moved) for score in self.shipped})
+        test = _TESTS[key]
+        return {
+            str(count): _mean([test(score) for score in self.shipped if len(score.moved) == count]) for count in counts
+        }
+
+    def _robot_s(self) -> float | None:
+        """Until the loop ended, over tasks within 2 cm."""
+        pairs = zip(self.ours, self.shipped, strict=True)
+        seconds = [result.figures["robot_s"] for result, score in pairs if score.is_success()]
+        return _rounded(np.median(seconds), 2) if seconds else None
+
+    def _against(self, others: Sequence[RearrangementScore]) -> dict[str, Any]:
+        """Paired by task."""
+        told: dict[str, Any] = {}
+        for key in ("success_tight", "success_2cm"):
+            test = _TESTS[key]
+            told[key] = compare_shares([test(score) for score in self.shipped], [test(score) for score in others])
+        for key in ("pose6d", "pose6d_symmetric"):
+            told[key] = compare_means(*([getattr(score, key) for score in them] for them in (self.shipped, others)))
+        return told
+
+    def _rejected(self) -> dict[str, int]:
+        reasons = sorted({reason for result in self.ours for reason in result.figures["rejected"]})
+        return {reason: sum(one.figures["rejected"].get(reason, 0) for one in self.ours) for reason in reasons}
 
     def _median(self, key: str) -> float | None:
         values = [result.figures[key] for result in self.ours if result.figures[key] is not None]
         return _rounded(np.median(values), 3) if values else None
 
 
+_STAGES = {"replan": "plan", "estimate": "estimate", "first": "first", "goal": "goal", "episode": "episode"}
+
+
+def _figures(scores: Sequence[RearrangementScore], who: str) -> dict[str, Any]:
+    """What is told of everybody alike; None of nobody."""
+    told: dict[str, Any] = {}
+    for key, test in _TESTS.items():
+        passed = [test(score) for score in scores]
+        told[who + key] = _mean(passed) if scores else None
+        limits = share_interval(sum(passed), len(scores)) if scores else None
+        told[f"{who}{key}_interval"] = None if limits is None else [round(end, 3) for end in limits]
+    for key in ("pose6d", "pose6d_symmetric"):
+        values = [getattr(score, key) for score in scores]
+        told[f"{who}{key}_mean"] = _rounded(np.mean(values), 4) if scores else None
+        told[f"{who}{key}_median"] = _rounded(np.median(values), 4) if scores else None
+        told[f"{who}{key}_mean_interval"] = [_rounded(end, 4) for end in mean_interval(values)] if scores else None
+    return told
+
+
+def _by_object(scores: Sequence[RearrangementScore]) -> dict[str, dict[str, float]]:
+    """Of each object, how it ended where it had to move."""
+    rows: dict[str, list[ObjectScore]] = {}
+    for score in scores:
+        for one in score.moved:
+            rows.setdefault(one.name, []).append(one)
+    return {
+        name: {
+            "moved": len(ends),
+            "tight": _mean([end.is_tight() for end in ends]),
+            "within_2cm": _mean([end.is_within(SUCCESS_M, np.inf) for end in ends]),
+            "mm_median": _rounded(np.median([end.mm for end in ends]), 2),
+            "deg_median": _rounded(np.median([end.deg for end in ends]), 2),
+        }
+        for name, ends in sorted(rows.items())
+    }
+
+
 def scores_of(results: Sequence[TaskResult], key: str) -> list[RearrangementScore]:
     """The scores among the figures of results."""
-    return [RearrangementScore(**result.figures[key]) for result in results]
+    return [decode(RearrangementScore, result.figures[key], "score") for result in results]
 
 
 def write_pictures(folder: Path, report: MpcReport) -> None:
@@ -91,9 +173,9 @@ def write_pictures(folder: Path, report: MpcReport) -> None:
     Raises:
         CannotWrite: if the disk refuses.
     """
-    kinds = {"from images": scores_of(report.ours, "score"), "no action": scores_of(report.ours, "noaction")}
+    kinds = {"from images": report.shipped, "no action": report.nothing}
     if report.oracle:
-        kinds["told the truth"] = scores_of(report.oracle, "score")
+        kinds["told the truth"] = report.told_truth
     share, mm, sixd = Axis("share of tasks", 0, 1), Axis("threshold [mm]", 0, _CHART_MM), Axis("distance", 0, _CHART_6D)
     reached = [cumulative(name, [_reached_mm(score) for score in scores], mm) for name, scores in kinds.items()]
     poses = [cumulative(name, [score.pose6d for score in scores], sixd) for name, scores in kinds.items()]
@@ -104,18 +186,17 @@ def write_pictures(folder: Path, report: MpcReport) -> None:
 
 
 def _reached_mm(score: RearrangementScore) -> float:
-    return score.moved_mm if score.others_mm <= 1000 * OTHERS_M else _NEVER_MM
+    """Of the object that is farthest from its goal."""
+    return max(one.mm for one in score.moved) if score.others_mm <= 1000 * SUCCESS_M else _NEVER_MM
 
 
 def _mean(values: Sequence[bool]) -> float:
     return round(float(np.mean(values)), 4)
 
 
+def _mean_of(values: Sequence[float]) -> float | None:
+    return _rounded(np.mean(values), 2) if values else None
+
+
 def _rounded(value: np.floating[Any] | float, digits: int) -> float:
     return round(float(value), digits)
-
-
-def interval(successes: int, tasks: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    limits = binomtest(successes, tasks).proportion_ci(method="wilson")
-    return float(limits.low), float(limits.high)

@@ -10,10 +10,12 @@ from jaxtyping import Float
 
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.estimators import Estimators
 from osfcore.control.events import Event
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
 from osfcore.control.scene_models import SceneModels
+from osfcore.experiments.rearrangement.factors import Factor, VariedWorld
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.states import SceneState
 from osfcore.metrics.success import RearrangementTask
@@ -46,6 +48,8 @@ def run_from_images(
     models: SceneModels,
     settings: EpisodeSettings,
     rng: np.random.Generator,
+    estimators: Estimators | None = None,
+    factor: Factor | None = None,
 ) -> Iterator[Event | Ended]:
     """The whole loop; the last step is how it ended.
 
@@ -55,12 +59,14 @@ def run_from_images(
         models: of the task's objects.
         settings: how the loop goes.
         rng: of estimates and plans.
+        estimators: how everything is estimated.
+        factor: how the world differs from what is taken for granted.
     """
-    world = Tabletop(assets)
+    world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0])
     try:
-        goal = _goal_image(world, task)
+        goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
-        yield from Episode(world, models, goal, settings, rng).run()
+        yield from Episode(world, models, goal, settings, rng, estimators=estimators).run()
         yield _ended(world, goal)
     finally:
         world.close()
@@ -130,6 +136,6 @@ def _goal_image(world: Tabletop, task: RearrangementTask) -> GoalImage:
     return GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
 
 
-def _ended(world: Tabletop, goal: GoalImage) -> Ended:
+def _ended(world: Tabletop | VariedWorld, goal: GoalImage) -> Ended:
     image = world.render((goal.camera,), with_pusher=False).images[0]
     return Ended(world.truth(), image, goal.image)

@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -6,6 +8,7 @@ from hypothesis import strategies as st
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import SceneState
+from osfcore.io.json_codec import decode
 from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.catalogue import CATALOGUE
@@ -36,8 +39,11 @@ def off(shifts=(), turns=(), task: RearrangementTask = TASK, symmetries=SYMMETRI
 
 def test_nothing_off_is_a_success():
     score = off()
-    assert score == RearrangementScore(1, 0.0, pytest.approx(0, abs=1e-5), 0.0, pytest.approx(0, abs=1e-9))
+    assert (score.moved_mm, score.others_mm, len(score.moved)) == (0.0, 0.0, 1)
+    assert score.moved_deg == pytest.approx(0, abs=1e-5)
+    assert score.pose6d == pytest.approx(0, abs=1e-9)
     assert score.is_success(0.0, 0.1)
+    assert score.is_tight()
     assert not score_of(TASK, START, SYMMETRIES).is_success()
     assert score_of(TASK, START, SYMMETRIES).moved_mm == pytest.approx(100)
 
@@ -69,18 +75,38 @@ def test_what_should_stay_must_not_be_pushed_away():
     assert not spoiled.is_success(1.0)
 
 
-def test_what_had_to_move_is_averaged_and_then_nothing_else_is_left():
+def test_every_object_that_had_to_move_must_arrive():
     task = RearrangementTask(2, START, GOAL, NAMES)
-    score = off({0: 0.03, 1: 0.06}, {2: 0.3}, task)
-    assert (score.moved, score.others_mm) == (3, 0.0)
-    assert score.moved_mm == pytest.approx(30)
+    score = off({0: 0.03, 1: 0.006}, {2: 0.3}, task)
+    assert (len(score.moved), score.others_mm) == (3, 0.0)
+    assert score.moved_mm == pytest.approx(12)
     assert score.moved_deg == pytest.approx(np.rad2deg(0.1), abs=1e-4)
+    assert not score.is_success()
+    assert score.is_success(0.031)
+
+
+def test_tight_means_two_centimetres_and_a_tenth_of_a_radian_for_all():
+    assert off({0: 0.0199}, {0: 0.0999}).is_tight()
+    assert not off({0: 0.0201}).is_tight()
+    assert not off(turns={0: 0.1001}).is_tight()
+    assert not off(turns={1: 0.1001}).is_tight()  # it should have stayed as it was
+    assert off(turns={1: 0.1001}).is_success()
+
+
+def test_scores_survive_as_json():
+    score = off({0: 0.03, 1: 0.006}, {2: 0.3})
+    told = json.loads(json.dumps(score.to_json()))
+    assert decode(RearrangementScore, told, "score") == score
+    assert (told["moved"], told["moved_mm"]) == (1, pytest.approx(30))
 
 
 def test_orientations_that_look_the_same_are_the_same():
     brick = RearrangementTask(0, START, GOAL, NAMES[2:])
     assert off(turns={2: np.pi}, task=brick).moved_deg == pytest.approx(0, abs=1e-4)
     assert off(turns={2: np.pi / 2}, task=brick).moved_deg == pytest.approx(90)
+    turned = off(turns={2: np.pi}, task=brick)
+    assert turned.pose6d == pytest.approx(np.sqrt(2) / 3)
+    assert turned.pose6d_symmetric == pytest.approx(0, abs=1e-6)
     none = dict.fromkeys(NAMES, Symmetry("none"))
     assert off(turns={2: np.pi}, task=brick, symmetries=none).moved_deg == pytest.approx(180)
 

@@ -1,5 +1,6 @@
 import json
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from osfcore.experiments.benchmarks import rollouts as bench_dynamics
 from osfcore.experiments.dynamics import evaluation as dynamics
 from osfcore.experiments.estimation.parts import EvaluateEstimate
 from osfcore.experiments.fields.evaluation import EvaluateFields
-from osfcore.experiments.rearrangement import evaluation as mpc
+from osfcore.experiments.rearrangement import measured_episodes as mpc
 from osfcore.experiments.rearrangement.runs import Ended
 from osfcore.world.collection.collect_images import CollectObject, collect_object
 from tests.core.experiments.oracle import Oracle
@@ -111,7 +112,7 @@ def test_estimators_are_measured_in_pieces(fields_dir, oracle, tmp_path, capsys)
     [
         (["--names", "teapot"], "teapot"),
         (["--tasks", "0"], "number of tasks is 0"),
-        ([], "osf assets fetch"),  # the default objects are not all here
+        (["--names", "011_banana"], "osf assets fetch"),
     ],
 )
 def test_a_mistake_about_estimators_is_one_sentence(fields_dir, oracle, tmp_path, capsys, arguments, words):
@@ -160,14 +161,14 @@ def runs(monkeypatch):
     """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
     made, image = [], np.full((16, 16, 3), 0.5)
 
-    def ours(task, _assets, _models, settings, _rng):
+    def ours(task, _assets, _models, settings, _rng, _estimators, _factor):
         made.append(settings.cost)
         yield Finished(0, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, image, image)
 
     monkeypatch.setattr(mpc, "run_from_images", ours)
     monkeypatch.setattr(mpc, "run_told_the_truth", lambda task, *_: Ended(task.goal, image, image))
-    monkeypatch.setattr(mpc, "load_scene_models", lambda *_: None)
+    monkeypatch.setattr(mpc, "load_scene_models", lambda *_: SimpleNamespace(symmetries={}))
     return made
 
 
@@ -178,12 +179,19 @@ def test_episodes_are_measured(data_dir, runs, capsys):
     result = json.loads(told.out.splitlines()[-1])
     assert (result["tasks"], result["objects"], result["success_2cm"], result["oracle_success_2cm"]) == (2, 1, 1, 1)
     assert (result["noaction_success_2cm"], result["final_mm_mean"], result["replan_s_median"]) == (0, 0, None)
-    assert "Told the truth" in told.err
+    assert "2 of 4 episodes" in told.err
     assert json.loads((data_dir / "evaluation" / "mpc.json").read_text()) == result
     assert main([*arguments, "--names", "009_gelatin_box"]) == 0  # taken over
     shown = capsys.readouterr().out
     assert runs == ["pose", "pose"]
-    for words in ("2 tasks with 1 objects, pose cost: 100.0 %", "100.0 % of 1", "Told the truth", "A plan takes - s"):
+    for words in (
+        "2 tasks of the family 'shifted' with 1 objects and 30 actions, pose cost:",
+        "100.0 % within 2 cm and 0.1 rad (34 to 100.0 %)",
+        "0 goals refused",
+        "100.0 % of 1",
+        "Told the truth",
+        "A plan takes - s",
+    ):
         assert words in shown, words
     assert main([*arguments, "--cost", "image", "--no-oracle"]) == 0
     assert "Told the truth" not in capsys.readouterr().out

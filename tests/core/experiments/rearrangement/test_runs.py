@@ -10,8 +10,9 @@ from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed
 from osfcore.control.scene_models import load_scene_models
 from osfcore.errors import OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
+from osfcore.experiments.rearrangement.factors import VariedWorld
 from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
-from osfcore.experiments.rearrangement.tasks import mpc_task
+from osfcore.experiments.rearrangement.tasks import TaskSet, draw_task
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
@@ -27,7 +28,7 @@ QUICK = EpisodeSettings(steps=2, plan=PlanSettings(samples=8, horizon=4), despit
 
 @pytest.fixture(scope="module")
 def task(library):
-    return mpc_task(library, (NAME,), 1, 0, 1)
+    return draw_task(library, TaskSet((NAME,), objects=1), 1).task
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +41,21 @@ def worlds(monkeypatch):
     """The worlds that are made, which count their actions."""
     made = []
 
-    class Watched(Tabletop):
-        def __init__(self, *args, **more):
-            super().__init__(*args, **more)
-            self.acted = 0
-            made.append(self)
+    def watched(kind):
+        class Watched(kind):
+            def __init__(self, *args, **more):
+                super().__init__(*args, **more)
+                self.acted = 0
+                made.append(self)
 
-        def act(self, action):
-            self.acted += 1
-            super().act(action)
+            def act(self, action):
+                self.acted += 1
+                super().act(action)
 
-    monkeypatch.setattr(module, "Tabletop", Watched)
+        return Watched
+
+    for kind in (Tabletop, VariedWorld):
+        monkeypatch.setattr(module, kind.__name__, watched(kind))
     return made
 
 

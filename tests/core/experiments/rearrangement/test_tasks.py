@@ -1,25 +1,30 @@
+from collections import Counter
+
 import numpy as np
 import pytest
 
 import osfcore.experiments.rearrangement.tasks as module
-from osfcore.errors import MissingAssets, NoRoom
-from osfcore.experiments.estimation.tasks import SHIFT_M
-from osfcore.experiments.rearrangement.tasks import mpc_task
-from osfcore.geometry.poses import Pose, rotation_angle
+from osfcore.errors import InvalidInput, MissingAssets, NoRoom
+from osfcore.experiments.rearrangement.tasks import FAMILIES, MIN_SHIFT_M, TURN_DEG, TaskSet, draw_task
+from osfcore.geometry.poses import rotate, rotation_angle
 from osfcore.geometry.workspace import PUSHER_REACH_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.goal_layouts import draw_goal
 from osfcore.world.placing import GAP_M
 from osfcore.world.tabletop import Tabletop
 
 NAMES = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box")
 NUMBERS = range(6)
+UP = np.array([0.0, 0.0, 1.0])
 RESTS_M, RESTS_RAD = 0.004, 0.06  # what a let go may change, twice: at the start and at the goal
 
 
+def tasks_of(library, family, objects=3, seed=0, names=NAMES, numbers=NUMBERS):
+    return [draw_task(library, TaskSet(names, family, objects, seed), number).task for number in numbers]
+
+
 @pytest.fixture(scope="module")
-def tasks(library):
-    return [mpc_task(library, NAMES, 3, 0, number) for number in NUMBERS]
+def families(library):
+    return {family: tasks_of(library, family) for family in FAMILIES}
 
 
 def same(a, b):
@@ -29,50 +34,114 @@ def same(a, b):
     np.testing.assert_array_equal(a.light.direction, b.light.direction)
 
 
-def test_a_task_is_the_same_again_without_the_others(library, tasks):
-    again = mpc_task(library, NAMES, 3, 0, 4)
-    same(again.start, tasks[4].start)
-    same(again.goal, tasks[4].goal)
-    assert (again.number, again.moved) == (4, tasks[4].moved)
-    other = mpc_task(library, NAMES, 3, 1, 4)
+def shift(task, name):
+    return np.linalg.norm((task.goal.pose(name).position - task.start.pose(name).position)[:2])
+
+
+def turn(task, name):
+    return rotation_angle(task.start.pose(name).quaternion, task.goal.pose(name).quaternion)
+
+
+def test_a_task_is_the_same_again_without_the_others(library, families):
+    (again,) = tasks_of(library, "shifted", numbers=[4])
+    expected = families["shifted"][4]
+    same(again.start, expected.start)
+    same(again.goal, expected.goal)
+    assert (again.number, again.moved) == (4, expected.moved)
+    (other,) = tasks_of(library, "shifted", seed=1, numbers=[4])
     assert np.abs(other.start.light.direction - again.start.light.direction).max() > 1e-3
 
 
-def test_one_two_and_three_objects_move_in_turn(library, tasks):
-    assert [task.number for task in tasks] == list(NUMBERS)
-    assert [len(set(task.moved)) for task in tasks] == [1, 2, 3, 1, 2, 3]
-    assert len({task.start.light.direction[0] for task in tasks}) == len(tasks)
-    assert [len(mpc_task(library, NAMES, 2, 0, number).moved) for number in range(3)] == [1, 2, 1]
-    assert len(mpc_task(library, NAMES, 1, 0, 5).moved) == 1
+def test_one_two_and_three_objects_move_in_turn(library, families):
+    for family in ("shifted", "turned", "relit"):
+        assert [len(set(task.moved)) for task in families[family]] == [1, 2, 3, 1, 2, 3]
+    assert [len(task.moved) for task in families["crowded"]] == [2, 2, 3, 2, 2, 3]
+    assert [len(task.moved) for task in tasks_of(library, "shifted", 2, numbers=range(3))] == [1, 2, 1]
+    assert [len(task.moved) for task in tasks_of(library, "crowded", 2, numbers=range(3))] == [2, 2, 2]
+    assert len(tasks_of(library, "shifted", 1, numbers=[5])[0].moved) == 1
 
 
-def test_what_moves_lies_elsewhere_on_the_same_side_and_the_rest_stays(tasks):
-    for task in tasks:
+@pytest.mark.parametrize("family", FAMILIES)
+def test_what_moves_lies_elsewhere_in_the_workspace_and_the_rest_stays(families, family):
+    for task in families[family]:
         for name in task.start.names:
             here, there = task.start.pose(name), task.goal.pose(name)
-            shift = np.linalg.norm((there.position - here.position)[:2])
-            assert rotation_angle(here.quaternion, there.quaternion) < RESTS_RAD
             assert there.position[2] == pytest.approx(here.position[2], abs=RESTS_M)
             if name in task.moved:
-                assert SHIFT_M[0] - RESTS_M < shift < SHIFT_M[1] + RESTS_M
                 assert np.abs(there.position[:2]).max() < WORKSPACE_HALF_M + RESTS_M
+                assert family == "crowded" or shift(task, name) > MIN_SHIFT_M - RESTS_M
             else:
-                assert shift < RESTS_M
+                assert shift(task, name) < RESTS_M
+            if family != "turned" or name not in task.moved:
+                assert turn(task, name) < RESTS_RAD
 
 
-def test_a_goal_shows_no_pusher_under_the_same_light(tasks):
-    assert SHIFT_M == (0.075, 0.2)
-    for task in tasks:
-        assert task.goal.pusher is None
-        assert task.goal.names == task.start.names
-        np.testing.assert_array_equal(task.goal.light.direction, task.start.light.direction)
-        assert np.abs(task.start.pusher[:2]).max() <= PUSHER_REACH_M
+def test_turned_objects_are_turned_about_the_vertical_by_what_is_said(families):
+    turns = []
+    for task in families["turned"]:
+        for name in task.moved:
+            turns.append(np.rad2deg(turn(task, name)))
+            up = [
+                rotate(pose.quaternion * [1, -1, -1, -1], UP) for pose in (task.start.pose(name), task.goal.pose(name))
+            ]
+            np.testing.assert_allclose(up[0], up[1], atol=RESTS_RAD)  # the object's own vertical
+    assert TURN_DEG[0] - 4 < min(turns) < 80 < max(turns) <= TURN_DEG[1] + 4
 
 
-def test_a_goal_can_be_put_on_the_table_and_rests_there_without_overlap(library, tasks):
+def test_the_place_of_an_object_is_taken_by_another_one_where_it_is_crowded(families):
+    for kind, task in enumerate(families["crowded"]):
+        first, second = task.moved[:2]
+        gap = np.linalg.norm((task.goal.pose(first).position - task.start.pose(second).position)[:2])
+        assert gap < RESTS_M
+        back = np.linalg.norm((task.goal.pose(task.moved[-1]).position - task.start.pose(first).position)[:2])
+        assert (back < RESTS_M) == (kind % 3 > 0)  # a swap, or a ring of three
+
+
+def test_a_relit_goal_is_a_shifted_one_under_another_light(families):
+    for task, relit in zip(families["shifted"], families["relit"], strict=True):
+        same(task.start, relit.start)
+        assert task.moved == relit.moved
+        np.testing.assert_array_equal(task.goal.poses.position, relit.goal.poses.position)
+        assert task.goal.light.angle_to(task.start.light) == pytest.approx(0, abs=1e-6)
+        assert relit.goal.light.angle_to(relit.start.light) > 0.01
+
+
+@pytest.mark.slow
+def test_goals_lie_anywhere_and_not_along_the_light(library):
+    """Where goal and light shared their random numbers, eight of twenty shifts pointed along the light."""
+    tasks = tasks_of(library, "shifted", 2, names=NAMES[1:], numbers=range(40))
+    shifts = np.array([(t.goal.pose(n).position - t.start.pose(n).position)[:2] for t in tasks for n in t.moved])
+    lights = np.array([t.start.light.direction[:2] for t in tasks for _ in t.moved])
+    angles = np.arctan2(*(shifts.T)) - np.arctan2(*(lights.T))
+    along = np.abs((angles + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(9)  # 1 in 20 by chance
+    assert along.mean() < 0.15
+    assert (np.sign(shifts) > 0).mean() == pytest.approx(0.5, abs=0.15)
+    places = np.array([t.goal.pose(n).position[:2] for t in tasks for n in t.moved])
+    assert np.abs(places.mean(axis=0)).max() < 0.06
+    assert places.std(axis=0) == pytest.approx(2 * WORKSPACE_HALF_M / np.sqrt(12), rel=0.25)  # that of a uniform one
+
+
+def test_lights_come_down_to_five_degrees():
+    elevations = []
+    for number in range(300):
+        draw = module.draw_scene(NAMES, 1, 0, number, module.Stream.TASK_SCENE, module.MIN_ELEVATION_DEG)
+        elevations.append(np.rad2deg(np.arcsin(draw.light.direction[2])))
+    assert 5 <= min(elevations) < 7
+
+
+def test_a_goal_shows_no_pusher(families):
+    for tasks in families.values():
+        for task in tasks:
+            assert task.goal.pusher is None
+            assert task.goal.names == task.start.names
+            assert np.abs(task.start.pusher[:2]).max() <= PUSHER_REACH_M
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_goal_can_be_put_on_the_table_and_rests_there_without_overlap(library, families, family):
     world = Tabletop(library)
     try:
-        for task in tasks[:3]:
+        for task in families[family][:3]:
             world.load(task.goal)  # refuses what overlaps
             before = world.truth()
             for _ in world.settle():
@@ -84,55 +153,39 @@ def test_a_goal_can_be_put_on_the_table_and_rests_there_without_overlap(library,
         world.close()
 
 
-def test_drawing_a_goal_leaves_the_world_as_the_goal(library, tasks):
-    world = Tabletop(library)
-    try:
-        world.restore(tasks[2].start)
-        found = draw_goal(world, 2, np.random.default_rng(3))
-        assert found is not None
-        goal, moved = found
-        left = world.truth()
-        np.testing.assert_allclose(left.poses.position, goal.poses.position, atol=1e-12)
-        np.testing.assert_allclose(left.poses.quaternion, goal.poses.quaternion, atol=1e-12)
-        assert len(moved) == 2
-    finally:
-        world.close()
+def test_where_there_is_no_room_or_no_rest_other_layouts_are_tried_and_counted(library, monkeypatch):
+    real, tried = module.came_to_rest, []
 
-
-def test_where_there_is_no_room_or_no_rest_other_layouts_are_tried(library, monkeypatch):
-    real, tried = module.draw_goal, []
-
-    def picky(world, count, rng):
+    def picky(world):
         tried.append(world.truth().poses.position)
-        return real(world, count, rng) if len(tried) == 3 else None
+        return real(world) if len(tried) == 3 else False
 
-    monkeypatch.setattr(module, "draw_goal", picky)
-    task = mpc_task(library, NAMES[3:], 1, 0, 0)
-    assert len(tried) == 3
+    monkeypatch.setattr(module, "came_to_rest", picky)
+    drawn = draw_task(library, TaskSet(NAMES[3:], objects=1), 0)
     assert len({place.tobytes() for place in tried}) == 3
-    np.testing.assert_array_equal(task.start.poses.position, tried[-1])
-    monkeypatch.setattr(module, "_LAYOUTS", 2)
-    tried.clear()
-    with pytest.raises(NoRoom):
-        mpc_task(library, NAMES[3:], 1, 0, 0)
+    assert Counter(drawn.rejected) == {"not at rest": 2}
 
 
-def test_a_goal_that_does_not_rest_is_refused(library, tasks, monkeypatch):
-    def tumbling(self):
-        name = self.names[0]
-        pose = self.truth().pose(name)
-        self.move_object(name, Pose(pose.position + [0, 0, 0.01], pose.quaternion))
-        return iter(())
+def test_what_never_rests_has_no_task(library, monkeypatch):
+    monkeypatch.setattr(module, "came_to_rest", lambda _: False)
+    with pytest.raises(NoRoom, match=NAMES[3]):
+        draw_task(library, TaskSet(NAMES[3:], objects=1), 0)
 
-    world = Tabletop(library)
-    try:
-        world.restore(tasks[0].start)
-        monkeypatch.setattr(Tabletop, "settle", tumbling)
-        assert draw_goal(world, 1, np.random.default_rng(0)) is None
-    finally:
-        world.close()
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (TaskSet(NAMES, "sorted"), "one of shifted, turned, crowded, relit"),
+        (TaskSet(NAMES, "crowded", 1), "objects in a scene is 1"),
+        (TaskSet(NAMES, "shifted", 7), "between 1 and 6"),
+        (TaskSet(NAMES, "shifted", 5), "is 4, but it must be at least 5"),
+    ],
+)
+def test_senseless_tasks_are_refused(library, asked, words):
+    with pytest.raises(InvalidInput, match=words):
+        draw_task(library, asked, 0)
 
 
 def test_an_object_without_a_mesh_is_told(tmp_path):
     with pytest.raises(MissingAssets, match=NAMES[0]):
-        mpc_task(AssetLibrary(tmp_path), NAMES[:1], 1, 0, 0)
+        draw_task(AssetLibrary(tmp_path), TaskSet(NAMES[:1], objects=1), 0)

@@ -1,0 +1,55 @@
+"""Episodes that cost nothing, and results as they leave them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import osfcore.experiments.rearrangement.measured_episodes as measured
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Stepped
+from osfcore.experiments.rearrangement.factors import Factor
+from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.objects.catalogue import CATALOGUE
+from osfcore.planning.pose_cost import PoseGoal
+
+SYMMETRIES = {name: info.symmetry for name, info in CATALOGUE.items()}
+PAPER = np.full((16, 16, 3), 0.5)
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Runs that cost nothing: ours reach the goal, odd ones with a doubt; the oracle's leave everything as it is.
+
+    Tells which were made.
+    """
+    made = []
+
+    def ours(task, _assets, _models, settings, _rng, estimators, factor):
+        held = estimators.first.held_light
+        assert (held is None) == (estimators.goal.held_light is None)
+        who = "ours" if held is None else "overhead" if held == (0, 0, 1) else "known_light"
+        assert isinstance(factor, Factor)
+        made.append((who, task.number, settings.cost))
+        assert settings.despite_doubts
+        one, doubt = np.full(len(task.start.names), 1e-3), "hidden" if task.number % 2 else ""
+        estimate = EstimatedState(task.goal, one, one, 1e-3, ("",) * len(one), doubt)
+        yield GoalFound(PoseGoal(task.goal.names, task.goal.poses), PAPER, goal_camera(16), estimate)
+        if doubt:
+            yield Noticed(0, "goal", "The goal image is not explained well: hidden.")
+        yield Stepped(0, 2, estimate, 0 * one, 0 * one, 0.0, PAPER, {"first": 8.0, "goal": 20.0})
+        for number, plan_s in ((1, 1.0), (2, 3.0)):
+            yield ActionExecuted(number, np.zeros(3))
+            yield Stepped(number, 2, estimate, 0 * one, 0 * one, 0.0, PAPER, {"plan": plan_s, "estimate": 0.5})
+        yield Finished(2, "reached", "The table looks like the goal.", task.goal)
+        yield Ended(task.goal, PAPER, PAPER)
+
+    def told(task, _assets, _models, settings, _rng):
+        made.append(("oracle", task.number, settings.plan.samples))
+        return Ended(task.start, PAPER, PAPER)
+
+    monkeypatch.setattr(measured, "run_from_images", ours)
+    monkeypatch.setattr(measured, "run_told_the_truth", told)
+    monkeypatch.setattr(measured, "load_scene_models", lambda *_: SimpleNamespace(symmetries=SYMMETRIES))
+    return made
