@@ -18,7 +18,10 @@ from tests.live import live_service
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-GUIDES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("command-line", "rest", "own-objects", "evaluation"))]
+GUIDES = [
+    ROOT / "README.md",
+    *(ROOT / "docs" / f"{name}.md" for name in ("command-line", "rest", "own-objects", "evaluation")),
+]
 OSF = Path(sys.executable).with_name("osf")
 
 

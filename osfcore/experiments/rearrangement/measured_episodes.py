@@ -18,10 +18,11 @@ import numpy as np
 
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.estimators import Estimators
-from osfcore.control.events import Event, Finished, GoalFound, Noticed, Stepped
+from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Stepped
 from osfcore.control.scene_models import SceneModels, load_scene_models
 from osfcore.experiments.rearrangement.factors import Factor, factor_named
-from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
+from osfcore.experiments.rearrangement.own_pushes import Course, prediction_errors
+from osfcore.experiments.rearrangement.runs import Ended, TrueState, run_from_images, run_told_the_truth
 from osfcore.experiments.rearrangement.tasks import DrawnTask, TaskSet, draw_task
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.fields.field_library import FieldLibrary
@@ -71,7 +72,8 @@ class MeasuredEpisodes:
                 log.take(event)
         assert ended is not None, "the last event tells how it ended"
         log.figures["episode_s"] = round(time.perf_counter() - began, 2)
-        return self._scored(drawn, ended, log.summary())
+        figures = {**log.summary(), "predicted": prediction_errors(log.course, models)}
+        return self._scored(drawn, ended, figures)
 
     def oracle(self, number: int, settings: EpisodeSettings) -> TaskResult:
         """A task for the planner that is told the truth."""
@@ -117,8 +119,10 @@ class _Log:
         unknown = dict.fromkeys(("goal_mm", "first_mm", "first_deg", "light_deg"))
         self.figures: dict[str, Any] = {"goal_doubt": "", "noticed": [], **unknown}
         self._seconds: dict[str, list[float]] = {}
+        self.course = Course()
+        self._truth: SceneState | None = None
 
-    def take(self, event: Event) -> None:
+    def take(self, event: Event | TrueState) -> None:
         """Take note of an event."""
         match event:
             case GoalFound():
@@ -128,7 +132,14 @@ class _Log:
                     self.figures["goal_mm"] = 1000 * float(np.linalg.norm(offsets, axis=1).max())
             case Noticed():
                 self.figures["noticed"].append([event.number, event.matter, event.text])
+            case TrueState():
+                self._truth = event.state
+            case ActionExecuted():
+                self.course.actions[event.number] = event.action
             case Stepped():
+                self.course.estimated[event.number] = event.estimate.state
+                if self._truth is not None:
+                    self.course.true[event.number] = self._truth
                 if event.number == 0:
                     self.figures |= self._first_errors(event.estimate.state)
                 for stage, seconds in event.seconds.items():

@@ -86,6 +86,7 @@ class MpcReport:
             "seconds_robot_median": self._robot_s(),
             **{f"{told}_s_median": self._median(f"{key}_s") for told, key in _STAGES.items()},
             "steps_median": self._median("steps"),
+            **self._own_pushes(),
             **{f"{key}_median": self._median(key) for key in ("goal_mm", "first_mm", "first_deg", "light_deg")},
             "against_noaction": self._against(nothing),
             "against_oracle": self._against(self.told_truth) if self.oracle else None,
@@ -114,6 +115,16 @@ class MpcReport:
             told[key] = compare_shares([test(score) for score in self.shipped], [test(score) for score in others])
         for key in ("pose6d", "pose6d_symmetric"):
             told[key] = compare_means(*([getattr(score, key) for score in them] for them in (self.shipped, others)))
+        return told
+
+    def _own_pushes(self) -> dict[str, float | int | None]:
+        """How well our own pushes were predicted four actions ahead, from estimated poses."""
+        told: dict[str, float | int | None] = {}
+        for unit in ("mm", "deg"):
+            values = [value for result in self.ours for value in result.figures["predicted"][unit]]
+            told[f"own_pushes_mean_{unit}_4"] = _rounded(np.mean(values), 2) if values else None
+            told[f"own_pushes_median_{unit}_4"] = _rounded(np.median(values), 2) if values else None
+            told["own_pushes"] = len(values)
         return told
 
     def _rejected(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.estimators import Estimators
-from osfcore.control.events import Event
+from osfcore.control.events import Event, Stepped
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
 from osfcore.control.scene_models import SceneModels
@@ -25,6 +25,17 @@ from osfcore.planning.pose_cost import PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.world.simulated_dynamics import SimulatedPushes
 from osfcore.world.tabletop import Tabletop
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueState:
+    """The truth at an instant that the loop has just estimated.
+
+    Attributes:
+        state: which the loop must not see.
+    """
+
+    state: SceneState
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,8 +61,8 @@ def run_from_images(
     rng: np.random.Generator,
     estimators: Estimators | None = None,
     factor: Factor | None = None,
-) -> Iterator[Event | Ended]:
-    """The whole loop; the last step is how it ended.
+) -> Iterator[Event | TrueState | Ended]:
+    """The whole loop, with the truth before each `Stepped`; the last step is how it ended.
 
     Args:
         task: what is told of it is the goal image alone.
@@ -66,7 +77,10 @@ def run_from_images(
     try:
         goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
-        yield from Episode(world, models, goal, settings, rng, estimators=estimators).run()
+        for event in Episode(world, models, goal, settings, rng, estimators=estimators).run():
+            if isinstance(event, Stepped):
+                yield TrueState(world.truth())
+            yield event
         yield _ended(world, goal)
     finally:
         world.close()

@@ -38,6 +38,7 @@ def result(moved=1, mm=5.0, deg=3.0, *, others=0.0, **figures) -> TaskResult:
         "light_deg": 1.5,
         "robot_s": 6.0,
         "rejected": {},
+        "predicted": {"mm": [3.0, 4.0], "deg": [1.0, 2.0]},
     }
     images = (np.full((16, 16, 3), shade, np.uint8) for shade in (40, 200))
     return TaskResult(told | plain | figures, (Comparison("0", *images),))
@@ -64,6 +65,7 @@ def test_figures_are_means_and_medians_over_tasks():
     assert (told["oracle_success_2cm"], told["oracle_success_tight"]) == (0.75, 0.5)
     assert told["oracle_final_mm_mean"] == 13.75
     assert (told["noaction_success_2cm"], told["start_mm_mean"]) == (0.0, 100.0)
+    assert (told["own_pushes"], told["own_pushes_mean_mm_4"], told["own_pushes_median_deg_4"]) == (8, 3.5, 1.5)
     low, high = told["success_2cm_interval"]
     assert 0 < low < 0.5 < high < 1
 
