@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from osfcore.errors import InvalidInput
 
 QUATERNION_NORM_TOLERANCE = 1e-3
+_ROUNDING = 8 * np.finfo(float).eps
 
 
 def quaternion_multiply(
@@ -89,7 +90,7 @@ def rotation_angle(
 
 
 def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") -> Float[np.ndarray, "*batch 4"]:
-    """The same quaternions with norm exactly 1.
+    """The same quaternions with norm 1, up to rounding; those that have it are given back bit by bit.
 
     Raises:
         InvalidInput: if a norm is off by more than 1e-3: such a quaternion is a mistake, not a rounding error.
@@ -100,7 +101,7 @@ def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") 
     norms = np.linalg.norm(q, axis=-1, keepdims=True)
     if not np.all(np.abs(norms - 1.0) < QUATERNION_NORM_TOLERANCE):  # also false for NaN
         raise InvalidInput(what, q.tolist(), "a unit quaternion (w, x, y, z)")
-    return q / norms
+    return np.where(np.abs(norms - 1.0) < _ROUNDING, q, q / norms)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

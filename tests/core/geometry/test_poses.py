@@ -80,6 +80,11 @@ def test_nearly_unit_quaternions_are_normalised_exactly():
     assert np.linalg.norm(unit_quaternion(np.array([1.0004, 0, 0, 0]))) == 1
 
 
+@given(turn=turns)
+def test_unit_quaternions_come_back_bit_by_bit(turn):
+    np.testing.assert_array_equal(unit_quaternion(turn), turn)
+
+
 @pytest.mark.parametrize("bad", [[2.0, 0, 0, 0], [0.0, 0, 0, 0], [np.nan, 0, 0, 1], [1.0, 0, 0]])
 @pytest.mark.wrong_arrays
 def test_other_quaternions_are_refused(bad):

@@ -178,7 +178,7 @@ def test_a_goal_image_is_read_from_the_inputs_as_its_own_camera_saw_it(place, st
     image = stage.world.render((camera,), with_pusher=False).images[0]
     write_png(place.folder / INPUTS / GOAL_FILE, to_uint8(image))
 
-    def explained(_models, observation, _prior):
+    def explained(_models, observation, _prior, _config):
         np.testing.assert_allclose(observation.images[0], image, atol=1 / 255)
         assert observation.cameras[0].name == "mine"
         np.testing.assert_allclose(observation.cameras[0].intrinsics, camera.intrinsics)

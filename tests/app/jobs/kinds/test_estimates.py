@@ -17,6 +17,7 @@ from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.observation_file import write_observation
 from osfcore.io.state_file import read_estimated, write_estimated
 from osfcore.progress import Progress
+from osfcore.random_streams import Stream, stream_rng
 
 MUSTARD = "006_mustard_bottle"
 FIRST = {"mode": "first", "seed": 5}
@@ -91,7 +92,7 @@ def test_the_estimator_gets_the_observation_and_the_prior_but_never_the_truth(pl
     list(estimate_job(FIRST, place))
     assert asked["observation"].names == (MUSTARD,)
     np.testing.assert_allclose(asked["observation"].pusher, [0.2, 0, 0.06])
-    assert asked["others"][0].random() == np.random.default_rng(5).random()
+    assert asked["others"][0].random() == stream_rng(5, Stream.FIRST_FRAME).random()
     write_estimated(inputs / "prior.json", believed(state(0.07)))
     for mode, count in (("next", 2), ("goal", 1)):
         list(estimate_job({"mode": mode, "seed": 0}, place))

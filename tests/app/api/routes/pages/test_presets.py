@@ -32,10 +32,10 @@ def test_a_preset_becomes_the_scene_that_is_shown_and_its_goal(service, services
     assert services.runner.current == scene["id"]
     assert [entry["name"] for entry in scene["objects"]] == list(one.objects)
     np.testing.assert_allclose(scene["light"]["position"], one.light.position, atol=1e-9)
-    assert (goal["scene"], goal["name"], goal["source"]) == (scene["id"], one.title, "drawn")
+    assert (goal["scene"], goal["name"], goal["source"]) == (scene["id"], one.title, "composed")
     assert service.get(f"/api/goals/{goal['id']}").json() == goal
     here, there = (np.array([entry["position"] for entry in it["objects"]]) for it in (scene, goal))
-    assert (np.linalg.norm(here - there, axis=1) > 0.05).sum() == one.moved
+    assert (np.linalg.norm(here - there, axis=1) > 0.05).sum() == len(one.shifts_m)
 
 
 def check_same_tables(some, others):
@@ -84,7 +84,7 @@ def test_what_cannot_be_made_is_told_and_leaves_nothing(service, services, monke
     def refuse(*_):
         raise OsfError("There is no room.")
 
-    monkeypatch.setattr(services.goals, "draw", refuse)
+    monkeypatch.setattr(services.goals, "compose", refuse)
     assert is_problem(service.post("/api/presets/pair"), 422)["detail"] == "There is no room."
     assert service.get("/api/scenes").json()["scenes"] == before["scenes"]
     one = preset("pair")
