@@ -67,6 +67,17 @@ class FieldLibrary:
         self._trained = None if data_dir is None else data_dir / "fields"
         self._shipped = shipped or Path(str(files("osfcore.fields") / "shipped"))
 
+    def __eq__(self, other: object) -> bool:
+        """Whether both look into the same folders."""
+        return isinstance(other, FieldLibrary) and self._folders() == other._folders()
+
+    def __hash__(self) -> int:
+        """By the folders."""
+        return hash(self._folders())
+
+    def _folders(self) -> tuple[Path | None, Path]:
+        return self._trained, self._shipped
+
     def stamp(self, name: str) -> tuple[int, int] | None:
         """Changes when a field is trained, trained again or deleted; None for those that ship with the program."""
         if self._trained is None:

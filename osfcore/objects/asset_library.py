@@ -49,6 +49,14 @@ class AssetLibrary:
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether both look into the same folder."""
+        return isinstance(other, AssetLibrary) and self.root == other.root
+
+    def __hash__(self) -> int:
+        """By the folder."""
+        return hash(self.root)
+
     def names(self) -> tuple[str, ...]:
         """Names of all objects that can be loaded, sorted."""
         if not self.root.is_dir():

@@ -99,7 +99,18 @@ class EvaluateFieldsCommand(_Evaluation):
 
 
 @dataclass(frozen=True)
-class EvaluateEstimateCommand(_Evaluation):
+class _ParallelEvaluation(_Evaluation):
+    workers: int = 2
+    """Processes that work side by side."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers do the work instead; they need the same data folder."""
+
+    def _pool(self) -> Any:  # noqa: ANN401
+        return worker_pool(self.workers, self.cluster)
+
+
+@dataclass(frozen=True)
+class EvaluateEstimateCommand(_ParallelEvaluation):
     """Estimates of poses and light: first frames, along pushes without masks, goals, ablations, spoiled inputs."""
 
     objects: int = 3
@@ -114,21 +125,10 @@ class EvaluateEstimateCommand(_Evaluation):
         from osfcore.experiments.estimation.parts import EvaluateEstimate
 
         config = EvaluateEstimate(self.folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
-        return evaluate_estimate(config, fields, assets)
+        return evaluate_estimate(config, fields, assets, executor)
 
     def _show(self, report: dict[str, Any]) -> None:
         _show_estimate(self.folder, report)
-
-
-@dataclass(frozen=True)
-class _ParallelEvaluation(_Evaluation):
-    workers: int = 2
-    """Processes that work side by side."""
-    cluster: str | None = None
-    """Address of a Dask scheduler whose workers do the work instead; they need the same data folder."""
-
-    def _pool(self) -> Any:  # noqa: ANN401
-        return worker_pool(self.workers, self.cluster)
 
 
 @dataclass(frozen=True)

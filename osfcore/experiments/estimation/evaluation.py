@@ -10,6 +10,7 @@ pieces; pictures and report.json lie beside the kept results.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from osfcore.errors import InvalidInput, MissingAssets
@@ -19,6 +20,7 @@ from osfcore.experiments.estimation.report import EstimateReport
 from osfcore.experiments.estimation.scores import FrameScore, TrackScore
 from osfcore.experiments.estimation.spoiled_inputs import BadScore
 from osfcore.experiments.fields.evaluation import MAX_SEED, MAX_TASKS
+from osfcore.experiments.pieces import Piece, results_of
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import image_side
@@ -49,7 +51,7 @@ class EstimateEvaluationStep:
 
 
 def evaluate_estimate(
-    config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary
+    config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
 ) -> Iterator[EstimateEvaluationStep]:
     """Measure every part that is asked for, task by task; pictures and report.json go to `config.folder`.
 
@@ -57,10 +59,12 @@ def evaluate_estimate(
         config: what to measure.
         fields: of the objects and the table.
         assets: meshes, for the simulator.
+        executor: does tasks side by side, if given; then their times are those of a busy machine.
 
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
         InvalidInput: if a number is out of range.
+        WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
     runner = TaskRunner(config, _checked(config, fields, assets), fields, assets)
@@ -68,11 +72,11 @@ def evaluate_estimate(
     jobs = _jobs(config, runner, kept)
     total, done = sum(count for _, count, _ in jobs.values()), 0
     for key, (title, count, work) in jobs.items():
-        kept[key] = []
-        for number in range(count):
-            yield EstimateEvaluationStep(done, total, f"{title} ({number + 1} of {count})")
-            kept[key].append(work(number))
-            done += 1
+        for results in results_of([work(number) for number in range(count)], executor):
+            kept[key] = [result for result in results if result is not None]
+            if (ready := len(kept[key])) < count:
+                yield EstimateEvaluationStep(done + ready, total, f"{title} ({ready + 1} of {count})")
+        done += count
     report = _report(kept)
     write_plots(config.folder, report)
     _galleries(config, kept)
@@ -80,7 +84,7 @@ def evaluate_estimate(
     yield EstimateEvaluationStep(total, total, "Everything is measured", report)
 
 
-_Job = tuple[str, int, Callable[[int], TaskResult]]  # what it is called, how many, and one of them
+_Job = tuple[str, int, Callable[[int], Piece]]  # what it is called, how many, and one of them
 
 
 def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[str, _Job]:
@@ -100,7 +104,7 @@ def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[
     return jobs
 
 
-def _few_views(runner: TaskRunner, views: int) -> Callable[[int], TaskResult]:
+def _few_views(runner: TaskRunner, views: int) -> Callable[[int], Piece]:
     return lambda number: runner.few_views(number, views)
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,6 +32,7 @@ from osfcore.experiments.estimation.spoiled_inputs import FIRST_SCENE, BadCase, 
 from osfcore.experiments.estimation.tasks import STEPS, Frame, episode, first_frame, goals
 from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
 from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
+from osfcore.experiments.pieces import Piece
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
@@ -94,7 +95,7 @@ class EvaluateEstimate:
 
 
 class TaskRunner:
-    """What the parts need: fields ready for use, meshes, and results of earlier runs.
+    """Makes pieces of work; what a piece needs is loaded once in each process that does some.
 
     Args:
         config: what to measure.
@@ -110,80 +111,64 @@ class TaskRunner:
         self._cameras = default_cameras(config.size)
         self._assets: dict[str, ObjectAsset] = {}
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Be sent to another process, where all pieces share one."""
+        return _shared_runner, (self._config, self._names, self._fields, self._library)
+
     # Parts
 
-    def first(self, number: int) -> TaskResult:
+    def first(self, number: int) -> Piece:
         """The first frame of a task; its figures hold the score and the estimated state."""
-        return self._first("first", number, self._config.effort, range(len(self._cameras)))
+        return self._first("first", number, self._config.effort, tuple(range(len(self._cameras))))
 
-    def fixed_light(self, number: int) -> TaskResult:
+    def fixed_light(self, number: int) -> Piece:
         """The first frame with the light held overhead."""
         effort = replace(self._config.effort, held_light=_OVERHEAD)
-        return self._first("fixed_light", number, effort, range(len(self._cameras)))
+        return self._first("fixed_light", number, effort, tuple(range(len(self._cameras))))
 
-    def few_views(self, number: int, views: int) -> TaskResult:
+    def few_views(self, number: int, views: int) -> Piece:
         """The first frame from one or two cameras."""
         return self._first(f"views_{views}", number, self._config.effort, VIEWS[views])
 
-    def track(self, number: int, first: TaskResult) -> TaskResult:
+    def track(self, number: int, first: TaskResult) -> Piece:
         """Later frames of a task, from its first estimate on."""
         draw, effort = self._draw(number), self._config.track
-        given = {
-            **self._circumstances(draw, asdict(effort)),
-            "first": digest(first.figures),
-            "steps": self._config.steps,
-        }
-        cache = TaskCache(self._config.folder / "track")
-        kept = cache.read(_file(number), given)
-        if kept is None:
-            kept = self._tracked(draw, state_of(first), decode(FrameScore, first.figures["score"], "score"), effort)
-            cache.write(_file(number), given, kept)
-        return kept
+        begun = {"first": digest(first.figures), "steps": self._config.steps}
+        score = decode(FrameScore, first.figures["score"], "score")
+        work = partial(self._tracked, draw, state_of(first), score, effort)
+        return self._piece("track", number, {**self._circumstances(draw, asdict(effort)), **begun}, work)
 
-    def goal(self, number: int, first: TaskResult) -> TaskResult:
+    def goal(self, number: int, first: TaskResult) -> Piece:
         """The goals of a task, told how the objects lie by its first estimate."""
         draw, effort = self._draw(number), self._config.goal
         given = {**self._circumstances(draw, asdict(effort)), "first": digest(first.figures)}
-        cache = TaskCache(self._config.folder / "goal")
-        kept = cache.read(_file(number), given)
-        if kept is None:
-            kept = self._goals(draw, state_of(first), effort)
-            cache.write(_file(number), given, kept)
-        return kept
+        return self._piece("goal", number, given, partial(self._goals, draw, state_of(first), effort))
 
-    def bad(self, number: int) -> TaskResult:
+    def bad(self, number: int) -> Piece:
         """A spoiled input."""
         config = self._config
         draw = self._draw(FIRST_SCENE + number)
         given = self._circumstances(draw, {"first": asdict(config.effort), "goal": asdict(config.goal)})
         # A case may call up an object that its scene does not hold.
         given["all"] = {name: [self._weights[name], self._library.digest(name)] for name in self._names}
-        cache = TaskCache(config.folder / "bad")
-        kept = cache.read(_file(number), given)
-        if kept is None:
-            case = bad_case(self._names, config.objects, config.seed, number, self._library, config.size)
-            kept = self._spoiled(case, draw.seed)
-            cache.write(_file(number), given, kept)
-        return kept
+        return self._piece("bad", number, given, partial(self._spoiled, number, draw.seed))
+
+    def _first(self, part: str, number: int, effort: FirstFrameConfig, views: tuple[int, ...]) -> Piece:
+        draw = self._draw(number)
+        given = {**self._circumstances(draw, asdict(effort)), "views": list(views)}
+        return self._piece(part, number, given, partial(self._seen_first, draw, effort, views))
+
+    def _piece(self, part: str, number: int, given: dict[str, Any], work: Callable[[], TaskResult]) -> Piece:
+        return Piece(f"{number:04d}", TaskCache(self._config.folder / part), given, work)
 
     # How they are measured
 
-    def _first(self, part: str, number: int, effort: FirstFrameConfig, views: Sequence[int]) -> TaskResult:
-        draw = self._draw(number)
-        given = {**self._circumstances(draw, asdict(effort)), "views": list(views)}
-        cache = TaskCache(self._config.folder / part)
-        kept = cache.read(_file(number), given)
-        if kept is None:
-            models = self._models
-            frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views))
-            steps = estimate_first(models, frame.observation, stream_rng(draw.seed, Stream.FIRST_FRAME), effort)
-            score, estimate = self._timed(steps, frame)
-            state = None if estimate is None else estimated_to_json(estimate)
-            figures = {"score": encode(score), "state": state}
-            shown = self._compared(frame.observation, None if estimate is None else estimate.state)
-            kept = TaskResult(figures, shown)
-            cache.write(_file(number), given, kept)
-        return kept
+    def _seen_first(self, draw: Draw, effort: FirstFrameConfig, views: tuple[int, ...]) -> TaskResult:
+        frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views))
+        rng = stream_rng(draw.seed, Stream.FIRST_FRAME)
+        score, estimate = self._timed(estimate_first(self._models, frame.observation, rng, effort), frame)
+        figures = {"score": encode(score), "state": None if estimate is None else estimated_to_json(estimate)}
+        return TaskResult(figures, self._compared(frame.observation, None if estimate is None else estimate.state))
 
     def _tracked(self, draw: Draw, start: SceneState | None, first: FrameScore, effort: TrackingConfig) -> TaskResult:
         pushes = episode(draw, self._library, self._cameras, steps=self._config.steps)
@@ -238,8 +223,9 @@ class TaskRunner:
             shown += self._compared(frame.observation, None if estimate is None else estimate.state)
         return TaskResult({"scores": scores, "moved": moved}, tuple(shown))
 
-    def _spoiled(self, case: BadCase, seed: int) -> TaskResult:
+    def _spoiled(self, number: int, seed: int) -> TaskResult:
         models, config, rng = self._models, self._config, stream_rng(seed, Stream.FIRST_FRAME)
+        case = bad_case(self._names, config.objects, config.seed, number, self._library, config.size)
         began, estimate, refused = time.perf_counter(), None, ""
         try:
             if case.start is None:
@@ -346,5 +332,9 @@ def digest(figures: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(figures["state"], sort_keys=True).encode()).hexdigest()
 
 
-def _file(number: int) -> str:
-    return f"{number:04d}"
+@lru_cache(maxsize=1)
+def _shared_runner(
+    config: EvaluateEstimate, names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary
+) -> TaskRunner:
+    """The runner of a worker process."""
+    return TaskRunner(config, names, fields, assets)

@@ -74,7 +74,8 @@ def oracle(fields_dir, monkeypatch):
 
 @pytest.mark.slow
 def test_estimators_are_measured(fields_dir, oracle, capsys):
-    arguments = ["--data-dir", str(fields_dir), "--names", *SOLIDS, "--tasks", "2", "--objects", "2", "--bad", "1"]
+    arguments = ["--data-dir", str(fields_dir), "--names", *SOLIDS, "--tasks", "2", "--objects", "2", "--bad", "1",
+                 "--workers", "1"]  # fmt: skip
     assert main(["eval", "estimate", *arguments, "--json"]) == 0
     told = capsys.readouterr()
     result = json.loads(told.out.splitlines()[-1])
@@ -96,7 +97,8 @@ def test_estimators_are_measured(fields_dir, oracle, capsys):
 
 
 def test_estimators_are_measured_in_pieces(fields_dir, oracle, tmp_path, capsys):
-    arguments = ["--data-dir", str(fields_dir), "--out", str(tmp_path), "--names", *SOLIDS, "--tasks", "1"]
+    arguments = ["--data-dir", str(fields_dir), "--out", str(tmp_path), "--names", *SOLIDS, "--tasks", "1",
+                 "--workers", "1"]  # fmt: skip
     assert main(["eval", "estimate", *arguments, "--parts", "first"]) == 0
     assert [what for what, _ in oracle.asked] == ["first search 4"]
     shown = capsys.readouterr().out
@@ -235,7 +237,7 @@ def test_the_command_explains_itself(capsys):
     [
         ("mpc", "--bad"),
         ("dynamics", "--objects"),
-        ("estimate", "--workers"),
+        ("fields", "--workers"),
         ("estimate", "--data"),
         ("fields", "--cost"),
     ],

@@ -1,5 +1,7 @@
 import json
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 
 import pytest
 
@@ -152,3 +154,13 @@ def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library
     with pytest.raises(MissingAssets, match=SOLIDS[0]):
         next(evaluate_estimate(config, solids, AssetLibrary(tmp_path / "none")))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_an_executor_changes_no_estimate(solids, library, tmp_path):
+    config = quick(tmp_path / "alone", tasks=2, objects=1, names=SOLIDS[:1], size=32, parts=("first",))
+    alone = last(evaluate_estimate(config, solids, library)).report
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
+        shared = last(evaluate_estimate(replace(config, out=tmp_path / "shared"), solids, library, executor)).report
+    for one, other in zip(alone.first, shared.first, strict=True):
+        assert replace(one, seconds=other.seconds) == other
