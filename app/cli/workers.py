@@ -14,16 +14,18 @@ from multiprocessing.connection import wait
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
 
 MAX_WORKERS = 256
-_ANSWERS_WITHIN_S = 10
 
 
 @contextmanager
-def worker_pool(workers: int, cluster: str | None = None) -> Iterator[Executor | None]:
+def worker_pool(
+    workers: int, cluster: str | None = None, *, answers_within_s: float = 10.0
+) -> Iterator[Executor | None]:
     """Processes that share the work; None, which means this process alone, for one.
 
     Args:
         workers: processes of this machine.
         cluster: address of a Dask scheduler whose workers share the work instead.
+        answers_within_s: how long the scheduler may take to answer.
 
     Raises:
         InvalidInput: if the number is out of range, or nothing answers at the address.
@@ -31,7 +33,7 @@ def worker_pool(workers: int, cluster: str | None = None) -> Iterator[Executor |
         WorkerDied: if a piece of work has ended several workers of the cluster.
     """
     if cluster is not None:
-        with _cluster(cluster) as executor:
+        with _cluster(cluster, answers_within_s) as executor:
             yield executor
         return
     if not 1 <= workers <= MAX_WORKERS:
@@ -45,14 +47,14 @@ def worker_pool(workers: int, cluster: str | None = None) -> Iterator[Executor |
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
+def _cluster(address: str, answers_within_s: float) -> Iterator[Executor]:
     try:
         from distributed import Client
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise OsfError("--cluster needs Dask; 'pip install osf-manipulation[cluster]' brings it.") from None
     try:
-        client = Client(address, timeout=_ANSWERS_WITHIN_S, set_as_default=False)
+        client = Client(address, timeout=answers_within_s, set_as_default=False)
     except (OSError, ValueError):
         allowed = "that of a running Dask scheduler, such as tcp://127.0.0.1:8786 ('dask scheduler' tells its own)"
         raise InvalidInput("address of the cluster", address, allowed) from None

@@ -37,18 +37,6 @@ class Piece:
         """What it left when it was done before."""
         return self.cache.read(self.name, self.circumstances)
 
-    def done(self) -> TaskResult:
-        """The same; it is done now where it was not.
-
-        Raises:
-            CannotWrite: if the disk refuses.
-        """
-        result = self.kept()
-        if result is None:
-            result = self.work()
-            self.cache.write(self.name, self.circumstances, result)
-        return result
-
 
 def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Iterator[list[TaskResult | None]]:
     """Do what is not done yet; yields what there is so far, in the order of the pieces, after each that was done.

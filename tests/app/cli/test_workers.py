@@ -117,9 +117,9 @@ def test_pushes_from_a_cluster_are_the_same_to_the_last_bit(cluster, library, tm
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "tcp://127.0.0.1:99999999"])
-def test_an_address_where_nothing_answers_is_told(address, monkeypatch):
-    monkeypatch.setattr(workers, "_ANSWERS_WITHIN_S", 0.3)
-    with pytest.raises(InvalidInput, match="address of the cluster"), worker_pool(2, address):
+def test_an_address_where_nothing_answers_is_told(address):
+    pool = worker_pool(2, address, answers_within_s=0.3)
+    with pytest.raises(InvalidInput, match="address of the cluster"), pool:
         pass
 
 
