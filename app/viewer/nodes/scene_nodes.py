@@ -282,15 +282,16 @@ class SceneNodes:
         )
 
         async def drag(event: viser.TransformControlsEvent) -> None:
-            body = self._bodies.get(name)
-            if body is None:
-                return
-            # Handles stay along the table's axes: what they turn is added to how the object lay when it was grabbed.
-            turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
-            pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
-            self._follow(name, pose)
-            self._place_labels()
-            self._draw_shadows()
+            with self._lock:  # another thread may be changing which objects there are
+                body = self._bodies.get(name)
+                if body is None:
+                    return
+                # Handles stay along the table's axes: what they turn is added to how the object lay when it was grabbed.
+                turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
+                pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
+                self._follow(name, pose)
+                self._place_labels()
+                self._draw_shadows()
             self._on_change()
             if event.phase == "end":
                 self._grabbed.pop(name, None)
