@@ -137,6 +137,11 @@ class OSF(nn.Module):
             self.gain.bias.fill_(_FIRST_GAIN)
 
     @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return self.ambient.device
+
+    @property
     def _skip(self) -> int:
         """The trunk's layer that reads the position once more."""
         return self.size.depth // 2

@@ -20,8 +20,8 @@ from osfcore.fields.kiloosf import EMPTY_G, FEATURES, FLOOR_G, STEP_VOXELS, Kilo
 from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.ray_marching import march
 from osfcore.fields.ray_sampling import RayBatch
+from osfcore.fields.training.network_stage import baked_g, corners
 from osfcore.fields.training.optimization import Rates, Stage
-from osfcore.fields.training.osf_training import baked_g, corners
 from osfcore.fields.voxel_shell import FIRST_NORMAL, first_shell, seen_corners, shell_field
 from osfcore.io.image_set import ImageSet
 
@@ -86,7 +86,7 @@ def _occupied_box(osf: OSF, proposal: KiloOSF) -> Float[np.ndarray, "2 3"]:
 @torch.no_grad()
 def _albedo(osf: OSF, points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
     parts = np.array_split(points, max(1, len(points) // _POINTS_AT_ONCE))
-    return torch.cat([osf.material_at(torch.as_tensor(p, device=osf.ambient.device))[1].cpu() for p in parts]).numpy()
+    return torch.cat([osf.material_at(torch.as_tensor(p, device=osf.device))[1].cpu() for p in parts]).numpy()
 
 
 class Distillation(Stage):

@@ -22,12 +22,13 @@ from osfcore.errors import CorruptFile, InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.fields.field_weights import field_bytes, field_from_bytes
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.osf import OSFSize
+from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.ray_sampling import RaySource
 from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from osfcore.fields.training.distillation import Distillation, first_student
+from osfcore.fields.training.network_stage import NetworkHoldout, NetworkStage
 from osfcore.fields.training.optimization import Stage
-from osfcore.fields.training.osf_training import Teacher, TeacherHoldout, TeacherRecipe
+from osfcore.fields.training.osf_training import TeacherRecipe, first_teacher, restored_teacher
 from osfcore.fields.training.recipes import Recipe, TrainField
 from osfcore.fields.training.validation import Holdout
 from osfcore.fields.training.visual_hull import silhouette_box
@@ -45,7 +46,7 @@ _CHECKPOINT_S = 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MIN_LOOK_S = 5.0
 _TRANSITIONS = {"distil": "Baking the teacher into a shell", "fine": "Refining the shell"}
-_Learner = Stage | Teacher  # a phase between its steps: step, snapshot, state
+_Learner = Stage | NetworkStage  # a phase between its steps: step, snapshot, state
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,7 +150,7 @@ class _Run:
         box = silhouette_box(self._images, where=self._config.data)
         r = self._recipe
         if self._config.recipe == "distil":
-            return Teacher.first(self._images, box, self._teacher_recipe(), self._rng, self._device)
+            return first_teacher(self._images, box, self._teacher_recipe(), self._rng, self._device)
         field = first_shell(self._images, box, across=r.coarse_across, cells=r.cells, hidden=r.hidden,
                             inside_g=r.hollow_g if self._config.hollow else r.solid_g, rng=self._rng)  # fmt: skip
         return Stage(field, r.coarse_rates, self._device)
@@ -158,10 +159,12 @@ class _Run:
         """The learner of a phase, from that of the phase before."""
         r = self._recipe
         if name == "distil":
-            assert isinstance(before, Teacher)
-            student = first_student(before.osf, before.snapshot(), self._images, across=r.fine_across, cells=r.cells,
+            assert isinstance(before, NetworkStage)
+            osf = before.network
+            assert isinstance(osf, OSF)
+            student = first_student(osf, before.snapshot(), self._images, across=r.fine_across, cells=r.cells,
                                     hidden=r.hidden, rng=self._rng)  # fmt: skip
-            return Distillation(student, before.osf, self._device)
+            return Distillation(student, osf, self._device)
         field = before.snapshot()
         if not isinstance(before, Distillation):
             field = refine(field, self._images, across=r.fine_across, rng=self._rng)
@@ -180,7 +183,7 @@ class _Run:
         began = reported = saved = time.monotonic()
         already = self._done_s
         while (share := self._share()) < end:
-            count = stage.recipe.rays if isinstance(stage, Teacher) else self._recipe.rays
+            count = self._teacher_recipe().rays if isinstance(stage, NetworkStage) else self._recipe.rays
             rays = self._source.batch(self._rng.choice(self._pixels, count))
             stage.step(rays, (share - start) / (end - start), self._rng, self._generator)
             self._done_steps += 1
@@ -200,7 +203,7 @@ class _Run:
         preview = None
         if self._done_s - self._looked_at > max(_MIN_LOOK_S, _LOOK_SHARE * budget_s):
             self._looked_at = self._done_s
-            holdout = TeacherHoldout(self._test, stage) if isinstance(stage, Teacher) else self._holdout
+            holdout = NetworkHoldout(self._test, stage.network) if isinstance(stage, NetworkStage) else self._holdout
             look = holdout.glance(stage.snapshot())
             self._psnr, preview = (look.psnr_full, look.psnr_mask), look.preview
         return replace(self._report(""), preview=preview)
@@ -273,7 +276,7 @@ class _Run:
     def _resumed(self, saved: Checkpoint) -> _Learner:
         r = self._recipe
         if saved.stage == "teacher":
-            learner = Teacher.restored(saved.field, saved.optimiser, self._teacher_recipe(), self._device)
+            learner = restored_teacher(saved.field, saved.optimiser, self._teacher_recipe(), self._device)
         elif saved.stage == "distil":
             learner = Distillation.restored(saved.field, saved.optimiser, self._teacher_recipe().size, self._device)
         else:

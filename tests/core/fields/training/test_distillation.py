@@ -12,7 +12,7 @@ from osfcore.fields.ray_sampling import RaySource
 from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from osfcore.fields.training.distillation import Distillation, first_student
 from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.osf_training import corners
+from osfcore.fields.training.network_stage import corners
 from osfcore.fields.training.recipes import Recipe, TrainField
 from osfcore.fields.training.visual_hull import silhouette_box
 from osfcore.fields.voxel_shell import first_shell

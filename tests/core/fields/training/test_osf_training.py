@@ -9,15 +9,13 @@ from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G
 from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.osf import DENSITY_GAIN, OSFSize
 from osfcore.fields.ray_sampling import RayBatch, RaySource
+from osfcore.fields.training.network_stage import MOST_G, baked_g, corners, inverse_density
 from osfcore.fields.training.optimization import Rates, composite
 from osfcore.fields.training.osf_training import (
-    MOST_G,
-    Teacher,
     TeacherRecipe,
     TrainTeacher,
-    baked_g,
-    corners,
-    inverse_density,
+    first_teacher,
+    restored_teacher,
     train_teacher,
 )
 from osfcore.fields.training.visual_hull import silhouette_box
@@ -31,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture
 def teacher(images):
-    return Teacher.first(images, silhouette_box(images), SMALL, np.random.default_rng(0), CPU)
+    return first_teacher(images, silhouette_box(images), SMALL, np.random.default_rng(0), CPU)
 
 
 def uniform(osf, sigma):
@@ -58,15 +56,15 @@ def test_the_first_proposals_fill_the_silhouettes(teacher, images):
     """Each ray of a pixel well inside a silhouette finds samples."""
     source = RaySource(images)
     rays = source.batch(source.silhouette_pixels())
-    uniform(teacher.osf, 2000.0)
+    uniform(teacher.network, 2000.0)
     with torch.no_grad():
-        _, alpha = composite(teacher.osf, teacher.snapshot(), rays, most=40)
+        _, alpha = composite(teacher.network, teacher.snapshot(), rays, most=40)
     assert (alpha.numpy()[rays.alpha == 1] > 0.9).mean() > 0.97
 
 
 def test_opacity_of_a_slab(teacher):
     grid, sigma = teacher.snapshot(), 1.5
-    uniform(teacher.osf, sigma)
+    uniform(teacher.network, sigma)
     inner = np.argwhere(grid.density > FLOOR_G).mean(axis=0).round().astype(int)
     column = grid.density[:, inner[1], inner[2]] > FLOOR_G
     length = column.sum() * grid.voxel
@@ -76,8 +74,8 @@ def test_opacity_of_a_slab(teacher):
         origin, np.float32([[1, 0, 0]]), np.float32([[0, 0, 1]]), np.zeros((1, 3), np.float32), np.ones(1, np.float32)
     )
     with torch.no_grad():
-        colour, alpha = composite(teacher.osf, grid, rays, min_weight=0, most=256)
-        scatter = teacher.osf(
+        colour, alpha = composite(teacher.network, grid, rays, min_weight=0, most=256)
+        scatter = teacher.network(
             torch.from_numpy(middle[None].astype(np.float32)),
             *(torch.from_numpy(a) for a in (rays.lights, rays.directions)),
         )
@@ -89,8 +87,8 @@ def test_opacity_of_a_slab(teacher):
 
 def test_bakes_have_the_networks_density(teacher):
     grid = teacher.snapshot()
-    uniform(teacher.osf, 3 / grid.voxel)
-    g = baked_g(teacher.osf, corners(grid)[2:4, 3, 3], grid.voxel)
+    uniform(teacher.network, 3 / grid.voxel)
+    g = baked_g(teacher.network, corners(grid)[2:4, 3, 3], grid.voxel)
     np.testing.assert_allclose(KiloQuery(grid).sigma(torch.from_numpy(g)) * grid.voxel, 3, rtol=1e-3)
 
 
@@ -102,10 +100,10 @@ def test_corners_lie_where_the_box_ends(teacher):
 
 def test_proposals_follow_the_network(teacher):
     hull = teacher.snapshot()
-    uniform(teacher.osf, 1e-6)
+    uniform(teacher.network, 1e-6)
     teacher.update_proposal()
     assert teacher.snapshot() is hull, "where nothing is found, everything is still looked at"
-    uniform(teacher.osf, 2 / hull.voxel)
+    uniform(teacher.network, 2 / hull.voxel)
     teacher.update_proposal()
     dense = KiloQuery(teacher.snapshot()).sigma(torch.from_numpy(teacher.snapshot().density)) * hull.voxel
     inside = hull.density > FLOOR_G
@@ -121,7 +119,7 @@ def test_a_teacher_goes_on_from_its_state_as_if_nothing_had_happened(teacher, im
     generator = torch.Generator()
     for k in (0, 1):
         teacher.step(batches[k], 0.1 * k, np.random.default_rng(k), generator)
-    other = Teacher.restored(teacher.snapshot(), copy.deepcopy(teacher.state()), SMALL, CPU)
+    other = restored_teacher(teacher.snapshot(), copy.deepcopy(teacher.state()), SMALL, CPU)
     ends = []
     for learner in (other, teacher):
         ends.append([learner.step(batches[k], 0.1 * k, np.random.default_rng(k), generator) for k in (2, 3)])

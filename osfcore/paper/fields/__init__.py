@@ -1,0 +1,1 @@
+"""KiloOSF as published: tiny networks alone, trained over a teacher by distillation and fine-tuning."""
