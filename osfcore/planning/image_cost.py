@@ -10,8 +10,7 @@ from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import MIN_IMAGE_SIDE, Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.types import PLANNING, SceneBatch
+from osfcore.render.types import PLANNING, Renderer, SceneBatch
 
 SIDE = 64  # longest side of the images that are compared [px]
 EVERY = 3  # actions between rendered states
@@ -29,26 +28,27 @@ class ImageCost:
         camera: of the goal image.
         image: that camera's, linear RGB.
         light: under which futures are rendered: that of the goal image.
+        every: actions between rendered states; 1 for the paper's sum over all of them.
 
     Raises:
         InvalidInput: if the image has another size than its camera's.
     """
 
     def __init__(
-        self, renderer: SceneRenderer, camera: Camera, image: Float[np.ndarray, "h w 3"], light: Light
+        self, renderer: Renderer, camera: Camera, image: Float[np.ndarray, "h w 3"], light: Light, *, every: int = EVERY
     ) -> None:
         if image.shape != (camera.height, camera.width, 3):
             raise InvalidInput("shape of the goal image", image.shape, f"{(camera.height, camera.width, 3)}")
         scale = min(1.0, SIDE / max(camera.width, camera.height))
         size = max(round(camera.width * scale), MIN_IMAGE_SIDE), max(round(camera.height * scale), MIN_IMAGE_SIDE)
-        self._renderer, self._light = renderer, light
+        self._renderer, self._light, self._every = renderer, light, every
         self._camera = camera.resized(*size)
         self._image = cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA)
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
         """The cost of each sequence."""
         horizon = rollouts.positions.shape[1] - 1
-        times = np.arange(horizon, 0, -EVERY)
+        times = np.arange(horizon, 0, -self._every)
         states = np.concatenate([rollouts.positions[:, times], rollouts.quaternions[:, times]], axis=-1)
         count = states.shape[0] * states.shape[1]
         shown, which = np.unique(states.round(_SAME).reshape(count, -1), axis=0, return_inverse=True)

@@ -103,7 +103,7 @@ def launch(  # noqa: D417
     wants_opacity = bool({"opacity", "masks"} & set(outputs))
     opacity = np.zeros((scenes, views, count, *size) if wants_opacity else (0,) * 5, np.float32)
     distance = np.empty(shape if "depth" in outputs else (0,) * 4, np.float32)
-    plain, rules = _plain_table(table), _rules(quality)
+    plain, rules = plain_table(table), _rules(quality)
     lenses_f32 = np.array(lenses, np.float32, order="C")
     different, base_of = np.unique(batch.lights.astype(np.float32), axis=0, return_inverse=True)
     directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
@@ -119,7 +119,7 @@ def launch(  # noqa: D417
         rgb,
         opacity if "opacity" in outputs else None,
         opacity >= MASK_OPACITY if "masks" in outputs else None,
-        _z_depth(distance, cameras) if "depth" in outputs else None,
+        z_depth(distance, cameras) if "depth" in outputs else None,
     )
 
 
@@ -219,14 +219,15 @@ def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B
     return dropped
 
 
-def _plain_table(table: TableField | None) -> Table:
+def plain_table(table: TableField | None) -> Table:
+    """A table for compiled code."""
     if table is None:
         nothing = np.zeros(3, np.float32)
         return Table(False, np.float32(1), np.zeros((2, 2, 3), np.float32), nothing, nothing)
     return Table(True, np.float32(table.half_side), table.albedo, table.ambient, table.background)
 
 
-def _z_depth(distance: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+def z_depth(distance: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Distances along rays as distances along the cameras' z axes."""
     result = np.empty_like(distance)
     for view, camera in enumerate(cameras):

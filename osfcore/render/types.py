@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import QUATERNION_NORM_TOLERANCE, Pose, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
@@ -111,13 +111,34 @@ class Rendered:
     depth: Float32[np.ndarray, "B V h w"] | None = None
 
 
+class Renderer(Protocol):
+    """What draws scenes: `osfcore.render.scene_renderer.SceneRenderer`, or the paper's."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Objects that can be drawn."""
+        ...
+
+    def render(
+        self,
+        batch: SceneBatch,
+        cameras: Sequence[Camera],
+        *,
+        quality: Quality = EXACT,
+        outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
+        only: Bool[np.ndarray, "V h w"] | None = None,
+    ) -> Rendered:
+        """Images of every scene of a batch from every camera."""
+        ...
+
+
 def check_request(
-    fields: Mapping[str, KiloOSF], batch: SceneBatch, cameras: Sequence[Camera], outputs: frozenset[str] | set[str]
+    fields: Collection[str], batch: SceneBatch, cameras: Sequence[Camera], outputs: frozenset[str] | set[str]
 ) -> tuple[int, int]:
     """Height and width of the images [px], after everything asked for was found possible.
 
     Args:
-        fields: those there are, by name.
+        fields: names of those there are.
         batch: scenes to render.
         cameras: from which.
         outputs: names of what is asked for.

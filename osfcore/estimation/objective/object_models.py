@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 from osfcore.errors import UnknownName
-from osfcore.estimation.objective.resting_orientations import RestingOrientations, resting_orientations
+from osfcore.estimation.objective.resting_orientations import DensityGrid, RestingOrientations, resting_orientations
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table_field import TableField
 from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.types import PLANNING, Quality
+from osfcore.render.types import PLANNING, Quality, Renderer
 
 QUALITY: Quality = PLANNING
+FieldT = TypeVar("FieldT", bound=DensityGrid)
 
 
 class ObjectModels:
@@ -28,10 +30,31 @@ class ObjectModels:
         Raises:
             InvalidInput: if there is no such device.
         """
+        alone, together = (SceneRenderer(fields, ground, device=device) for ground in (None, table))
+        self._set(fields, alone, together)
+
+    @classmethod
+    def rendered_by(
+        cls,
+        renderer: Callable[[Mapping[str, FieldT], TableField | None], Renderer],
+        fields: Mapping[str, FieldT],
+        table: TableField,
+    ) -> ObjectModels:
+        """Models whose fields another renderer draws.
+
+        Args:
+            renderer: makes renderers of fields, on a table or over black.
+            fields: by name of the object.
+            table: what the objects lie on.
+        """
+        models = cls.__new__(cls)
+        models._set(fields, renderer(fields, None), renderer(fields, table))
+        return models
+
+    def _set(self, fields: Mapping[str, DensityGrid], alone: Renderer, together: Renderer) -> None:
         self._fields = dict(fields)
         self._resting: dict[str, RestingOrientations] = {}
-        self.alone = SceneRenderer(fields, None, device=device)
-        self.together = SceneRenderer(fields, table, device=device)
+        self.alone, self.together = alone, together
 
     def check(self, names: tuple[str, ...]) -> None:
         """Refuse objects without a field.

@@ -8,12 +8,12 @@ them is kept.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from scipy.spatial import ConvexHull
 
-from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 
 _OPAQUE_G = 2.0  # density feature above which a corner counts as solid
@@ -22,6 +22,25 @@ _NEIGHBOURHOOD_DEG = 20.0
 _SLACK_M = 1.5e-3  # above the lowest direction nearby
 _SPACING_DEG = 15.0
 _YAWS = 24
+
+
+class DensityGrid(Protocol):
+    """A field's density features on a grid: `osfcore.fields.kiloosf.KiloOSF`, or the paper's."""
+
+    @property
+    def origin(self) -> Float32[np.ndarray, "3"]:
+        """Corner (0, 0, 0) of the grid [m]."""
+        ...
+
+    @property
+    def voxel(self) -> float:
+        """Side of a voxel [m]."""
+        ...
+
+    @property
+    def density(self) -> Float32[np.ndarray, "nx ny nz"]:
+        """Density features on all corners."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,7 +66,7 @@ class RestingOrientations:
         return float(pose.apply(self.hull)[:, 2].min())
 
 
-def resting_orientations(field: KiloOSF, *, yaws: int = _YAWS) -> RestingOrientations:
+def resting_orientations(field: DensityGrid, *, yaws: int = _YAWS) -> RestingOrientations:
     """Find them for a field; `yaws` steps about the vertical."""
     vertices, centre = _solid(field)
     directions = fibonacci_sphere(_DIRECTIONS)
@@ -74,7 +93,7 @@ def yaw_quaternions(angles: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K 4"]:
     return quaternion_exp(np.stack([np.zeros_like(angles), np.zeros_like(angles), angles], axis=1))
 
 
-def _solid(field: KiloOSF) -> tuple[np.ndarray, np.ndarray]:
+def _solid(field: DensityGrid) -> tuple[np.ndarray, np.ndarray]:
     """Vertices of the convex hull of what is opaque, and the hull's centre of mass."""
     solid = np.argwhere(field.density > min(_OPAQUE_G, float(field.density.max()) - 1))
     points = field.origin + field.voxel * solid
