@@ -40,10 +40,9 @@ from osfcore.control.scene_models import SceneModels
 from osfcore.control.sight import Sight
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
-from osfcore.estimation.first_frame import estimate_first
 from osfcore.estimation.goal_image import estimate_goal
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.tracking import estimate_next, expected_residuals
+from osfcore.estimation.tracking import expected_residuals
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -139,7 +138,7 @@ class Episode:
         observation = yield from self._observe(masks=self._start is None)
         self._check_objects(observation.names)
         if self._start is None:
-            steps = estimate_first(self._models.appearance, observation, self._rng, self._how.first)
+            steps = self._how.first_frame(self._models.appearance, observation, self._rng)
             self._estimate = yield from self._look("first", observation, steps)
         else:
             self._estimate = self._start
@@ -189,7 +188,7 @@ class Episode:
         before = self._estimate
         expected = before.state if self._expected is None else self._expected
         models = self._models.appearance
-        steps = estimate_next(models, observation, expected, self._rng, self._how.later, usual=self._usual)
+        steps = self._how.later_frame(models, observation, expected, self._rng, self._usual)
         self._estimate = (yield from self._run_estimator("next", steps)).with_pusher(observation.pusher)
         yield from self._noticed_changes(before, expected)
         yield from self._find_lost()

@@ -1,20 +1,25 @@
-"""How a closed loop estimates: the configurations of its three estimators."""
+"""How a closed loop estimates: its three estimators with their configurations."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
-from osfcore.estimation.first_frame import FirstFrameConfig
+from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
 from osfcore.estimation.goal_image import GoalImageConfig
-from osfcore.estimation.tracking import TrackingConfig
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.geometry.light import Light
+from osfcore.geometry.states import Observation, SceneState
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Estimators:
-    """Configurations of the estimators.
+    """The estimators of ours; others derive from it.
 
     Attributes:
         first: of the first frame.
@@ -25,6 +30,23 @@ class Estimators:
     first: FirstFrameConfig = field(default_factory=FirstFrameConfig)
     later: TrackingConfig = field(default_factory=TrackingConfig)
     goal: GoalImageConfig = field(default_factory=GoalImageConfig)
+
+    def first_frame(
+        self, models: ObjectModels, observation: Observation, rng: np.random.Generator
+    ) -> Iterator[EstimateStep]:
+        """Poses and light of the first frame, which has masks."""
+        return estimate_first(models, observation, rng, self.first)
+
+    def later_frame(
+        self,
+        models: ObjectModels,
+        observation: Observation,
+        expected: SceneState,
+        rng: np.random.Generator,
+        usual: Float[np.ndarray, "N"] | None = None,
+    ) -> Iterator[EstimateStep]:
+        """Poses and light of a frame without masks, from the last estimate or what was predicted from it."""
+        return estimate_next(models, observation, expected, rng, self.later, usual=usual)
 
     @staticmethod
     def with_known_lights(light: Light, goal_light: Light) -> Estimators:

@@ -1,0 +1,129 @@
+"""Algorithm 1 as published: estimate, sample, predict, render, compare, act; for T steps, whatever happens.
+
+Nothing else is there: no poses of the goal, no stopping, no doubts, no search for what was lost. The objects' fields,
+the estimators and the dynamics model are arguments, so that each can be replaced by ours.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.estimators import Estimators
+from osfcore.control.events import ActionExecuted, Event, Finished, Looking, Observed, Planning, Stepped
+from osfcore.control.goal import GoalImage
+from osfcore.control.scene_models import SceneModels
+from osfcore.control.world_protocol import World
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import SceneState
+from osfcore.paper.mppi import GaussianMPPI, GaussianPlanSettings
+from osfcore.planning.image_cost import ImageCost
+from osfcore.render.types import PLANNING, SceneBatch
+
+
+@dataclass(frozen=True, slots=True)
+class AlgorithmSettings:
+    """How an episode goes.
+
+    Attributes:
+        steps: actions (T).
+        plan: how they are sampled.
+    """
+
+    steps: int = 30
+    plan: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
+
+
+def run_algorithm(
+    world: World,
+    models: SceneModels,
+    goal: GoalImage,
+    settings: AlgorithmSettings,
+    estimators: Estimators,
+    rng: np.random.Generator,
+) -> Iterator[Event]:
+    """Algorithm 1, until a `Finished`.
+
+    Args:
+        world: cameras and pusher.
+        models: of the objects.
+        goal: I_goal and its viewpoint.
+        settings: how it goes.
+        estimators: Psi.
+        rng: draws everything.
+
+    Raises:
+        InvalidInput: if the world gives no masks for the first frame.
+        UnknownName: if an object is not known.
+    """
+    planner = GaussianMPPI(models.dynamics.rollout, settings.plan)
+    observation = world.observe(masks=True)
+    yield Observed(0, observation)
+    seconds: dict[str, float] = {}
+    steps = _timed("first", estimators.first_frame(models.appearance, observation, rng), seconds)
+    estimate = yield from _look(0, steps)
+    for number in range(settings.steps):
+        estimate = estimate.with_pusher(observation.pusher)
+        yield _stepped(number, settings, models, goal, estimate, seconds)
+        seconds, began = {}, time.perf_counter()
+        cost = ImageCost(models.appearance.together, goal.camera, goal.image, estimate.state.light, every=1)
+        round_ = planner.plan(estimate.state, cost, rng)
+        seconds["plan"] = time.perf_counter() - began
+        yield Planning(number, round_)
+        world.act(round_.actions[0])
+        planner.shift()
+        yield ActionExecuted(number + 1, round_.actions[0])
+        observation = world.observe()
+        yield Observed(number + 1, observation)
+        later = estimators.later_frame(models.appearance, observation, estimate.state, rng)
+        estimate = yield from _look(number + 1, _timed("estimate", later, seconds))
+    estimate = estimate.with_pusher(observation.pusher)
+    yield _stepped(settings.steps, settings, models, goal, estimate, seconds)
+    text = f"All {settings.steps} pushes are done."
+    yield Finished(settings.steps, "out of steps", text, estimate.state)
+
+
+def _look(number: int, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # returns the EstimatedState
+    estimate = None
+    for step in steps:
+        estimate = step.estimate
+        yield Looking(number, "next" if number else "first", step)
+    assert estimate is not None, "the last step brings the estimate"
+    return estimate
+
+
+def _timed(stage: str, steps: Iterator[EstimateStep], seconds: dict[str, float]) -> Iterator[EstimateStep]:
+    """The steps; what they take, without what is done between two of them, is added up [s]."""
+    while True:
+        began = time.perf_counter()
+        step = next(steps, None)
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - began
+        if step is None:
+            return
+        yield step
+
+
+def _stepped(
+    number: int,
+    settings: AlgorithmSettings,
+    models: SceneModels,
+    goal: GoalImage,
+    estimate: EstimatedState,
+    seconds: dict[str, float],
+) -> Stepped:
+    """Distances to the goal are not known, for it has no poses here."""
+    rendered = _rendered(models, goal, estimate.state)
+    cost = float(((rendered - goal.image) ** 2).mean())
+    unknown = np.zeros(0)
+    return Stepped(number, settings.steps, estimate, unknown, unknown, cost, rendered, seconds)
+
+
+def _rendered(models: SceneModels, goal: GoalImage, state: SceneState) -> Float[np.ndarray, "h w 3"]:
+    """The scene as the goal image would show it, without the pusher."""
+    batch = SceneBatch.of(replace(state, pusher=None))
+    return models.appearance.together.render(batch, (goal.camera,), quality=PLANNING).rgb[0, 0]

@@ -1,0 +1,126 @@
+"""Which stages of an episode are the paper's, and their models: one by one, or all together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.estimators import Estimators
+from osfcore.control.scene_models import SceneModels
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.steps import EstimateStep
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.paper.estimation import PaperEstimationConfig, estimate_first, estimate_next
+from osfcore.paper.fields.tiny_field import TinyField
+from osfcore.paper.fields.weights import read_field
+from osfcore.paper.rendering.renderer import PaperRenderer
+
+StageName = Literal["fields", "estimation", "dynamics", "planning"]
+STAGES: tuple[StageName, ...] = get_args(StageName)
+_FOLDER = "paper_fields"
+
+
+@dataclass(frozen=True)
+class PaperEstimators(Estimators):
+    """CMA-ES alone for poses and light. Goal images, which the paper never inverts, are estimated as ours are.
+
+    Attributes:
+        cma: how much work it is.
+    """
+
+    cma: PaperEstimationConfig = field(default_factory=PaperEstimationConfig)
+
+    def first_frame(
+        self, models: ObjectModels, observation: Observation, rng: np.random.Generator
+    ) -> Iterator[EstimateStep]:
+        """Poses and light of the first frame, which has masks."""
+        return estimate_first(models, observation, rng, self.cma)
+
+    def later_frame(
+        self,
+        models: ObjectModels,
+        observation: Observation,
+        expected: SceneState,
+        rng: np.random.Generator,
+        usual: Float[np.ndarray, "N"] | None = None,
+    ) -> Iterator[EstimateStep]:
+        """Poses and light of a frame without masks."""
+        return estimate_next(models, observation, expected, rng, self.cma)
+
+
+def check_stages(stages: Iterable[str]) -> frozenset[str]:
+    """Stages that there are.
+
+    Raises:
+        InvalidInput: naming one that there is not.
+    """
+    for stage in stages:
+        if stage not in STAGES:
+            raise InvalidInput("stage", stage, ", ".join(STAGES))
+    return frozenset(stages)
+
+
+def paper_field_path(name: str, data_dir: Path | None) -> Path:
+    """Where an object's KiloOSF as published lies: DATA_DIR/paper_fields/NAME.safetensors, else the package's.
+
+    Raises:
+        UnknownName: if there is none.
+    """
+    folders = [] if data_dir is None else [data_dir / _FOLDER]
+    folders.append(Path(str(files("osfcore.paper") / "shipped")))
+    for folder in folders:
+        path = folder / f"{name}.safetensors"
+        if path.is_file():
+            return path
+    raise UnknownName("field as published", name, paper_field_names(data_dir))
+
+
+def paper_field_names(data_dir: Path | None) -> tuple[str, ...]:
+    """Objects with a KiloOSF as published, in order."""
+    own = [] if data_dir is None else list((data_dir / _FOLDER).glob("*.safetensors"))
+    shipped = Path(str(files("osfcore.paper") / "shipped")).glob("0*.safetensors")
+    return tuple(sorted({path.stem for path in (*own, *shipped)}))
+
+
+def load_paper_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
+    """How objects look by their KiloOSFs as published, on the table of ours.
+
+    Args:
+        names: of the objects.
+        fields: library of the table.
+        data_dir: whose fields come before the installed ones.
+
+    Raises:
+        UnknownName: if an object has no such field.
+        CorruptFile: if a file is broken.
+    """
+    own: dict[str, TinyField] = {name: read_field(paper_field_path(name, data_dir)) for name in names}
+    return ObjectModels.rendered_by(PaperRenderer, own, fields.load_table())
+
+
+def with_paper_stages(
+    models: SceneModels, stages: frozenset[str], fields: FieldLibrary, data_dir: Path | None
+) -> SceneModels:
+    """Models of which some are the paper's.
+
+    Args:
+        models: ours, of a scene's objects.
+        stages: which of "fields" and "dynamics" to replace; others have no models.
+        fields: library of the fields.
+        data_dir: whose files come before the installed ones.
+
+    Raises:
+        UnknownName: if an object has no such field.
+        CorruptFile: if a file is broken.
+    """
+    names = tuple(models.shapes)
+    appearance = load_paper_appearance(names, fields, data_dir) if "fields" in stages else models.appearance
+    return SceneModels(appearance, models.dynamics, models.shapes, models.symmetries)
