@@ -30,6 +30,7 @@ ROOMS = (
     "osfcore.dynamics",
     "osfcore.planning",
     "osfcore.control",
+    "osfcore.paper",
     "osfcore.world",
     "osfcore.inspection",
     "osfcore.experiments",

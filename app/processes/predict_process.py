@@ -19,7 +19,7 @@ from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
 
 if TYPE_CHECKING:
-    from osfcore.dynamics.rollout import PushModel
+    from osfcore.dynamics.dynamics_model import DynamicsModel
 
 _MOST_MODELS = 8
 
@@ -39,7 +39,7 @@ class PushPredictor:
     def __init__(self, data_dir: Path) -> None:
         self._data_dir = data_dir
         self._fields = FieldLibrary(data_dir)
-        self._models: OrderedDict[object, PushModel] = OrderedDict()
+        self._models: OrderedDict[object, DynamicsModel] = OrderedDict()
 
     def answer(self, order: Order, is_overtaken: IsOvertaken = lambda: False) -> Predicted | None:
         """What answers an order; None if nobody waits for it any more.
@@ -61,7 +61,7 @@ class PushPredictor:
             raise OsfError("The prediction runs out of all bounds, so there is none; begin with objects on the table.")
         return Predicted(rollouts, took_s)
 
-    def _model(self, names: tuple[str, ...]) -> PushModel:
+    def _model(self, names: tuple[str, ...]) -> DynamicsModel:
         from osfcore.dynamics.push_models import load_push_model, network_path
 
         chosen = tuple(sorted(names))

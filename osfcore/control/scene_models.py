@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from osfcore.dynamics.dynamics_model import DynamicsModel
 from osfcore.dynamics.network_weights import read_network
 from osfcore.dynamics.push_models import load_shapes, network_path
 from osfcore.dynamics.rollout import PushModel
@@ -28,7 +29,7 @@ class SceneModels:
     """
 
     appearance: ObjectModels
-    dynamics: PushModel
+    dynamics: DynamicsModel
     shapes: Mapping[str, ObjectShape]
     symmetries: Mapping[str, Symmetry]
 

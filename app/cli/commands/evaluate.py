@@ -138,14 +138,17 @@ class EvaluateDynamicsCommand(_ParallelEvaluation):
     Objects and pairs of objects that training never saw are among them.
     """
 
+    method: Literal["ours", "paper"] = "ours"
+    """Whose predictions: our model's; the paper's as published, with results in the folder paper within --out."""
+
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.dynamics.evaluation import EvaluateDynamics, evaluate_dynamics
 
-        config = EvaluateDynamics(self.folder, self.tasks, self.seed, self.names, self.data_dir)
+        config = EvaluateDynamics(self.folder, self.tasks, self.seed, self.names, self.data_dir, self.method)
         return evaluate_dynamics(config, fields, assets, executor)
 
     def _show(self, report: dict[str, Any]) -> None:
-        _show_dynamics(self.folder, report)
+        _show_dynamics(self.folder if self.method == "ours" else self.folder / self.method, report)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,6 +15,7 @@ from osfcore.errors import InvalidInput
 if TYPE_CHECKING:
     import numpy as np
 
+    from osfcore.dynamics.dynamics_model import DynamicsModel
     from osfcore.geometry.cameras import Camera
     from osfcore.geometry.rollouts import Rollouts
     from osfcore.geometry.states import SceneState
@@ -37,6 +39,8 @@ class Predict:
     """With --images: a camera of the scene.json, one of the four default ones (0 to 3), or goal."""
     sequence: int = 0
     """With --images: which sequence."""
+    method: Literal["ours", "paper"] = "ours"
+    """Whose model: ours; the paper's as published, for which --before plays no part."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     data_dir: Path = field(default_factory=default_data_dir)
@@ -46,7 +50,6 @@ class Predict:
 
     def run(self) -> dict[str, Any]:
         """Predict; the result tells how far each object goes at most [mm], and PSNR by step where it is known."""
-        from osfcore.dynamics.push_models import load_push_model
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.output_paths import check_place
@@ -61,7 +64,8 @@ class Predict:
         if self.images is not None and not 0 <= self.sequence < len(actions):
             raise InvalidInput("sequence", self.sequence, f"between 0 and {len(actions) - 1}")
         camera = self._camera() if self.images is not None else None
-        model = load_push_model(self.data_dir, FieldLibrary(self.data_dir), state.names, pick_device(self.device))
+        load = self._loader()
+        model = load(self.data_dir, FieldLibrary(self.data_dir), state.names, pick_device(self.device))
         start = time.perf_counter()
         rollouts = model.rollout(state, actions, before)
         seconds = time.perf_counter() - start
@@ -72,6 +76,12 @@ class Predict:
         if not self.json:
             _show(result)
         return result
+
+    def _loader(self) -> Callable[..., DynamicsModel]:
+        from osfcore.dynamics.push_models import load_push_model
+        from osfcore.paper.dynamics.rollout import load_paper_push_model
+
+        return load_paper_push_model if self.method == "paper" else load_push_model
 
     def _result(self, rollouts: Rollouts, seconds: float) -> dict[str, Any]:
         import numpy as np

@@ -12,6 +12,7 @@ import tyro
 
 from app.cli.progress_bar import follow
 from app.storage.paths import default_data_dir
+from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from osfcore.fields.training.kiloosf_training import FieldStep
@@ -105,22 +106,24 @@ class TrainDynamicsCommand:
     """Push files that 'osf collect pushes' wrote; one in twelve episodes is held out."""
     out: Path
     """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
-    iterations: int = 26_000
-    """Steps of descent on single substeps, at most."""
-    long_iterations: int = 500
-    """Steps of descent on windows of three actions, after these."""
-    patience: int = 20
-    """Measurements on held-out episodes without a better one after which training stops."""
+    method: Literal["ours", "paper"] = "ours"
+    """What is trained: our model, or the paper's as published, on windows of three actions alone."""
+    iterations: int | None = None
+    """Steps of descent at most: of ours on single substeps (default 26000), of the paper's (default 8000)."""
+    long_iterations: int | None = None
+    """Of ours: steps of descent on windows of three actions, after these (default 500)."""
+    patience: int | None = None
+    """Measurements on held-out episodes without a better one after which training stops (ours 20, paper 16)."""
     without: tuple[str, ...] = ()
-    """Objects whose episodes are left out."""
-    hidden: int = 192
-    """Width of the network."""
-    batch: int = 512
-    """Substeps in each step of descent."""
-    long_batch: int = 96
-    """Windows in each."""
-    rate: float = 4e-3
-    """Of learning, at its highest."""
+    """Of ours: objects whose episodes are left out."""
+    hidden: int | None = None
+    """Width of the network (ours 192, paper 128)."""
+    batch: int | None = None
+    """Substeps, or windows of the paper's, in each step of descent (ours 512, paper 128)."""
+    long_batch: int | None = None
+    """Of ours: windows in each (default 96)."""
+    rate: float | None = None
+    """Of learning, at its highest (ours 0.004, paper 0.002)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     seed: int = 0
@@ -132,31 +135,39 @@ class TrainDynamicsCommand:
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
-        from osfcore.dynamics.push_models import load_shapes
-        from osfcore.dynamics.training.network_training import TrainDynamics, train_dynamics
-        from osfcore.fields.field_library import FieldLibrary
-
-        config = TrainDynamics(
-            self.data,
-            self.out,
-            iterations=self.iterations,
-            batch=self.batch,
-            long_iterations=self.long_iterations,
-            long_batch=self.long_batch,
-            hidden=self.hidden,
-            rate=self.rate,
-            patience=self.patience,
-            without=self.without,
-            device=self.device,
-            seed=self.seed,
-        )
-        library = FieldLibrary(self.data_dir)
-        follow(train_dynamics(config, load_shapes(self.data_dir, library, library.names())))
+        follow(self._train_paper() if self.method == "paper" else self._train_ours())
         metrics = _metrics(self.out)
         if not self.json:
             mm, deg = metrics["validation_mm_4"], metrics["validation_deg_4"]
             print(f"Wrote {self.out}: held out, {mm:.1f} mm and {deg:.1f} deg after 4 steps.")
         return {"out": str(self.out), **metrics}
+
+    def _train_ours(self) -> Iterator[Progress]:
+        from osfcore.dynamics.push_models import load_shapes
+        from osfcore.dynamics.training.network_training import TrainDynamics, train_dynamics
+        from osfcore.fields.field_library import FieldLibrary
+
+        given = self._given("iterations", "long_iterations", "patience", "hidden", "batch", "long_batch", "rate")
+        config = TrainDynamics(self.data, self.out, without=self.without, device=self.device, seed=self.seed, **given)
+        library = FieldLibrary(self.data_dir)
+        return train_dynamics(config, load_shapes(self.data_dir, library, library.names()))
+
+    def _train_paper(self) -> Iterator[Progress]:
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.paper.dynamics.graph import longest_axes
+        from osfcore.paper.dynamics.training import TrainPaperDynamics, train_paper_dynamics
+
+        for name in (*self._given("long_iterations", "long_batch"), *(("without",) if self.without else ())):
+            option = f"--{name.replace('_', '-')}"
+            raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
+        given = self._given("iterations", "patience", "hidden", "batch", "rate")
+        config = TrainPaperDynamics(self.data, self.out, device=self.device, seed=self.seed, **given)
+        library = FieldLibrary(self.data_dir)
+        return train_paper_dynamics(config, longest_axes(library, library.names()))
+
+    def _given(self, *names: str) -> dict[str, Any]:
+        """Those of some options that were given; the others are the method's own defaults."""
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
 def _progress(steps: Iterator[FieldStep]) -> Iterator[Progress]:

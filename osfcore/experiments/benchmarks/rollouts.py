@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from osfcore.dynamics.dynamics_model import DynamicsModel
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.rollout import PushModel
 from osfcore.dynamics.shapes.object_shapes import ObjectShape
@@ -57,7 +58,11 @@ def bench_rollouts(
         InvalidInput: if there are no shapes.
     """
     names = tuple(sorted(shapes))[: len(BENCH_NAMES)]
-    model = PushModel(network, {name: shapes[name] for name in names}, device)
+    return _timed(PushModel(network, {name: shapes[name] for name in names}, device), shapes)
+
+
+def _timed(model: DynamicsModel, shapes: Mapping[str, ObjectShape]) -> RolloutCosts:
+    names = tuple(sorted(shapes))[: len(BENCH_NAMES)]
     state, actions = _scene(names, shapes), _paths(stream_rng(0, Stream.BENCHMARK))
     rollouts = model.rollout(state, actions)  # warm
     seconds = []
@@ -70,9 +75,14 @@ def bench_rollouts(
     return RolloutCosts(median, SEQUENCES * HORIZON / median, float(moved.mean()), torch.get_num_threads())
 
 
-def rollout_rate(network: PropagationNetwork, shapes: Mapping[str, ObjectShape]) -> float:
-    """Steps of three-object scenes predicted in a second."""
-    return bench_rollouts(network, shapes).rollout_steps_per_s
+def rollout_rate(model: DynamicsModel, shapes: Mapping[str, ObjectShape]) -> float:
+    """Steps of three-object scenes predicted in a second.
+
+    Args:
+        model: that predicts, and knows these objects.
+        shapes: by name; the first three names are taken.
+    """
+    return _timed(model, shapes).rollout_steps_per_s
 
 
 def _scene(names: tuple[str, ...], shapes: Mapping[str, ObjectShape]) -> SceneState:

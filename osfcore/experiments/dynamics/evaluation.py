@@ -3,7 +3,8 @@
 Episodes of both policies with two, three, four and six objects are collected once into the output folder, from random
 streams that no other collection uses. Windows of up to 30 actions are rolled out by the network, by a quasi-static
 model and by nobody (everything stays), and scored for objects that truly moved. Pairs of objects that never meet in
-training are scored apart, and so are objects that a second network has never seen.
+training are scored apart, and so are objects that a second network has never seen; with the paper's network neither is,
+for it has met them all. Episodes are the same for every method.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from osfcore.dynamics.network_weights import read_metrics, read_network, shipped
-from osfcore.dynamics.push_models import load_shapes, network_path
+from osfcore.dynamics.push_models import load_shapes
 from osfcore.dynamics.shapes.object_shapes import ObjectShape
 from osfcore.errors import InvalidInput, MissingAssets, check_seed
 from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, rollout_rate
+from osfcore.experiments.dynamics.methods import DynamicsMethod, Predictor, check_method, load_predictor
 from osfcore.experiments.dynamics.plots import write_gallery, write_plots
 from osfcore.experiments.dynamics.report import DynamicsReport, Scored, report_json
 from osfcore.experiments.dynamics.scores import analytic, constant, errors, learned, windows_of
@@ -43,11 +45,12 @@ class EvaluateDynamics:
     """What to measure.
 
     Attributes:
-        folder: for episodes, pictures and dynamics.json.
+        folder: for episodes, pictures and dynamics.json; those of the paper's method go into its folder "paper".
         tasks: episodes of each policy with three objects, and of both together with other numbers.
         seed: of the episodes.
         names: objects; all that have a field and a mesh if None.
         data_dir: where a network trained on this machine may be.
+        method: whose predictions.
     """
 
     folder: Path
@@ -55,6 +58,12 @@ class EvaluateDynamics:
     seed: int = 0
     names: tuple[str, ...] | None = None
     data_dir: Path | None = None
+    method: DynamicsMethod = "ours"
+
+    @property
+    def results(self) -> Path:
+        """Folder for pictures and dynamics.json."""
+        return self.folder if self.method == "ours" else self.folder / self.method
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,7 +97,7 @@ class _Set:
 def evaluate_dynamics(
     config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
 ) -> Iterator[DynamicsEvaluationStep]:
-    """Collect, predict and score; pictures and dynamics.json go to `config.folder`.
+    """Collect, predict and score; pictures and dynamics.json go to `config.results`.
 
     Args:
         config: what to measure.
@@ -102,7 +111,7 @@ def evaluate_dynamics(
         CorruptFile, CannotWrite: as files are.
     """
     names = _checked(config, fields, assets)
-    unseen = _unseen(names)
+    unseen = _unseen(config, names)
     sets = _sets(config, names, unseen)
     total = 2 * len(sets) + 1
     done = 0
@@ -111,23 +120,26 @@ def evaluate_dynamics(
             yield DynamicsEvaluationStep(done, total, f"Pushes, {entry.objects} objects: {step}")
         done += 1
     shapes = load_shapes(config.data_dir, fields, names)
+    predictor = load_predictor(config.method, config.data_dir, fields, shapes)
     scored: dict[str, Scored] = {}
     for entry in sets:
         yield DynamicsEvaluationStep(done, total, f"Predicting {entry.policy} pushes of {entry.objects} objects")
-        scored[entry.key] = _score(config, entry, shapes, assets)
+        scored[entry.key] = _score(config, entry, shapes, assets, predictor)
         done += 1
     yield DynamicsEvaluationStep(done, total, "Timing rollouts")
-    network = read_network(network_path(config.data_dir))
+    bench_shapes = load_shapes(config.data_dir, fields, BENCH_NAMES)
+    timed = load_predictor(config.method, config.data_dir, fields, bench_shapes).model
     report = DynamicsReport(
         by_set={key: value for key, value in scored.items() if key != _UNSEEN},
         unseen=scored.get(_UNSEEN),
         unseen_names=unseen,
-        rollout_steps_per_s=rollout_rate(network, load_shapes(config.data_dir, fields, BENCH_NAMES)),
+        rollout_steps_per_s=rollout_rate(timed, bench_shapes),
+        holds_out_pairs=config.method == "ours",
     )
-    write_plots(config.folder, report)
-    write_gallery(config.folder, report, shapes)
+    write_plots(config.results, report)
+    write_gallery(config.results, report, shapes)
     figures = report_json(report)
-    write_json(config.folder / REPORT_FILE, figures)
+    write_json(config.results / REPORT_FILE, figures)
     yield DynamicsEvaluationStep(total, total, "Everything is measured", figures)
 
 
@@ -136,6 +148,7 @@ def _checked(config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrar
     if not 1 <= config.tasks <= MAX_TASKS:
         raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
     check_seed(config.seed)
+    check_method(config.method)
     if config.names is None:
         names = tuple(name for name in fields.names() if assets.has(name))
     else:
@@ -149,8 +162,10 @@ def _checked(config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrar
     return names
 
 
-def _unseen(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Objects that the second shipped network has not seen, as far as they are there."""
+def _unseen(config: EvaluateDynamics, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Objects that the second shipped network has not seen, as far as they are there; the paper's has no second one."""
+    if config.method != "ours":
+        return ()
     return tuple(name for name in read_metrics(shipped("pushes_without_two")).get("without", ()) if name in names)
 
 
@@ -181,12 +196,13 @@ def _path(config: EvaluateDynamics, entry: _Set) -> Path:
     return config.folder / f"pushes-{entry.key.replace(' ', '-')}-{entry.episodes}-{config.seed}-{which}.h5"
 
 
-def _score(config: EvaluateDynamics, entry: _Set, shapes: Mapping[str, ObjectShape], assets: AssetLibrary) -> Scored:
+def _score(
+    config: EvaluateDynamics, entry: _Set, shapes: Mapping[str, ObjectShape], assets: AssetLibrary, predictor: Predictor
+) -> Scored:
     windows = windows_of(read_pushes(_path(config, entry)))
     symmetries = {name: assets.info(name).symmetry for name in entry.names}
-    network = read_network(network_path(config.data_dir))
     predictions = {
-        "network": learned(network, shapes, windows),
+        "network": predictor.predict(windows),
         "constant": constant(windows),
         "analytic": analytic(shapes, windows),
     }

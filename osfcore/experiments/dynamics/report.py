@@ -40,12 +40,14 @@ class DynamicsReport:
         unseen: scenes with objects that the second network has not seen.
         unseen_names: these objects.
         rollout_steps_per_s: steps of three-object scenes that are predicted in a second.
+        holds_out_pairs: whether there are pairs of objects that never met in the network's training.
     """
 
     by_set: Mapping[str, Scored]
     unseen: Scored | None
     unseen_names: tuple[str, ...]
     rollout_steps_per_s: float
+    holds_out_pairs: bool = True
 
     def of_count(self, objects: int) -> list[Scored]:
         """Both policies with that many objects."""
@@ -70,7 +72,7 @@ def report_json(report: DynamicsReport) -> dict[str, Any]:
     result["by_objects"] = {str(count): _row(report.of_count(count)) for count in _counts(report)}
     result["by_policy"] = {key.split()[0]: _row([s]) for key, s in report.by_set.items() if key.endswith(" 3")}
     result["by_name"] = _by_name(main)
-    result["unseen_pairs"] = _pairs(list(report.by_set.values()))
+    result["unseen_pairs"] = _pairs(list(report.by_set.values()) if report.holds_out_pairs else [])
     return result | _unseen(report)
 
 

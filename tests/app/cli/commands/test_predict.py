@@ -80,6 +80,21 @@ def test_what_was_moving_goes_on(files, state, data_dir, capsys):
     assert "objects one action ago" in capsys.readouterr().err
 
 
+def test_the_papers_model_predicts_on_request(files, data_dir, capsys):
+    folder, count = files
+    assert call(folder, data_dir, "--json") == 0
+    ours = json.loads((folder / "rollouts.json").read_text())
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    before = ["--before", str(folder / "state.json")]  # which plays no part
+    assert call(folder, data_dir, "--method", "paper", *before, "--json") == 0
+    paper = json.loads((folder / "rollouts.json").read_text())
+    assert set(json.loads(capsys.readouterr().out.splitlines()[-1])) == set(told)
+    assert set(paper) == set(ours)
+    assert np.shape(paper["positions"]) == (2, count + 1, 2, 3)
+    assert paper["positions"] != ours["positions"]
+    assert paper["positions"][0][0] == ours["positions"][0][0]
+
+
 def test_pictures_lie_beside_the_simulators(files, data_dir, capsys):
     folder, count = files
     assert (

@@ -11,8 +11,10 @@ from app.cli.main import main
 from osfcore.dynamics.network_weights import read_network
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.field_weights import read_field
+from osfcore.paper.dynamics.weights import read_network as read_paper_network
 from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
 from tests.core.fields.sets import write_set
+from tests.core.paper.dynamics.scenes import episode, write
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +78,34 @@ def test_mistakes_are_told_before_anything_is_trained(image_set, tmp_path):
     with pytest.raises(CorruptFile, match="anno.json"):
         TrainFieldCommand(tmp_path, tmp_path / "egg.safetensors").run()
     assert not (tmp_path / "egg.safetensors").exists()
+
+
+@pytest.fixture
+def toy_pushes(tmp_path):
+    return write(tmp_path / "pushes.h5", [episode(seed) for seed in range(14)])
+
+
+def test_the_papers_model_is_trained_on_request(toy_pushes, tmp_path, capsys):
+    out = tmp_path / "paper.safetensors"
+    arguments = ["train", "dynamics", "--method", "paper", "--data", str(toy_pushes), "--out", str(out)]
+    quick = ["--data-dir", str(tmp_path), "--iterations", "30", "--hidden", "8", "--batch", "4", "--device", "cpu"]
+    assert main([*arguments, *quick, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
+    assert (result["iterations"], read_paper_network(out).hidden) == (30, 8)
+    assert "--method paper" in result["command"]
+    assert main([*arguments, *quick, "--rate", "0"]) == 1
+    assert "rate of learning" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [("--long-iterations", "3"), ("--long-batch", "3"), ("--without", "teapot")])
+def test_what_the_papers_model_has_not_cannot_be_asked_for(toy_pushes, tmp_path, capsys, option):
+    out = tmp_path / "paper.safetensors"
+    arguments = ["train", "dynamics", "--method", "paper", "--data", str(toy_pushes), "--out", str(out)]
+    assert main([*arguments, *option]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert option[0] in line
+    assert not out.exists()
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 import numpy as np
 
 from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.rollout import PushModel
 from osfcore.experiments.benchmarks import rollouts as bench_dynamics
 from osfcore.experiments.benchmarks.rollouts import bench_rollouts, rollout_rate
 from tests.core.experiments.pushes import shapes
@@ -13,4 +14,4 @@ def test_rollouts_are_timed_in_a_scene_where_most_paths_meet_something(monkeypat
     assert costs.rollout_s > 0
     assert np.isclose(costs.rollout_steps_per_s, 400 / costs.rollout_s)
     assert costs.touched_share > 0.3
-    assert rollout_rate(PropagationNetwork(8, 1), shapes()) > 0
+    assert rollout_rate(PushModel(PropagationNetwork(8, 1), shapes()), shapes()) > 0

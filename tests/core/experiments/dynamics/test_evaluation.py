@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -40,11 +41,31 @@ def test_an_evaluation_collects_once_and_tells_everything(quick, library, tmp_pa
     assert {**again, "rollout_steps_per_s": 0} == {**report, "rollout_steps_per_s": 0}
 
 
+@pytest.mark.slow
+def test_the_papers_model_is_measured_on_the_same_episodes(quick, library, tmp_path):
+    config = EvaluateDynamics(tmp_path, tasks=1, seed=4, names=NAMES)
+    ours = list(evaluate_dynamics(config, FieldLibrary(None), library))[-1].report
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    paper = list(evaluate_dynamics(replace(config, method="paper"), FieldLibrary(None), library))[-1].report
+    assert {name: (tmp_path / name).stat().st_mtime_ns for name in kept} == kept  # neither episodes nor results
+    assert ours is not None
+    assert paper is not None
+    assert set(paper) == set(ours)
+    assert json.loads((tmp_path / "paper" / REPORT_FILE).read_text()) == paper
+    for name in ("dynamics.png", "trajectories.png"):
+        assert (tmp_path / "paper" / name).exists()
+    for key in ("windows", "constant_mm_4", "analytic_mm_4"):
+        assert paper[key] == ours[key]
+    assert paper["median_mm_4"] != ours["median_mm_4"]
+    assert (paper["unseen_objects"], paper["unseen_pairs"]["windows"]) == ([], 0)
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
         ({"tasks": 0}, InvalidInput, "number of tasks"),
         ({"seed": -1}, InvalidInput, "seed"),
+        ({"method": "theirs"}, InvalidInput, "method"),
         ({"names": ("003_cracker_box", "teapot")}, UnknownName, "teapot"),
         ({"names": ("003_cracker_box", "011_banana", "024_bowl")}, MissingAssets, "011_banana"),
         ({"names": ("003_cracker_box", "005_tomato_soup_can")}, InvalidInput, "at least 3"),

@@ -50,6 +50,12 @@ def report(**changes: object) -> DynamicsReport:
     return DynamicsReport(**(given | changes))
 
 
+def test_where_all_pairs_were_met_in_training_none_are_told():
+    told = report_json(report(holds_out_pairs=False))
+    assert told["unseen_pairs"] == {"windows": 0, "median_mm_4": None, "constant_mm_4": None}
+    assert set(told) == set(report_json(report()))
+
+
 def test_figures_are_those_of_three_objects_that_moved():
     told = report_json(report())
     assert set(STABLE) <= set(told)

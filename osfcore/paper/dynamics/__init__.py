@@ -1,0 +1,1 @@
+"""The paper's action-conditioned dynamics model (its section 4.3, equations 7 and 8)."""
