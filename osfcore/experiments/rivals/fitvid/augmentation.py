@@ -1,9 +1,10 @@
 """Variations of videos while FitVid learns: a random crop and one random change of colours, the same for all frames.
 
-Deviations from the paper, which takes every operation of RandAugment (Cubuk et al., 2020): none that moves the image
-(flips, rotations, shears, translations), for actions stay what they are and would then point elsewhere. A crop is close
-enough to the camera having moved. The strength of a change is drawn instead of fixed, as the fixed one of the published
-program leaves colour, contrast and brightness as they are. What an operation reads off the image it reads off the video.
+Deviations from the paper, which takes most operations of RandAugment (Cubuk et al., 2020): none that moves the image
+(flips, rotations, shears, translations), for actions stay what they are and would then point elsewhere; a crop is close
+enough to a camera that moved. The strength of a change is drawn, for the published program's fixed one leaves colour,
+contrast and brightness as they are. No equalisation of histograms. What an operation reads off the image, such as the
+mean grey that contrast is relative to, it reads off the whole video.
 """
 
 from __future__ import annotations

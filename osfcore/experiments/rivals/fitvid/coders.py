@@ -35,9 +35,12 @@ class Encoder(nn.Module):
         self.cells = nn.ModuleList(cells)
         self.head = nn.Linear(before, features)
 
-    def forward(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B c h2 w2"]]]:
+    def forward(
+        self, frames: Float[Tensor, "B 3 h w"]
+    ) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B c h2 w2"]]]:
         """The vector of each frame, and the features after each cell."""
-        skips, x = [], frames.contiguous()  # colours last in memory crash PyTorch 2.13's convolutions of few channels
+        # With colours last in memory, 1 x 1 convolutions of few channels at stride 2 crash PyTorch 2.13.
+        skips, x = [], frames.contiguous()
         for cell in self.cells:
             x = cell(x)
             skips.append(x)

@@ -11,10 +11,11 @@ true frames behind h_t-1. To predict, z_t comes from the prior, and behind the c
 
 Deviations from the published program: images are of 128 pixels instead of 64, as in the paper that is reproduced here,
 by one more stage in front, so that the coarsest maps stay 8 x 8 pixels; channels start with 4 at full size and double
-per stage, so that at 64 pixels there are 8 where the original has 64 (7.3 instead of 302 million parameters). Batch norm
-takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no variance, which the
-original computes and never uses. Encoder and decoder may compute in bfloat16. Predictions take the skip connections from the last context frame, as training does;
-the original takes those of the first one there. Actions are in units of the highest speed.
+per stage, so that at 64 pixels there are 8 where the original has 64 (7.4 instead of 302 million parameters). Batch
+norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no variance,
+which the original computes and never uses. Encoder and decoder may compute in bfloat16. Predictions take the skip
+connections from the last context frame, as training does; the original takes those of the first one there. Actions are
+in units of the highest speed.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from torch import Tensor, nn
 
 from osfcore.errors import InvalidInput
 from osfcore.experiments.rivals.fitvid.coders import COARSEST_SIDE, Decoder, Encoder, Skips
-from osfcore.experiments.rivals.fitvid.recurrence import FrameLSTM, Gaussian, LatentLSTM, kl_divergence
+from osfcore.experiments.rivals.fitvid.recurrence import FrameLSTM, LatentLSTM, kl_divergence
 from osfcore.geometry.workspace import MAX_SPEED_M_S
 
 CONTEXT = 2  # frames that are given

@@ -36,6 +36,10 @@ def kl_divergence(p: Gaussian, q: Gaussian) -> Float[Tensor, "*batch"]:
     """KL(p || q) in closed form, summed over the components.
 
         sum_i (ln s_q^2 - ln s_p^2 + (s_p^2 + (m_p - m_q)^2) / s_q^2 - 1) / 2
+
+    Args:
+        p: such as the posterior.
+        q: such as the prior.
     """
     ratio = (p.logvar - q.logvar).exp()
     far = (p.mean - q.mean).square() * (-q.logvar).exp()
@@ -78,8 +82,8 @@ class LatentLSTM(nn.Module):
 
     def forward(self, x: Float[Tensor, "B T inputs"], state: State | None = None) -> tuple[Gaussian, State]:
         """Gaussians (B, T, z), and the state to go on from."""
-        y, state = self.recurrence(x, state)
-        return Gaussian(self.mean(y), self.logvar(y)), state
+        y, after = self.recurrence(x, state)
+        return Gaussian(self.mean(y), self.logvar(y)), after
 
 
 class FrameLSTM(nn.Module):
@@ -99,5 +103,5 @@ class FrameLSTM(nn.Module):
         self, x: Float[Tensor, "B T inputs"], state: State | None = None
     ) -> tuple[Float[Tensor, "B T g"], State]:
         """Vectors in (0, 1), and the state to go on from."""
-        y, state = self.recurrence(x, state)
-        return self.head(y).sigmoid(), state
+        y, after = self.recurrence(x, state)
+        return self.head(y).sigmoid(), after

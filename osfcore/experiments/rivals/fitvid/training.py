@@ -182,8 +182,8 @@ class _Run:
             self._recent[name] = value + _RECENT * (self._recent.get(name, value) - value)
         self.steps += 1
         self._spent_s += time.monotonic() - began
-        recent = self._recent
-        return f"step {self.steps}: MSE {recent['error']:.5f} (a copied frame: {recent['still']:.5f}), KL {recent['kl']:.2f}"
+        error, still, kl = (self._recent[name] for name in ("error", "still", "kl"))
+        return f"step {self.steps}: MSE {error:.5f}, of a copied frame {still:.5f}; KL {kl:.2f}"
 
     def _descend(self, loss: torch.Tensor) -> None:
         self._adam.zero_grad(set_to_none=True)

@@ -12,6 +12,7 @@ from osfcore.dynamics.network_weights import read_network
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.field_weights import read_field
 from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from tests.core.experiments.rivals.fitvid.videos import write_videos
 from tests.core.fields.sets import write_set
 
 
@@ -97,3 +98,19 @@ def test_pushes_are_learned_from_collected_ones(library, tmp_path, capsys):
     assert "rate of learning" in capsys.readouterr().err
     assert main([*arguments, *quick]) == 0
     assert "after 4 steps" in capsys.readouterr().out
+
+
+def test_a_rival_is_trained_from_frames(tmp_path, capsys):
+    frames, out = write_videos(tmp_path / "frames.h5"), tmp_path / "fitvid.safetensors"
+    arguments = ["train", "fitvid", "--data", str(frames), "--out", str(out), "--iterations", "2", "--width", "1"]
+    arguments += ["--batch", "2", "--frames", "3", "--no-augment", "--device", "cpu"]
+    assert main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
+    assert (result["iterations"], result["videos"]) == (2, 2)
+    assert "held out" in told.err
+    assert main(arguments) == 0
+    assert "the last known frame, copied" in capsys.readouterr().out
+    assert main([*arguments, "--rate", "0"]) == 1
+    assert "rate of learning" in capsys.readouterr().err
