@@ -12,7 +12,7 @@ from osfcore.experiments.rivals.fitvid.cells import DecoderCell, EncoderCell
 COARSEST_SIDE = 8  # of the feature maps between encoder and decoder, as in the original [px]
 _CELLS = 2  # of a stage
 
-Skips = Sequence[Float[Tensor, "B c h w"]]  # features after each of the encoder's cells, the finest first
+Skips = Sequence[Float[Tensor, "_ _ _ _"]]  # features after each of the encoder's cells, the finest first
 
 
 class Encoder(nn.Module):
@@ -35,9 +35,7 @@ class Encoder(nn.Module):
         self.cells = nn.ModuleList(cells)
         self.head = nn.Linear(before, features)
 
-    def forward(
-        self, frames: Float[Tensor, "B 3 h w"]
-    ) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B c h2 w2"]]]:
+    def forward(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B _ _ _"]]]:
         """The vector of each frame, and the features after each cell."""
         # With colours last in memory, 1 x 1 convolutions of few channels at stride 2 crash PyTorch 2.13.
         skips, x = [], frames.contiguous()

@@ -156,42 +156,42 @@ class FitVidModel(nn.Module):
         squared_error = (predicted - frames[:, 1:]).square().mean(dim=(0, 2, 3, 4)).sum()
         return Losses(squared_error, kl_divergence(posterior, prior).sum(dim=1).mean())
 
-    @torch.inference_mode()
     def rollout(
         self,
         context: Float[Tensor, "B 2 3 side side"],
         actions: Float[Tensor, "B T1 3"],
         generator: torch.Generator | None = None,
-    ) -> Iterator[Float[Tensor, "B 3 side side"]]:
-        """The frames after the context, one after the other.
+    ) -> Iterator[Tensor]:
+        """The frames (B, 3, side, side) after the context, one after the other.
 
         Args:
             context: true frames in [0, 1].
             actions: the first one between the context's frames, then one for each frame that is predicted [m/s].
             generator: draws latents from the prior; its mean is taken if None.
         """
+        vectors, skips = self._context(context)
+        yield from self._continued(vectors, skips, actions, generator)
+
+    @torch.inference_mode()
+    def _context(self, context: Float[Tensor, "B 2 3 side side"]) -> tuple[Float[Tensor, "B 2 g"], list[Tensor]]:
+        """Vectors of the context's frames, and the feature maps of the last ones."""
         vectors, skips = self._encoded(context.flatten(0, 1))
-        skips = [skip[CONTEXT - 1 :: CONTEXT] for skip in skips]
-        yield from self._continued(vectors.unflatten(0, (-1, CONTEXT)), skips, actions, generator)
+        return vectors.unflatten(0, (-1, CONTEXT)), [skip[CONTEXT - 1 :: CONTEXT] for skip in skips]
 
     def _continued(
         self, vectors: Tensor, skips: list[Tensor], actions: Tensor, generator: torch.Generator | None
     ) -> Iterator[Tensor]:
-        prior_state = frame_state = None
-        steps = actions.shape[1]
-        vector = vectors[:, 0]
-        for step in range(steps):
-            prior, prior_state = self.prior(vector[:, None], prior_state)
-            latent = prior.mean if generator is None else prior.sample(generator)
-            inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, latent]
-            following, frame_state = self.frame_predictor(torch.cat(inputs, dim=-1), frame_state)
-            if step + 1 < CONTEXT:
-                vector = vectors[:, step + 1]
-                continue
-            frame = self._decoded(following[:, 0], skips)
-            yield frame
-            if step + 1 < steps:
-                vector, _ = self._encoded(frame)
+        prior_state = frame_state = frame = None
+        for step in range(actions.shape[1]):
+            with torch.inference_mode():
+                vector = vectors[:, step] if frame is None else self._encoded(frame)[0]
+                prior, prior_state = self.prior(vector[:, None], prior_state)
+                latent = prior.mean if generator is None else prior.sample(generator)
+                inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, latent]
+                following, frame_state = self.frame_predictor(torch.cat(inputs, dim=-1), frame_state)
+                frame = self._decoded(following[:, 0], skips) if step + 1 >= CONTEXT else None
+            if frame is not None:
+                yield frame
 
     def predict(
         self,
@@ -221,11 +221,9 @@ class FitVidModel(nn.Module):
         first = np.zeros(_ACTION) if between is None else between
         all_actions = np.concatenate([np.broadcast_to(first, (len(actions), 1, _ACTION)), actions], axis=1)
         given = torch.as_tensor(all_actions, dtype=torch.float32, device=device)
-        with torch.inference_mode():
-            vectors, skips = self._encoded(context)
-            skips = [skip[CONTEXT - 1 :] for skip in skips]  # one frame's for all sequences
-            parts = []
-            for part in given.split(_AT_ONCE):
-                begun = vectors[None].expand(len(part), -1, -1)
-                parts.append(torch.stack(list(self._continued(begun, skips, part, generator)), dim=1))
-        return torch.cat(parts).permute(0, 1, 3, 4, 2).contiguous().cpu().numpy()
+        vectors, skips = self._context(context[None])  # once for all sequences
+        parts = []
+        for part in given.split(_AT_ONCE):
+            futures = self._continued(vectors.expand(len(part), -1, -1), skips, part, generator)
+            parts.append(torch.stack(list(futures), dim=1))
+        return torch.cat(parts).movedim(2, -1).contiguous().cpu().numpy()
