@@ -114,3 +114,21 @@ def test_a_rival_is_trained_from_frames(tmp_path, capsys):
     assert "the last known frame, copied" in capsys.readouterr().out
     assert main([*arguments, "--rate", "0"]) == 1
     assert "rate of learning" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_killed_rival_goes_on_when_the_same_command_is_run_again(tmp_path):
+    frames, out = write_videos(tmp_path / "frames.h5"), tmp_path / "fitvid.safetensors"
+    command = [sys.executable, "-m", "app.cli", "train", "fitvid", "--data", str(frames), "--out", str(out)]
+    command += ["--iterations", "300", "--width", "1", "--batch", "2", "--frames", "3", "--save-every", "20"]
+    process = subprocess.Popen([*command, "--device", "cpu"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not out.with_suffix(".checkpoint").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not out.exists()
+    done = subprocess.run([*command, "--device", "cpu", "--json"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr.startswith("[  0 %]")
+    assert json.loads(done.stdout.splitlines()[-1])["iterations"] == 300
