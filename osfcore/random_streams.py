@@ -39,6 +39,9 @@ class Stream(IntEnum):
     LIGHT = 20  # of scenes whose objects lie where a person wants them
     BOOTSTRAP = 21
     FACTOR_LIGHT = 22
+    COLLECTED_LIGHT = 70  # of trajectories whose frames are kept
+    VIDEO_WINDOWS = 71  # which of them video prediction learns from, and how they are varied
+    VIDEO_WEIGHTS = 72  # that video prediction begins with
 
 
 def _sequence(seed: int, stream: Stream, numbers: tuple[int, ...]) -> np.random.SeedSequence:

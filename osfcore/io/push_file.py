@@ -244,7 +244,8 @@ def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
     group.attrs["seed"] = episode.seed
     group.create_dataset("names", data=list(episode.names), dtype=h5py.string_dtype())
     for name, array in _arrays(episode).items():
-        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
+        chunks = (1, *array.shape[1:]) if name == "frames" else True  # whoever learns from frames reads a few at a time
+        group.create_dataset(name, data=array, compression="gzip", shuffle=True, chunks=chunks)
 
 
 def _from_group(group: h5py.Group) -> PushEpisode:

@@ -88,7 +88,13 @@ class CollectPushesCommand:
     seed: int = 0
     """Of everything."""
     images: bool = False
-    """Keep frames of camera 0 as well."""
+    """Keep frames of one camera as well, with the pusher in them."""
+    camera: Literal["0", "goal"] = "0"
+    """What takes the frames: camera 0, or the one that takes goal images."""
+    size: int = 128
+    """Side of the frames [px]."""
+    random_lights: bool = False
+    """Frames under one light per episode from the whole hemisphere."""
     renderer: Literal["embree", "tiny"] = "embree"
     """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
     names: tuple[str, ...] | None = None
@@ -106,7 +112,8 @@ class CollectPushesCommand:
         from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
 
         config = CollectPushes(self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images,
-                               self.renderer, self.names, self.disturb)  # fmt: skip
+                               self.renderer, self.names, self.disturb, self.camera, self.size,
+                               self.random_lights)  # fmt: skip
         in_flight = self.workers + 2 if self.cluster is None else _IN_FLIGHT
         with worker_pool(self.workers, self.cluster) as executor:
             last = follow(collect_pushes(config, AssetLibrary(self.data_dir / "objects"), executor, in_flight))

@@ -1,10 +1,10 @@
-"""`osf train`: fields from image sets, dynamics from pushes."""
+"""`osf train`: fields from image sets, dynamics from pushes, and a rival that predicts video."""
 
 from __future__ import annotations
 
 import json as json_text
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -170,6 +170,57 @@ class TrainDynamicsCommand:
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
+@dataclass(frozen=True)
+class TrainFitVidCommand:
+    """FitVid, which predicts video, to compare with. A killed training goes on when started again."""
+
+    data: tuple[Path, ...]
+    """Push files with frames, as 'osf collect pushes --images --camera goal --random-lights' writes them."""
+    out: Path
+    """File to write, such as fitvid.safetensors; its metrics go beside it as .json."""
+    minutes: float = 60.0
+    """How long to train [min]."""
+    iterations: int | None = None
+    """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    width: int = 4
+    """Channels at full size; they double whenever the image is halved."""
+    batch: int = 8
+    """Windows in each step of descent."""
+    frames: int = 12
+    """Frames of a window, of which two are given."""
+    rate: float = 1e-3
+    """Of learning."""
+    beta: float = 1e-4
+    """Weight of the KL divergence."""
+    augment: bool = True
+    """Vary crops and colours."""
+    precision: Literal["bfloat16", "float32"] = "bfloat16"
+    """What convolutions compute in while training."""
+    save_every: int = 20
+    """Steps between checkpoints."""
+    measured: int = 32
+    """Held-out videos to measure on in the end, at most."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        from osfcore.experiments.rivals.fitvid.training import TrainFitVid, train_fitvid
+
+        settings = {one.name: getattr(self, one.name) for one in fields(TrainFitVid)}
+        follow(train_fitvid(TrainFitVid(**settings)))
+        metrics = _metrics(self.out)
+        if not self.json:
+            for horizon, means in metrics["horizons"].items():
+                told = f"{means['psnr']:.1f} dB (the last known frame, copied: {means['psnr_copied']:.1f} dB)"
+                print(f"Wrote {self.out}: held out, over {horizon} steps, {told}.")
+        return {"out": str(self.out), **metrics}
+
+
 def _progress(steps: Iterator[FieldStep]) -> Iterator[Progress]:
     for step in steps:
         yield step.progress
@@ -182,6 +233,7 @@ def _metrics(out: Path) -> dict[str, Any]:
 Train = Annotated[
     Annotated[TrainFieldCommand, tyro.conf.subcommand("field")]
     | Annotated[TrainTableCommand, tyro.conf.subcommand("table")]
-    | Annotated[TrainDynamicsCommand, tyro.conf.subcommand("dynamics")],
+    | Annotated[TrainDynamicsCommand, tyro.conf.subcommand("dynamics")]
+    | Annotated[TrainFitVidCommand, tyro.conf.subcommand("fitvid")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

@@ -9,11 +9,13 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from osfcore.errors import CannotWrite, InvalidInput, WorkerDied
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera, image_side
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import rotation_angle
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.io.image_file import to_uint8
@@ -28,6 +30,7 @@ from osfcore.world.tabletop import Renderer, Tabletop
 MOVED_M = 1e-3
 MOVED_RAD = np.deg2rad(0.5)
 SUBSTATES = 4  # poses recorded within an action: dynamics learns from them what contact does in between
+FrameCamera = Literal["0", "goal"]
 _MAX_EPISODES, _MAX_STEPS, _MAX_DISTURB = 1_000_000, 1000, 100
 
 
@@ -42,11 +45,15 @@ class CollectPushes:
         objects: objects per scene, chosen at random among those fetched.
         policy: "paper" (uniform random velocities) or "directed" (seeks sustained contact).
         seed: of everything.
-        images: whether to keep frames of camera "0" as well.
+        images: whether to keep frames of one camera as well, with the pusher.
         renderer: what takes the frames.
         names: objects to choose from; all of the library if None.
         disturb: from how many disturbed states to simulate each substep in which something moves (see
             `osfcore.world.collection.disturbed_states`).
+        camera: that takes the frames.
+        size: side of the frames [px].
+        random_lights: frames under one light per episode from the whole hemisphere down to the lowest light that is
+            allowed, instead of the scene's own; nothing else changes.
     """
 
     out: Path
@@ -59,6 +66,9 @@ class CollectPushes:
     renderer: Renderer = "embree"
     names: tuple[str, ...] | None = None
     disturb: int = 0
+    camera: FrameCamera = "0"
+    size: int = DEFAULT_IMAGE_SIDE
+    random_lights: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +125,8 @@ def collect_pushes(
         "available": list(library.names() if config.names is None else config.names),
         "disturb": config.disturb,
     }
+    if config.images:
+        settings |= {"camera": config.camera, "size": config.size, "random_lights": config.random_lights}
     try:
         config.out.parent.mkdir(parents=True, exist_ok=True)
         with EpisodeFolder(config.out, settings) as folder:
@@ -154,6 +166,9 @@ def _check(config: CollectPushes) -> None:
         raise InvalidInput("disturbed states of each substep", config.disturb, f"between 0 and {_MAX_DISTURB}")
     if config.seed < 0:
         raise InvalidInput("seed", config.seed, "0 or more")
+    if config.camera not in ("0", "goal"):
+        raise InvalidInput("camera", repr(config.camera), '"0" or "goal"')
+    image_side(config.size)
     if config.out.exists():
         raise InvalidInput("output file", config.out, "new")
 
@@ -213,10 +228,14 @@ def _episodes(
 
 
 @functools.lru_cache(maxsize=2)
-def _tabletop(root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer) -> Tabletop:
+def _tabletop(
+    root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer, view: tuple[FrameCamera, int]
+) -> Tabletop:
     """One simulator per process and setting: its meshes stay loaded from episode to episode."""
     request = SceneRequest(count=objects, among=names)
-    return Tabletop(AssetLibrary(root), cameras=default_cameras()[:1], request=request, renderer=renderer)
+    name, size = view
+    camera = goal_camera(size) if name == "goal" else default_cameras(size)[0]
+    return Tabletop(AssetLibrary(root), cameras=(camera,), request=request, renderer=renderer)
 
 
 def _kept(path: Path, episode: PushEpisode) -> PushEpisode:
@@ -228,8 +247,11 @@ def _kept(path: Path, episode: PushEpisode) -> PushEpisode:
 def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
     """Simulate one episode, which depends on nothing but the settings and its index."""
     seed = stream_seed(config.seed, Stream.COLLECTED_SCENE, index)
-    world = _tabletop(root, config.objects, config.names, config.renderer)
+    world = _tabletop(root, config.objects, config.names, config.renderer, (config.camera, config.size))
     world.arrange(seed)
+    if config.random_lights:
+        lights = stream_rng(config.seed, Stream.COLLECTED_LIGHT, index)
+        world.set_light(Light.random(lights, MIN_LIGHT_ELEVATION_DEG))
     rng = stream_rng(config.seed, Stream.COLLECTED_POLICY, index)
     policy = PaperPolicy(rng) if config.policy == "paper" else DirectedPolicy(world.assets, rng)
     states, contacts, actions, within = [world.truth()], [], [], []
@@ -266,7 +288,7 @@ def _pusher(state: SceneState) -> np.ndarray:
 
 
 def _frame(world: Tabletop, config: CollectPushes) -> np.ndarray:
-    """The view of camera "0" as one 8-bit frame, or no frame."""
+    """The camera's view as one 8-bit frame, or no frame."""
     if not config.images:
-        return np.zeros((0, DEFAULT_IMAGE_SIDE, DEFAULT_IMAGE_SIDE, 3), np.uint8)
+        return np.zeros((0, config.size, config.size, 3), np.uint8)
     return to_uint8(world.observe().images)

@@ -10,6 +10,7 @@ from app.cli.commands.collect import (
 )
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.inspection.check import check_path
+from osfcore.io.push_file import read_pushes
 
 
 def test_object_images(data_dir, tmp_path):
@@ -32,6 +33,15 @@ def test_pushes_tell_their_shares(data_dir, tmp_path):
     assert 0 <= result["contact_share"] <= 1
     assert 0 <= result["motion_share"] <= 1
     assert result["episodes_per_s"] > 0
+
+
+def test_frames_of_the_goal_camera_go_along_with_pushes(data_dir, tmp_path):
+    out = tmp_path / "pushes.h5"
+    more = {"images": True, "camera": "goal", "size": 16, "random_lights": True}
+    CollectPushesCommand(out, episodes=1, steps=2, workers=1, data_dir=data_dir, **more).run()
+    (episode,) = read_pushes(out)
+    assert episode.frames is not None
+    assert episode.frames.shape == (3, 16, 16, 3)
 
 
 def test_mistakes_are_errors_of_ours(data_dir, tmp_path):

@@ -13,6 +13,7 @@ from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.field_weights import read_field
 from osfcore.paper.dynamics.weights import read_network as read_paper_network
 from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from tests.core.experiments.rivals.fitvid.videos import write_videos
 from tests.core.fields.sets import write_set
 from tests.core.paper.dynamics.scenes import episode, write
 
@@ -127,3 +128,37 @@ def test_pushes_are_learned_from_collected_ones(library, tmp_path, capsys):
     assert "rate of learning" in capsys.readouterr().err
     assert main([*arguments, *quick]) == 0
     assert "after 4 steps" in capsys.readouterr().out
+
+
+def test_a_rival_is_trained_from_frames(tmp_path, capsys):
+    frames, out = write_videos(tmp_path / "frames.h5"), tmp_path / "fitvid.safetensors"
+    arguments = ["train", "fitvid", "--data", str(frames), "--out", str(out), "--iterations", "2", "--width", "1"]
+    arguments += ["--batch", "2", "--frames", "3", "--no-augment", "--device", "cpu"]
+    assert main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out.splitlines()[-1])
+    assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
+    assert (result["iterations"], result["videos"]) == (2, 2)
+    assert "held out" in told.err
+    assert main(arguments) == 0
+    assert "the last known frame, copied" in capsys.readouterr().out
+    assert main([*arguments, "--rate", "0"]) == 1
+    assert "rate of learning" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_killed_rival_goes_on_when_the_same_command_is_run_again(tmp_path):
+    frames, out = write_videos(tmp_path / "frames.h5"), tmp_path / "fitvid.safetensors"
+    command = [sys.executable, "-m", "app.cli", "train", "fitvid", "--data", str(frames), "--out", str(out)]
+    command += ["--iterations", "300", "--width", "1", "--batch", "2", "--frames", "3", "--save-every", "20"]
+    process = subprocess.Popen([*command, "--device", "cpu"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not out.with_suffix(".checkpoint").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not out.exists()
+    done = subprocess.run([*command, "--device", "cpu", "--json"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr.startswith("[  0 %]")
+    assert json.loads(done.stdout.splitlines()[-1])["iterations"] == 300

@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.workspace import STEP_S
+from osfcore.io.image_file import to_uint8
 from osfcore.io.push_file import PushEpisode, read_pushes
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.collection.collect_pushes import SUBSTATES, CollectPushes, collect_pushes
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 
 def collect(library, out, executor=None, **settings) -> tuple[PushEpisode, ...]:
@@ -117,6 +123,30 @@ def test_frames_on_demand(library, tmp_path):
     assert without.frames is None
 
 
+def test_frames_are_those_of_the_chosen_camera_under_a_light_of_their_own(library, tmp_path):
+    """The pushes are the same whatever is seen of them."""
+    shared = {"episodes": 2, "steps": 2, "objects": 2, "images": True, "size": 32}
+    plain = collect(library, tmp_path / "plain.h5", **shared)
+    goal = collect(library, tmp_path / "goal.h5", camera="goal", **shared)
+    lit = collect(library, tmp_path / "lit.h5", camera="goal", random_lights=True, **shared)
+    assert_same(plain, goal)
+    assert_same(plain, lit)
+    world = Tabletop(library, request=SceneRequest(count=2))
+    try:
+        for index, (scene, other) in enumerate(zip(goal, lit, strict=True)):
+            assert scene.frames is not None
+            assert other.frames is not None
+            assert other.frames.shape == (3, 32, 32, 3)
+            world.arrange(scene.seed)
+            np.testing.assert_array_equal(scene.frames[0], to_uint8(world.render((goal_camera(32),)).images[0]))
+            drawn = stream_rng(0, Stream.COLLECTED_LIGHT, index)
+            world.set_light(Light.random(drawn, MIN_LIGHT_ELEVATION_DEG))
+            np.testing.assert_array_equal(other.frames[0], to_uint8(world.render((goal_camera(32),)).images[0]))
+            assert np.abs(scene.frames.astype(int) - other.frames).max() > 10
+    finally:
+        world.close()
+
+
 def test_shares_are_counted_over_all_steps(library, tmp_path):
     config = CollectPushes(tmp_path / "a.h5", episodes=3, steps=20, policy="directed")
     last = list(collect_pushes(config, library))[-1]
@@ -127,7 +157,9 @@ def test_shares_are_counted_over_all_steps(library, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "bad", [{"episodes": 0}, {"steps": 0}, {"objects": 0}, {"objects": 9}, {"policy": "wild"}, {"seed": -1}]
+    "bad",
+    [{"episodes": 0}, {"steps": 0}, {"objects": 0}, {"objects": 9}, {"policy": "wild"}, {"seed": -1}]
+    + [{"camera": "1"}, {"size": 8}],
 )
 def test_bad_settings_are_refused_before_anything_is_written(library, tmp_path, bad):
     with pytest.raises(InvalidInput):

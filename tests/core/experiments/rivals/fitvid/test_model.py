@@ -1,0 +1,146 @@
+import numpy as np
+import pytest
+import torch
+
+from osfcore.errors import InvalidInput
+from osfcore.experiments.rivals.fitvid.cells import DecoderCell, EncoderCell
+from osfcore.experiments.rivals.fitvid.measurement import as_frames
+from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
+from tests.core.experiments.rivals.fitvid.videos import square_video
+
+TINY = FitVidSettings(side=16, width=2, features=12, hidden=16, latent=3)
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def model(settings=TINY, seed=0, **more) -> FitVidModel:
+    torch.manual_seed(seed)
+    return FitVidModel(settings, **more)
+
+
+def scene(side=16, steps=4, seed=0):
+    frames, actions = square_video(side, steps, np.random.default_rng(seed))
+    video = as_frames(frames[None], torch.device("cpu"))
+    return video, torch.as_tensor(actions[None], dtype=torch.float32)
+
+
+@pytest.mark.parametrize(("side", "stages"), [(16, 2), (32, 3), (64, 4), (128, 5), (1024, 8)])
+def test_every_stage_halves_the_image_down_to_8_pixels(side, stages):
+    assert FitVidSettings(side=side).stages == stages
+
+
+def test_the_default_has_about_eight_million_parameters():
+    with torch.device("meta"):
+        assert 7e6 < FitVidModel().parameter_count < 9e6
+
+
+def test_the_original_had_302_million():
+    """With its 64 channels at 64 pixels, of which the variance that is never used is not counted."""
+    with torch.device("meta"):
+        assert FitVidModel(FitVidSettings(side=64, width=64)).parameter_count == pytest.approx(302e6, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"side": 20}, {"side": 8}, {"side": 2048}, {"width": 0}, {"features": 0}, {"hidden": 0}, {"latent": 0}]
+)
+def test_sizes_out_of_range_are_refused(bad):
+    with pytest.raises(InvalidInput):
+        FitVidSettings(**bad)
+
+
+def test_a_decoder_cell_begins_as_its_shortcut():
+    x = torch.randn(2, 4, 8, 8)
+    torch.testing.assert_close(DecoderCell(4, 4)(x), torch.nn.functional.silu(x))
+    assert DecoderCell(4, 2, grows=True)(x).shape == (2, 2, 16, 16)
+    assert EncoderCell(4, 6, 2)(x).shape == (2, 6, 4, 4)
+
+
+@pytest.mark.parametrize("side", [16, 32])
+def test_predictions_have_the_stated_shape_and_are_images(side):
+    network = model(FitVidSettings(side=side, width=1, features=8, hidden=8, latent=2)).eval()
+    context = np.random.default_rng(0).random((2, side, side, 3))
+    for generator in (None, torch.Generator().manual_seed(0)):
+        frames = network.predict(context, np.zeros((5, 3, 3)), generator=generator)
+        assert frames.shape == (5, 3, side, side, 3)
+        assert frames.dtype == np.float32
+        assert 0 <= frames.min() <= frames.max() <= 1
+
+
+def test_frames_of_another_size_are_refused():
+    with pytest.raises(InvalidInput, match="context frames"):
+        model().eval().predict(np.zeros((2, 32, 32, 3)), np.zeros((1, 1, 3)))
+
+
+def test_means_are_the_same_each_time_and_draws_are_not():
+    network = model().eval()
+    context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.zeros((2, 3, 3))
+    again = [network.predict(context, actions) for _ in range(2)]
+    np.testing.assert_array_equal(*again)
+    draws = [torch.Generator().manual_seed(seed) for seed in (0, 0, 1)]
+    one, same, other = (network.predict(context, actions, generator=generator) for generator in draws)
+    np.testing.assert_array_equal(one, same)
+    assert np.abs(one - other).max() > 0
+    assert np.abs(one[0] - one[1]).max() > 0  # each sequence draws its own
+
+
+def test_each_sequence_is_predicted_as_if_alone_and_nothing_sees_the_future():
+    network = model().eval()
+    rng = np.random.default_rng(0)
+    context, actions = rng.random((2, 16, 16, 3)), rng.uniform(-0.3, 0.3, (40, 3, 3))
+    together = network.predict(context, actions)
+    np.testing.assert_allclose(together[35], network.predict(context, actions[35:36])[0], atol=1e-5)
+    changed = actions[:2].copy()
+    changed[:, 2] = 0.2
+    later = network.predict(context, changed)
+    np.testing.assert_allclose(later[:, :2], together[:2, :2], atol=1e-6)
+    assert np.abs(later[:, 2] - together[:2, 2]).max() > 0
+
+
+def test_the_action_between_the_context_frames_counts():
+    network = model().eval()
+    context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.zeros((1, 1, 3))
+    still = network.predict(context, actions)
+    np.testing.assert_array_equal(still, network.predict(context, actions, between=np.zeros(3)))
+    assert np.abs(still - network.predict(context, actions, between=np.array([0.3, 0, 0]))).max() > 0
+
+
+def test_gradients_reach_every_parameter():
+    network = model()
+    with torch.no_grad():  # what begins at zero would hide what is behind it
+        for parameter in network.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    video, actions = scene()
+    losses = network.losses(video, actions, torch.Generator().manual_seed(0))
+    (losses.squared_error + losses.kl).backward()
+    dead = [n for n, p in network.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]
+    assert dead == []
+
+
+def test_the_error_is_that_of_the_frames_and_latents_come_from_the_generator():
+    network = model()
+    video, actions = scene()
+    first, again, other = (network.losses(video, actions, torch.Generator().manual_seed(s)) for s in (0, 0, 1))
+    assert torch.equal(first.squared_error, again.squared_error)
+    assert not torch.equal(first.squared_error, other.squared_error)
+    torch.testing.assert_close(first.kl, other.kl)  # of distributions, not of draws
+    assert 0 < float(first.squared_error.detach()) < 4  # four frames, each of a mean over pixels below 1
+
+
+def test_a_short_sequence_can_be_learned_better_than_by_copying():
+    network = model(FitVidSettings(side=16, width=4, features=16, hidden=32, latent=2))
+    videos = [scene(steps=4, seed=seed) for seed in range(2)]
+    video, actions = (torch.cat(parts) for parts in zip(*videos, strict=True))
+    copied = float((video[:, 2:] - video[:, 1:2]).square().mean())
+    adam = torch.optim.Adam(network.parameters(), 3e-3)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(80):
+        losses = network.losses(video, actions, generator)
+        adam.zero_grad()
+        (losses.squared_error + 1e-4 * losses.kl).backward()
+        adam.step()
+    assert float(losses.squared_error.detach()) / 4 < 0.6 * copied
+
+
+def test_half_the_precision_changes_little():
+    context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.zeros((1, 2, 3))
+    whole, half = (model(precision=p).eval().predict(context, actions) for p in (torch.float32, torch.bfloat16))
+    assert 0 < np.abs(whole - half).max() < 0.05
