@@ -17,8 +17,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8
 from osfcore.planning.pose_cost import PoseGoal
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.types import PLANNING, SceneBatch
+from osfcore.render.types import PLANNING, Renderer, SceneBatch
 
 SIDE = 160  # of a picture [px]
 _EVERY_S = 0.4
@@ -35,7 +34,7 @@ class LookPictures:
     """
 
     def __init__(
-        self, renderer: SceneRenderer, goal: GoalImage | PoseGoal, clock: Callable[[], float] = time.perf_counter
+        self, renderer: Renderer, goal: GoalImage | PoseGoal, clock: Callable[[], float] = time.perf_counter
     ) -> None:
         self._renderer, self._clock = renderer, clock
         self._goal = _small([goal.camera], goal.image[None]) if isinstance(goal, GoalImage) else None

@@ -48,22 +48,18 @@ class PaperEstimationConfig:
         joint_population: candidates in each.
         later_iterations: of a later frame.
         later_population: candidates in each.
-        shift_m: initial standard deviation of positions in the first frame [m].
-        turn: likewise of the quaternions' numbers.
-        light: likewise of the light's position [m].
-        later_share: of these, at the beginning of a later frame.
+        first_spread: initial standard deviations in the first frame: positions [m], quaternions' numbers, light [m].
+        later_spread: likewise in later ones.
     """
 
     masked_iterations: int = 5
-    masked_population: int = 100
-    joint_iterations: int = 40
+    masked_population: int = 200
+    joint_iterations: int = 60
     joint_population: int = 24
     later_iterations: int = 8
     later_population: int = 20
-    shift_m: float = 0.02
-    turn: float = 0.5
-    light: float = 0.5
-    later_share: float = 0.2
+    first_spread: tuple[float, float, float] = (0.01, 1.0, 0.5)
+    later_spread: tuple[float, float, float] = (0.01, 0.1, 0.05)
 
 
 def estimate_first(
@@ -91,10 +87,8 @@ def estimate_first(
         observation.names, np.array(starts).reshape(-1, 3), upright, np.array(OVERHEAD), observation.pusher
     )
     reporter = StepReporter(config.masked_iterations + config.joint_iterations + 1)
-    searches = [
-        _Search(_one(params, n), (config.shift_m, config.turn, 0.0), config.masked_population, rng)
-        for n in range(len(starts))
-    ]
+    shift, turn, light = config.first_spread
+    searches = [_Search(_one(params, n), (shift, turn, 0.0), config.masked_population, rng) for n in range(len(starts))]
     for _ in range(config.masked_iterations):
         tried, losses = [], []
         for n, search in enumerate(searches):
@@ -108,9 +102,8 @@ def estimate_first(
         )
         sigma = searches[0].sigma if searches else 1.0
         yield reporter.step("objects", "Each object in its masks", params, tried, losses, sigma)
-    share = searches[0].sigma if searches else 1.0
-    scales = config.shift_m * share, config.turn * share, config.light
-    search = _Search(params, scales, config.joint_population, rng)
+    share = float(np.mean([search.sigma for search in searches])) if searches else 1.0
+    search = _Search(params, (shift * share, turn * share, light), config.joint_population, rng)
     yield from _descend(models, views, search, config.joint_iterations, reporter, has_masks=True)
 
 
@@ -138,10 +131,8 @@ def estimate_next(
     if set(before.names) != set(observation.names):
         raise InvalidInput("objects of the last estimate", ", ".join(before.names), ", ".join(observation.names))
     views = views_of(observation, FINE_SIDE // 2)
-    share = config.later_share
-    scales = config.shift_m * share, config.turn * share, config.light * share
     params = SceneParameters.of(before.reordered(observation.names), observation.pusher)
-    search = _Search(params, scales, config.later_population, rng)
+    search = _Search(params, config.later_spread, config.later_population, rng)
     reporter = StepReporter(config.later_iterations + 1)
     yield from _descend(models, views, search, config.later_iterations, reporter, has_masks=False)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,6 +18,7 @@ from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.states import Observation, SceneState
+from osfcore.paper.dynamics.rollout import load_paper_push_model
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first, estimate_next
 from osfcore.paper.fields.tiny_field import TinyField
 from osfcore.paper.fields.weights import read_field
@@ -123,4 +124,5 @@ def with_paper_stages(
     """
     names = tuple(models.shapes)
     appearance = load_paper_appearance(names, fields, data_dir) if "fields" in stages else models.appearance
-    return SceneModels(appearance, models.dynamics, models.shapes, models.symmetries)
+    dynamics = load_paper_push_model(data_dir, fields, names) if "dynamics" in stages else models.dynamics
+    return replace(models, appearance=appearance, dynamics=dynamics)

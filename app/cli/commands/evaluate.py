@@ -161,8 +161,10 @@ class EvaluateMpcCommand(_ParallelEvaluation):
     """Objects in a scene, 1 to 6."""
     actions: int = 30
     """Actions of 0.2 s that an episode may have; 30 in the paper."""
-    method: Literal["ours", "overhead", "known_light"] = "ours"
-    """Whose episodes: ours; the same with the light taken to be overhead; the same, told the true light."""
+    method: Literal["ours", "overhead", "known_light", "paper"] = "ours"
+    """Whose episodes: ours; with the light taken to be overhead; told the true light; the paper's, as published."""
+    ours: tuple[Literal["fields", "estimation", "dynamics", "planning"], ...] = ()
+    """With --method paper: stages that are replaced by ours."""
     factor: str = ""
     """One thing in which the world differs from what the method takes for granted, such as table_wood."""
     cost: Literal["pose", "image"] = "pose"
@@ -175,7 +177,7 @@ class EvaluateMpcCommand(_ParallelEvaluation):
 
         config = EvaluateMpc(
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, self.method,
-            self.factor, self.cost, self.names, self.oracle,
+            self.factor, self.cost, self.names, self.oracle, ours=self.ours,
         )  # fmt: skip
         return evaluate_mpc(config, fields, assets, executor)
 

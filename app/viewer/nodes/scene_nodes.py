@@ -286,7 +286,7 @@ class SceneNodes:
                 body = self._bodies.get(name)
                 if body is None:
                     return
-                # Handles stay along the table's axes: what they turn is added to how the object lay when it was grabbed.
+                # Handles stay along the axes of the table: what they turn is added to how the object lay before.
                 turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
                 pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
                 self._follow(name, pose)

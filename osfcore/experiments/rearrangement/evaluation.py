@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from osfcore import control, dynamics, estimation, experiments, metrics, planning, render, world
+from osfcore import control, dynamics, estimation, experiments, metrics, paper, planning, render, world
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
 from osfcore.dynamics.push_models import network_path
 from osfcore.errors import InvalidInput, MissingAssets, check_seed
@@ -29,6 +29,8 @@ from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, f
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.dynamics.weights import weights_path
+from osfcore.paper.stages import STAGES, StageName, check_stages, paper_field_names, paper_field_path
 from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"
@@ -53,6 +55,7 @@ class EvaluateMpc:
         family: what goals ask for.
         actions: that an episode may have.
         method: whose episodes.
+        ours: stages of the paper's method that are replaced by ours.
         factor: name of what differs from the usual world; "" for nothing.
         cost: what futures are compared by.
         names: objects to draw from; all that have a field and a mesh if None.
@@ -75,6 +78,7 @@ class EvaluateMpc:
     oracle: bool = True
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     oracle_plan: PlanSettings = _ORACLE_PLAN
+    ours: tuple[StageName, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -124,7 +128,7 @@ def evaluate_mpc(
     report = MpcReport(tuple(finished[: config.tasks]), tuple(finished[config.tasks :]))
     write_pictures(config.folder, report)
     about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "method", "factor", "cost")}
-    figures = {**report.to_json(), **about}
+    figures = {**report.to_json(), **about, "ours": list(config.ours)}
     write_json(config.folder / REPORT_FILE, figures)
     yield MpcEvaluationStep(total, total, "Everything is measured", figures)
 
@@ -136,17 +140,34 @@ def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) ->
         raise InvalidInput("method", repr(config.method), f"one of {', '.join(METHODS)}")
     if config.factor:
         factor_named(config.factor)
+    _check_stages(config)
     check_seed(config.seed)
     if config.names is None:
-        names = tuple(name for name in fields.names() if assets.has(name))
+        known = paper_field_names(config.data_dir) if _published(config, "fields") else fields.names()
+        names = tuple(name for name in known if fields.has(name) and assets.has(name))
     else:
         names = tuple(dict.fromkeys(config.names))
         for name in names:
             fields.info(name)
             if not assets.has(name):
                 raise MissingAssets([name])
+            if _published(config, "fields"):
+                paper_field_path(name, config.data_dir)
     check_tasks(_tasks(replace(config, names=names)))
     return names
+
+
+def _check_stages(config: EvaluateMpc) -> None:
+    replaced = check_stages(config.ours)
+    if replaced and config.method != "paper":
+        raise InvalidInput("stages of ours", ", ".join(config.ours), "given with method paper alone")
+    if len(replaced) == len(STAGES):
+        raise InvalidInput("stages of ours", "all of them", "some; method ours is what replaces all")
+
+
+def _published(config: EvaluateMpc, stage: StageName) -> bool:
+    """Whether a stage is the paper's."""
+    return config.method == "paper" and stage not in config.ours
 
 
 def _tasks(config: EvaluateMpc) -> TaskSet:
@@ -161,14 +182,18 @@ def _pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> 
         config.settings, steps=config.actions, plan=config.oracle_plan, replan_every=_ORACLE_REPLANS_EVERY,
         reached_rad=_ORACLE_REACHED_RAD,
     )  # fmt: skip
-    episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor)
+    episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, frozenset(config.ours))
     given = {
         "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in config.names},
         "network": file_sha256(network_path(config.data_dir)),
-        "code": code_sha256(control, dynamics, estimation, experiments, metrics, planning, render, world),
+        "code": code_sha256(control, dynamics, estimation, experiments, metrics, paper, planning, render, world),
     }
+    if _published(config, "fields"):
+        given["paper_fields"] = [file_sha256(paper_field_path(name, config.data_dir)) for name in config.names]
+    if _published(config, "dynamics"):
+        given["paper_network"] = file_sha256(weights_path(config.data_dir))
     folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
-    method = "-".join(part for part in (config.method, config.cost, config.factor) if part)
+    method = "-".join(part for part in (config.method, *sorted(config.ours), config.cost, config.factor) if part)
     kinds: list[tuple[str, EpisodeSettings, _Work]] = [
         (method, settings, partial(episodes.from_images, method=config.method))
     ]

@@ -4,6 +4,7 @@ Methods:
     ours         the loop as it ships.
     overhead     the same, but it takes the light to be overhead: what estimating the light is worth.
     known_light  the same, told the true lights of scene and goal image: what knowing them would be worth.
+    paper        the method as published; each of its stages can be replaced by ours (`MeasuredEpisodes.replaced`).
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ from osfcore.io.image_file import to_uint8
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.stages import STAGES, PaperEstimators, StageName, with_paper_stages
 from osfcore.random_streams import Stream, stream_rng
 
-Method = Literal["ours", "overhead", "known_light"]
+Method = Literal["ours", "overhead", "known_light", "paper"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
@@ -50,6 +52,7 @@ class MeasuredEpisodes:
         assets: meshes for the simulator.
         data_dir: where networks trained on this machine are.
         factor: name of what differs from the usual world; "" for nothing.
+        replaced: stages of the paper's method that are ours.
     """
 
     tasks: TaskSet
@@ -57,6 +60,7 @@ class MeasuredEpisodes:
     assets: AssetLibrary
     data_dir: Path
     factor: str = ""
+    replaced: frozenset[StageName] = frozenset()
 
     def from_images(self, number: int, settings: EpisodeSettings, method: Method = "ours") -> TaskResult:
         """A task for a method that sees images alone; doubts about its goal are noted and overruled."""
@@ -64,8 +68,12 @@ class MeasuredEpisodes:
         rng = stream_rng(self.tasks.seed, Stream.EPISODE, number)
         log, ended, began = _Log(drawn.task, models.symmetries), None, time.perf_counter()
         settings, estimators = replace(settings, despite_doubts=True), _estimators(method, drawn.task)
-        factor = self._factor()
-        for event in run_from_images(drawn.task, self.assets, models, settings, rng, estimators, factor):
+        stages = frozenset(STAGES) - self.replaced if method == "paper" else frozenset[StageName]()
+        if stages:
+            models = with_paper_stages(models, stages, self.fields, self.data_dir)
+            estimators = PaperEstimators() if "estimation" in stages else estimators
+        given = drawn.task, self.assets, models, settings, rng, estimators, self._factor()
+        for event in run_from_images(*given, as_published="planning" in stages):
             if isinstance(event, Ended):
                 ended = event
             else:
@@ -103,7 +111,7 @@ class MeasuredEpisodes:
 def _estimators(method: Method, task: RearrangementTask) -> Estimators:
     overhead = Light(np.array([0.0, 0.0, 1.0]))
     match method:
-        case "ours":
+        case "ours" | "paper":
             return Estimators()
         case "overhead":
             return Estimators.with_known_lights(overhead, overhead)

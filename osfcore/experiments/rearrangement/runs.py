@@ -20,6 +20,7 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.states import SceneState
 from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
 from osfcore.planning.mppi import MPPIPlanner
 from osfcore.planning.pose_cost import PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
@@ -61,6 +62,8 @@ def run_from_images(
     rng: np.random.Generator,
     estimators: Estimators | None = None,
     factor: Factor | None = None,
+    *,
+    as_published: bool = False,
 ) -> Iterator[Event | TrueState | Ended]:
     """The whole loop, with the truth before each `Stepped`; the last step is how it ended.
 
@@ -72,12 +75,18 @@ def run_from_images(
         rng: of estimates and plans.
         estimators: how everything is estimated.
         factor: how the world differs from what is taken for granted.
+        as_published: plan as the paper does, with as many steps as the settings say.
     """
     world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0])
     try:
         goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
-        for event in Episode(world, models, goal, settings, rng, estimators=estimators).run():
+        if as_published:
+            how = AlgorithmSettings(settings.steps)
+            events = run_algorithm(world, models, goal, how, estimators or Estimators(), rng)
+        else:
+            events = Episode(world, models, goal, settings, rng, estimators=estimators).run()
+        for event in events:
             if isinstance(event, Stepped):
                 yield TrueState(world.truth())
             yield event

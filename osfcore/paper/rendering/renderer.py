@@ -23,6 +23,7 @@ from osfcore.paper.fields.tiny_field import TinyField
 from osfcore.paper.rendering.packing import PackedTiny, pack
 from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
 
+_FINE_MAP, _COARSE_MAP = 96, 32  # sides of shadow maps [px]
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)), bool)
 
 
@@ -80,9 +81,10 @@ class PaperRenderer:
         lenses = np.array([camera_numbers(camera) for camera in cameras]).astype(np.float32)
         step = quality.step_voxels * float(packed.scales[numbers, 3].mean()) if count else 1.0
         rules = np.array([step, quality.min_weight, quality.stop], np.float32)
+        side = _COARSE_MAP if quality.one_shadow else _FINE_MAP
         mask = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
         with ONE_AT_A_TIME:
-            maps = shadow_maps(packed, numbers, rotations, batch.lights)
+            maps = shadow_maps(packed, numbers, rotations, batch.lights, side)
             render_batch(packed, numbers, plain_table(self._table), self._scene(batch, rotations, directs), maps,
                          directs, lenses, boxes, rules, quality.samples_per_side, mask, rgb, opacity,
                          distance)  # fmt: skip

@@ -20,7 +20,6 @@ from osfcore.paper.rendering.network_kernels import density_at, next_occupied
 from osfcore.paper.rendering.packing import PackedTiny
 from osfcore.render.table_kernels import HELPER, KERNEL, TINY
 
-SIDE = 64  # of a map [px]
 NOTHING = np.float32(-1e9)
 _DECIMALS = 2  # of a light's direction up to which objects share a map: 0.3 degrees
 _OPAQUE = np.float32(0.5)
@@ -32,7 +31,7 @@ class ShadowMaps(NamedTuple):
     """M maps, and which of them each object of each scene has.
 
     Attributes:
-        surface: M x SIDE x SIDE, how far the first surface lies toward the light from the middle [m]; NOTHING for none.
+        surface: M x side x side, how far the first surface lies toward the light from the middle [m]; NOTHING for none.
         axes: M x 3 x 3: the map's two axes and the direction toward the light, in the object's frame.
         centre: M x 3, middle of the map in the object's frame [m].
         radius: M, half of the map's side [m].
@@ -50,7 +49,7 @@ class ShadowMaps(NamedTuple):
 
 def shadow_maps(
     pack: PackedTiny, numbers: Int[np.ndarray, "N"], rotations: Float[np.ndarray, "B N 3 3"],
-    lights: Float[np.ndarray, "B 3"],
+    lights: Float[np.ndarray, "B 3"], side: int,
 ) -> ShadowMaps:  # fmt: skip
     """Render the maps of all objects of B scenes.
 
@@ -59,6 +58,7 @@ def shadow_maps(
         numbers: which of them each object has.
         rotations: from the world into each object's frame.
         lights: unit vectors toward the light.
+        side: of the maps [px].
     """
     local = np.einsum("bnij,bj->bni", rotations, lights)
     keys = np.concatenate([np.broadcast_to(numbers[None, :, None], (*local.shape[:2], 1)), local.round(_DECIMALS)], -1)
@@ -71,7 +71,7 @@ def shadow_maps(
     reach = pack.reach[which].reshape(-1, 2, 3)
     radius = (np.linalg.norm(reach[:, 1] - reach[:, 0], axis=1) / 2).astype(np.float32)
     centre = reach.mean(axis=1).astype(np.float32)
-    surface = np.empty((len(which), SIDE, SIDE), np.float32)
+    surface = np.empty((len(which), side, side), np.float32)
     bias = (_BIAS_VOXELS * pack.scales[which, 3]).astype(np.float32)
     render_surfaces(pack, which, axes, centre, radius, surface)
     return ShadowMaps(surface, axes, centre, radius, bias, map_of.reshape(local.shape[:2]))
@@ -150,9 +150,10 @@ def light_reaches(scene, maps, b, skip, x, y, z):
         radius = maps.radius[m]
         if abs(u) >= radius or abs(v) >= radius:
             continue
-        column = int((u / radius + _ONE) * _HALF * np.float32(SIDE))
-        row = int((v / radius + _ONE) * _HALF * np.float32(SIDE))
-        if s < maps.surface[m, min(row, SIDE - 1), min(column, SIDE - 1)] - maps.bias[m]:
+        side = maps.surface.shape[1]
+        column = int((u / radius + _ONE) * _HALF * np.float32(side))
+        row = int((v / radius + _ONE) * _HALF * np.float32(side))
+        if s < maps.surface[m, min(row, side - 1), min(column, side - 1)] - maps.bias[m]:
             return _ZERO
     if scene.has_pusher and skip != -2:
         lx, ly, lz = scene.lights[b, 0], scene.lights[b, 1], scene.lights[b, 2]

@@ -166,7 +166,7 @@ def runs(monkeypatch):
     """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
     made, image = [], np.full((16, 16, 3), 0.5)
 
-    def ours(task, _assets, _models, settings, _rng, _estimators, _factor):
+    def ours(task, _assets, _models, settings, _rng, _estimators, _factor, *, as_published):
         made.append(settings.cost)
         yield Finished(0, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, image, image)

@@ -26,7 +26,7 @@ def runs(monkeypatch):
     """
     made = []
 
-    def ours(task, _assets, _models, settings, _rng, estimators, factor):
+    def ours(task, _assets, _models, settings, _rng, estimators, factor, *, as_published):
         held = estimators.first.held_light
         assert (held is None) == (estimators.goal.held_light is None)
         who = "ours" if held is None else "overhead" if held == (0, 0, 1) else "known_light"
