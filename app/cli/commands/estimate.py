@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from app.cli.progress_bar import follow
 from app.storage.paths import default_data_dir
@@ -31,6 +31,8 @@ class Estimate:
     """state.json or scene.json: of a goal, how the objects lie now; else the frame before, or what was predicted."""
     goal: bool = False
     """A goal image: one view without masks, in which the objects may be anywhere and the light another."""
+    method: Literal["ours", "paper"] = "ours"
+    """How: ours; the paper's as published, CMA-ES alone with its own fields."""
     seed: int = 0
     """Of the searches."""
     images: Path | None = None
@@ -54,10 +56,10 @@ class Estimate:
             raise InvalidInput("--prior", "missing", "given: how the objects lie now")
         observation = read_observation(self.observation)
         prior = None if self.prior is None else read_estimated(self.prior).state
-        models = load_models(self.data_dir, observation.names)
+        models = load_models(self.data_dir, observation.names, self.method)
         start = time.perf_counter()
         mode = "goal" if self.goal else "first" if prior is None else "next"
-        estimate = _last(steps_of(mode, models, observation, prior, rng))
+        estimate = _last(steps_of(mode, models, observation, prior, rng, self.method))
         seconds = round(time.perf_counter() - start, 2)
         write_estimated(self.out, estimate)
         if not self.json:

@@ -37,8 +37,10 @@ class TrainFieldCommand:
     """The object has hollows that no silhouette shows, such as a bowl's."""
     iterations: int | None = None
     """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    method: Literal["ours", "paper"] = "ours"
+    """What is trained: our field, or a KiloOSF as published, tiny networks alone over a teacher."""
     recipe: Literal["direct", "distil"] = "direct"
-    """direct learns from the images at once; distil, the paper's way, goes over a teacher and is slower."""
+    """Of ours: direct learns from the images at once; distil, the paper's way, goes over a teacher and is slower."""
     teacher_width: int = 64
     """Units of each layer of the teacher."""
     teacher_depth: int = 4
@@ -48,28 +50,31 @@ class TrainFieldCommand:
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
-        from osfcore.fields.training.kiloosf_training import train_field
-        from osfcore.fields.training.recipes import TrainField
-
-        config = TrainField(
-            self.data,
-            self.out,
-            minutes=self.minutes,
-            device=self.device,
-            seed=self.seed,
-            iterations=self.iterations,
-            hollow=self.hollow,
-            recipe=self.recipe,
-            teacher_width=self.teacher_width,
-            teacher_depth=self.teacher_depth,
-        )
-        follow(_progress(train_field(config)))
+        follow(_progress(self._train_paper() if self.method == "paper" else self._train_ours()))
         metrics = _metrics(self.out)
         if not self.json:
             full, mask = metrics["psnr_full"], metrics["psnr_mask"]
             quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
             print(f"Wrote {self.out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
         return {"out": str(self.out), **metrics}
+
+    def _train_ours(self) -> Iterator[FieldStep]:
+        from osfcore.fields.training.kiloosf_training import train_field
+        from osfcore.fields.training.recipes import TrainField
+
+        return train_field(TrainField(self.data, self.out, hollow=self.hollow, recipe=self.recipe, **self._common()))
+
+    def _train_paper(self) -> Iterator[FieldStep]:
+        from osfcore.paper.fields.training import TrainPaperField, train_paper_field
+
+        for option, is_given in (("--hollow", self.hollow), ("--recipe", self.recipe != "direct")):
+            if is_given:
+                raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
+        return train_paper_field(TrainPaperField(self.data, self.out, **self._common()))
+
+    def _common(self) -> dict[str, Any]:
+        names = ("minutes", "device", "seed", "iterations", "teacher_width", "teacher_depth")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from app.jobs.job import INPUTS
-from osfcore.errors import CannotWrite, CorruptFile
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import StateJson, state_to_json
 from osfcore.random_streams import Stream, stream_rng
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from osfcore.geometry.states import Observation, SceneState
 
 Mode = Literal["first", "next", "goal"]
+Method = Literal["ours", "paper"]
 OBSERVATION, PRIOR, TRUTH = "observation", "prior.json", "truth.json"
 STEPS, STATE = "steps.jsonl", "state.json"
 
@@ -83,8 +84,13 @@ def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimati
         yield progress
 
 
-def load_models(data_dir: Path, names: tuple[str, ...]) -> ObjectModels:
+def load_models(data_dir: Path, names: tuple[str, ...], method: Method = "ours") -> ObjectModels:
     """The fields of some objects and the table, ready to be rendered.
+
+    Args:
+        data_dir: whose fields come before the installed ones.
+        names: of the objects.
+        method: whose fields, ours or those as published.
 
     Raises:
         UnknownName: if an object has no field.
@@ -94,11 +100,20 @@ def load_models(data_dir: Path, names: tuple[str, ...]) -> ObjectModels:
     from osfcore.fields.field_library import FieldLibrary
 
     library = FieldLibrary(data_dir)
+    if method == "paper":
+        from osfcore.paper.stages import load_paper_appearance
+
+        return load_paper_appearance(names, library, data_dir)
     return ObjectModels({name: library.load(name) for name in names}, library.load_table())
 
 
 def steps_of(
-    mode: Mode, models: ObjectModels, observation: Observation, prior: SceneState | None, rng: np.random.Generator
+    mode: Mode,
+    models: ObjectModels,
+    observation: Observation,
+    prior: SceneState | None,
+    rng: np.random.Generator,
+    method: Method = "ours",
 ) -> Iterator[EstimateStep]:
     """The estimator that a mode asks for, which begins to work when its first step is taken.
 
@@ -108,18 +123,27 @@ def steps_of(
         observation: with masks for a first frame; of one view for a goal.
         prior: where "next" begins, or how the objects of a goal lie now; None for a first frame.
         rng: of the searches; a goal needs none.
-    """
-    if prior is None:
-        from osfcore.estimation.first_frame import estimate_first
+        method: ours, or CMA-ES alone as published.
 
-        return estimate_first(models, observation, rng)
+    Raises:
+        InvalidInput: for a goal as published, which only compares goal images with renderings.
+    """
+    if method == "paper":
+        from osfcore.paper.stages import PaperEstimators as Estimators
+    else:
+        from osfcore.control.estimators import Estimators
+
+    estimators = Estimators()
+    if prior is None:
+        return estimators.first_frame(models, observation, rng)
+    if mode == "goal" and method == "paper":
+        allowed = "ours for a goal image: the paper compares it with renderings and never estimates it"
+        raise InvalidInput("method", method, allowed)
     if mode == "goal":
         from osfcore.estimation.goal_image import estimate_goal
 
         return estimate_goal(models, observation, prior)
-    from osfcore.estimation.tracking import estimate_next
-
-    return estimate_next(models, observation, prior, rng)
+    return estimators.later_frame(models, observation, prior, rng)
 
 
 def read_steps(path: Path) -> tuple[dict[str, Any], ...]:

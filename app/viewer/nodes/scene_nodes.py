@@ -283,8 +283,7 @@ class SceneNodes:
 
         async def drag(event: viser.TransformControlsEvent) -> None:
             with self._lock:  # another thread may be changing which objects there are
-                body = self._bodies.get(name)
-                if body is None:
+                if (body := self._bodies.get(name)) is None:
                     return
                 # Handles stay along the axes of the table: what they turn is added to how the object lay before.
                 turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))

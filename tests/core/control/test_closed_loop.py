@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from osfcore.control import closed_loop as module
+from osfcore.control import estimators
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
@@ -38,8 +39,8 @@ def told(world, monkeypatch):
     def steps(look, state):
         yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state, doubts.get(look)))
 
-    monkeypatch.setattr(module, "estimate_first", lambda *_: steps("first", world.truth()))
-    monkeypatch.setattr(module, "estimate_next", lambda *_, usual: steps("next", world.truth()))
+    monkeypatch.setattr(estimators, "estimate_first", lambda *_: steps("first", world.truth()))
+    monkeypatch.setattr(estimators, "estimate_next", lambda *_, usual: steps("next", world.truth()))
     monkeypatch.setattr(module, "relocalize", lambda *_: steps("search", world.truth()))
     monkeypatch.setattr(module, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
     return doubts

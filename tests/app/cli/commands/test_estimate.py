@@ -30,8 +30,8 @@ def scene(data_dir, tmp_path):
 @pytest.fixture
 def untried(monkeypatch):
     """What is told before the work begins must be told without it."""
-    for place in ("first_frame.estimate_first", "goal_image.estimate_goal"):
-        monkeypatch.setattr(f"osfcore.estimation.{place}", lambda *_: pytest.fail("the work began"))
+    for place in ("control.estimators.estimate_first", "estimation.goal_image.estimate_goal"):
+        monkeypatch.setattr(f"osfcore.{place}", lambda *_: pytest.fail("the work began"))
 
 
 def test_an_observation_becomes_a_state_near_the_truth(scene, data_dir, tmp_path, capsys):

@@ -21,6 +21,7 @@ from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
 from app.jobs.worker import KINDS, run_job
 from app.processes.messages.job_messages import RunJob
 from app.processes.plan_summary import PlanSketch
+from osfcore.control import estimators
 from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
@@ -63,7 +64,7 @@ def sighted(monkeypatch, stage):  # noqa: F811
         yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 
     for name in ("estimate_first", "estimate_next"):
-        monkeypatch.setattr(core, name, found)
+        monkeypatch.setattr(estimators, name, found)
     monkeypatch.setattr(core, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
 
 

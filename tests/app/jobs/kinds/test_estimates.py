@@ -48,14 +48,15 @@ def asked(monkeypatch):
     """Estimators that take three steps and keep what they were given."""
     asked = {}
 
-    def steps(models, observation, *others):
+    def steps(models, observation, *others, **_):
         asked.update(observation=observation, others=others)
         yield EstimateStep(Progress(1, 3, "Looking"), "orientations", state(0.3), losses=(0.5,))
         yield EstimateStep(Progress(2, 3, "Both"), "together", state(0.2), loss=0.25)
         yield EstimateStep(Progress(3, 3, "Done"), "done", state(), None, None, 1.0, (0.1,), 0.1, believed(state()))
 
-    for name in ("first_frame.estimate_first", "goal_image.estimate_goal", "tracking.estimate_next"):
-        monkeypatch.setattr(f"osfcore.estimation.{name}", steps)
+    monkeypatch.setattr("osfcore.estimation.goal_image.estimate_goal", steps)
+    for name in ("estimate_first", "estimate_next"):
+        monkeypatch.setattr(f"osfcore.control.estimators.{name}", steps)
     return asked
 
 
@@ -94,7 +95,7 @@ def test_the_estimator_gets_the_observation_and_the_prior_but_never_the_truth(pl
     np.testing.assert_allclose(asked["observation"].pusher, [0.2, 0, 0.06])
     assert asked["others"][0].random() == stream_rng(5, Stream.FIRST_FRAME).random()
     write_estimated(inputs / "prior.json", believed(state(0.07)))
-    for mode, count in (("next", 2), ("goal", 1)):
+    for mode, count in (("next", 3), ("goal", 1)):
         list(estimate_job({"mode": mode, "seed": 0}, place))
         assert asked["others"][0].poses.position[0, 0] == 0.07
         assert len(asked["others"]) == count

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import osfcore.control.closed_loop as episode
+import osfcore.control.estimators as estimators
 import osfcore.experiments.rearrangement.runs as module
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed
@@ -68,8 +69,8 @@ def eyes(monkeypatch, task, worlds):
         estimate = EstimatedState(state, one, one, 1e-3, ("",) * len(state.names), "")
         yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=estimate)
 
-    monkeypatch.setattr(episode, "estimate_first", lambda *_: told(worlds[0].truth()))
-    monkeypatch.setattr(episode, "estimate_next", lambda *_, **__: told(worlds[0].truth()))
+    monkeypatch.setattr(estimators, "estimate_first", lambda *_: told(worlds[0].truth()))
+    monkeypatch.setattr(estimators, "estimate_next", lambda *_, **__: told(worlds[0].truth()))
     monkeypatch.setattr(episode, "estimate_goal", lambda *_: told(task.goal))
 
 
