@@ -59,11 +59,11 @@ class TrainPaperDynamics:
 
     data: tuple[Path, ...]
     out: Path
-    iterations: int = 8_000
-    batch: int = 128
+    iterations: int = 6_000
+    batch: int = 256
     hidden: int = 128
-    rate: float = 2e-3
-    patience: int = 16
+    rate: float = 1e-3
+    patience: int = 12
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
 
