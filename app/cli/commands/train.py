@@ -109,7 +109,7 @@ class TrainDynamicsCommand:
     method: Literal["ours", "paper"] = "ours"
     """What is trained: our model, or the paper's as published, on windows of three actions alone."""
     iterations: int | None = None
-    """Steps of descent at most: of ours on single substeps (default 26000), of the paper's (default 6000)."""
+    """Steps of descent at most: of ours on single substeps (default 26000), of the paper's (default 2000)."""
     long_iterations: int | None = None
     """Of ours: steps of descent on windows of three actions, after these (default 500)."""
     patience: int | None = None
