@@ -12,6 +12,7 @@ A map of the rooms, each importing only from those above it:
     dynamics     what a push does: contact graph and propagation network
     planning     MPPI, costs, push primitives, path planning
     control      Algorithm 1 of the paper as a generator of events over a `World`
+    paper        the paper's dynamics model as published, to compare ours with
     world        the simulated tabletop (PyBullet) and data collection
     inspection   checks of files, and pictures of how they were understood
     experiments  evaluations and benchmarks; only the command line imports it

@@ -114,21 +114,21 @@ class TrainDynamicsCommand:
     method: Literal["ours", "paper"] = "ours"
     """What is trained: our model, or the paper's as published, on windows of three actions alone."""
     iterations: int | None = None
-    """Steps of descent at most: of ours on single substeps (default 26000), of the paper's (default 8000)."""
+    """Steps of descent at most: of ours on single substeps (default 26000), of the paper's (default 2000)."""
     long_iterations: int | None = None
     """Of ours: steps of descent on windows of three actions, after these (default 500)."""
     patience: int | None = None
-    """Measurements on held-out episodes without a better one after which training stops (ours 20, paper 16)."""
+    """Measurements on held-out episodes without a better one after which training stops (ours 20, paper 12)."""
     without: tuple[str, ...] = ()
     """Of ours: objects whose episodes are left out."""
     hidden: int | None = None
     """Width of the network (ours 192, paper 128)."""
     batch: int | None = None
-    """Substeps, or windows of the paper's, in each step of descent (ours 512, paper 128)."""
+    """Substeps, or windows of the paper's, in each step of descent (ours 512, paper 256)."""
     long_batch: int | None = None
     """Of ours: windows in each (default 96)."""
     rate: float | None = None
-    """Of learning, at its highest (ours 0.004, paper 0.002)."""
+    """Of learning, at its highest (ours 0.004, paper 0.001)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     seed: int = 0

@@ -73,9 +73,7 @@ def load_predictor(
         network = read_network(network_path(data_dir))
         return Predictor(lambda windows: learned(network, shapes, windows), PushModel(network, shapes))
     published, kappas = read_paper_network(weights_path(data_dir)), longest_axes(fields, shapes)
-    return Predictor(
-        lambda windows: as_published(published, kappas, windows), PaperPushModel(published, kappas)
-    )  # fmt: skip
+    return Predictor(lambda windows: as_published(published, kappas, windows), PaperPushModel(published, kappas))
 
 
 def as_published(network: GraphNetwork, kappas: Mapping[str, float], windows: Windows) -> Predicted:

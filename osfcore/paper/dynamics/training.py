@@ -1,8 +1,10 @@
-"""Training the paper's model (its section 4.3): mean squared error of poses, unrolled over three actions, and Adam.
+"""Training the paper's model (its section 4.3): mean squared error of poses, unrolled over three actions.
 
 Windows of a push file are drawn evenly; nothing is reflected, weighted, disturbed or smoothed. The paper names neither
-optimiser nor schedule: here they are Adam with a short warm-up and a rate that falls along a cosine. One in twelve
-episodes is held out, and the weights with the least error of position on them after four actions are kept.
+optimiser nor schedule: here they are AdamW, a short warm-up and a rate that falls along a cosine. A thousand episodes
+are soon learned by heart: without the decay of weights, 3,000 steps of a longer run leave an error of 8 mm on episodes
+that were learned from and of 22 mm on others. One in twelve episodes is held out, and the weights with the least error
+of position on them after four actions are kept.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ from osfcore.progress import Progress
 
 UNROLLED = 3  # actions (paper: up to three future steps)
 _WARM_UP = 100
+_DECAY = 0.5  # of weights
 _LAST_RATE = 0.01  # of the first one
 _REPORT_EVERY, _MEASURE_EVERY = 20, 500
 _OWN_METRICS = ("validation_mm_4", "validation_windows")
@@ -59,11 +62,11 @@ class TrainPaperDynamics:
 
     data: tuple[Path, ...]
     out: Path
-    iterations: int = 8_000
-    batch: int = 128
+    iterations: int = 2_000
+    batch: int = 256
     hidden: int = 128
-    rate: float = 2e-3
-    patience: int = 16
+    rate: float = 1e-3
+    patience: int = 12
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
 
@@ -132,7 +135,7 @@ class _Run:
         torch.manual_seed(config.seed)
         self._rng = np.random.default_rng(config.seed)
         self._network = GraphNetwork(names, config.hidden).to(device)
-        self._optimiser = torch.optim.Adam(self._network.parameters(), lr=config.rate)
+        self._optimiser = torch.optim.AdamW(self._network.parameters(), lr=config.rate, weight_decay=_DECAY)
         self._recording = record(learned, self._network, kappas, UNROLLED)
         self._validation = record(kept, self._network, kappas, MEASURED_WINDOW)
         self._best: dict[str, Tensor] = {}

@@ -84,6 +84,15 @@ def test_objects_that_the_network_never_met_are_predicted(model):
     assert np.isfinite(model.rollout(begin, plans(2)).positions).all()
 
 
+def test_the_shipped_model_moves_what_is_pushed_more_than_what_is_not():
+    shipped = load_paper_push_model(None, FieldLibrary(None), NAMES)
+    begin = state()
+    toward = np.array([[[0.3, 0.0, 0.0]] * 2])
+    pushed, left = (shipped.rollout(begin, actions).positions for actions in (toward, 0 * toward))
+    assert pushed[0, -1, 0, 0] - left[0, -1, 0, 0] > 0.01
+    assert np.linalg.norm(left[0, -1] - left[0, 0], axis=-1).max() < 0.02
+
+
 def test_mistakes_are_told(model):
     with pytest.raises(InvalidInput, match="number of objects is 0"):
         model.rollout(state(names=()), plans(1))

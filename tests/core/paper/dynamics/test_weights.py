@@ -5,7 +5,8 @@ import torch
 from safetensors.torch import load, save
 
 from osfcore.errors import CannotWrite, CorruptFile
-from osfcore.paper.dynamics.weights import FORMAT, network_bytes, read_network, weights_path, write_network
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.paper.dynamics.weights import FORMAT, network_bytes, read_network, shipped, weights_path, write_network
 from tests.core.paper.dynamics.scenes import NAMES, network
 
 BIAS = "answer.bias"
@@ -73,8 +74,17 @@ def test_places_that_cannot_be_read_or_written_are_told(tmp_path):
         write_network(tmp_path / "file" / "a.safetensors", network())
 
 
+def test_the_shipped_network_is_small_whole_and_described():
+    assert shipped().stat().st_size < 1_000_000
+    assert set(read_network(shipped()).names) == set(FieldLibrary(None).names())
+    told = json.loads(shipped().with_suffix(".json").read_text())
+    assert told["command"].startswith("osf train dynamics --method paper")
+    assert told["validation_mm_4"] < told["validation_constant_mm_4"]
+    assert told["bytes"] == shipped().stat().st_size
+
+
 def test_a_network_of_this_machine_comes_first(tmp_path):
-    assert weights_path(None) == weights_path(tmp_path) != tmp_path
+    assert weights_path(None) == weights_path(tmp_path) == shipped()
     own = tmp_path / "dynamics" / "paper_pushes.safetensors"
     write_network(own, network())
     assert weights_path(tmp_path) == own
