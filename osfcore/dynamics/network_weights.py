@@ -8,13 +8,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from osfcore.dynamics.propagation_network import PropagationNetwork
-from osfcore.errors import CorruptFile
+from osfcore.errors import CorruptFile, shown
 from osfcore.io.files import write_atomically
+from osfcore.io.network_file import load_parameters, read_parameters
 
 FORMAT = "pushes-2"
 _MOST_HIDDEN, _MOST_STEPS = 1024, 16
@@ -41,27 +40,25 @@ def read_network(path: Path) -> PropagationNetwork:
     Raises:
         CorruptFile: if the file is missing, cut short, of another version or no such network.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise CorruptFile(path, f"it is not of the format {FORMAT}")
-            hidden, steps = int(metadata["hidden"]), int(metadata["steps"])
-            if not (1 <= hidden <= _MOST_HIDDEN and 1 <= steps <= _MOST_STEPS):
-                raise CorruptFile(path, f"{hidden} units and {steps} steps are out of range")
-            values = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
-        if isinstance(error, CorruptFile):
-            raise
-        raise CorruptFile(path, f"it holds no network of pushes ({error})") from error
-    network = PropagationNetwork(hidden, steps)
-    try:
-        network.load_state_dict(values)
-    except RuntimeError as error:
-        raise CorruptFile(path, "its parameters do not fit its description") from error
-    if not all(bool(torch.isfinite(value).all()) for value in values.values()):
-        raise CorruptFile(path, "its parameters are not all finite")
+    metadata, values = read_parameters(path, FORMAT, "network of pushes")
+    network = PropagationNetwork(*described_sizes(metadata, path))
+    load_parameters(network, values, path)
     return network.eval()
+
+
+def described_sizes(metadata: Mapping[str, str], path: Path) -> tuple[int, int]:
+    """Width and propagation steps that a file describes.
+
+    Raises:
+        CorruptFile: if they are missing or out of range.
+    """
+    try:
+        hidden, steps = int(metadata["hidden"]), int(metadata["steps"])
+    except (KeyError, ValueError) as error:
+        raise CorruptFile(path, f"it holds no network of pushes of known size ({shown(error)})") from error
+    if not (1 <= hidden <= _MOST_HIDDEN and 1 <= steps <= _MOST_STEPS):
+        raise CorruptFile(path, f"{hidden} units and {steps} steps are out of range")
+    return hidden, steps
 
 
 def shipped(name: str = "pushes") -> Path:

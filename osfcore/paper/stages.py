@@ -75,9 +75,7 @@ def paper_field_path(name: str, data_dir: Path | None) -> Path:
     Raises:
         UnknownName: if there is none.
     """
-    folders = [] if data_dir is None else [data_dir / _FOLDER]
-    folders.append(Path(str(files("osfcore.paper") / "shipped")))
-    for folder in folders:
+    for folder in _field_folders(data_dir):
         path = folder / f"{name}.safetensors"
         if path.is_file():
             return path
@@ -86,9 +84,13 @@ def paper_field_path(name: str, data_dir: Path | None) -> Path:
 
 def paper_field_names(data_dir: Path | None) -> tuple[str, ...]:
     """Objects with a KiloOSF as published, in order."""
-    own = [] if data_dir is None else list((data_dir / _FOLDER).glob("*.safetensors"))
-    shipped = Path(str(files("osfcore.paper") / "shipped")).glob("0*.safetensors")
-    return tuple(sorted({path.stem for path in (*own, *shipped)}))
+    return tuple(sorted({path.stem for folder in _field_folders(data_dir) for path in folder.glob("*.safetensors")}))
+
+
+def _field_folders(data_dir: Path | None) -> tuple[Path, ...]:
+    """Where to look, in this order."""
+    shipped = Path(str(files("osfcore.paper") / "shipped" / "fields"))
+    return (shipped,) if data_dir is None else (data_dir / _FOLDER, shipped)
 
 
 def load_paper_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:

@@ -9,7 +9,6 @@ states, which cost a fraction.
 
 from __future__ import annotations
 
-import io
 import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,6 +36,7 @@ from osfcore.fields.devices import pick_device
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
 from osfcore.io.push_file import PushEpisode, read_sound_pushes
+from osfcore.io.training_checkpoint import resume_from, write_checkpoint
 from osfcore.progress import Progress
 
 LONG_WINDOW = 3  # actions (paper: up to three future steps)
@@ -237,30 +237,24 @@ class _Run:
     def save(self) -> None:
         """Everything that is needed to go on."""
         content: dict[str, Any] = {
-            "fingerprint": self._fingerprint(),
             "descent": self._descent.state(),
             "best": self._best,
             "validation": asdict(self.best) if self.best else None,
             "numbers": [self.done, self.fruitless, self.steps],
             "rng": self._rng.bit_generator.state,
         }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        write_atomically(self._checkpoint, buffer.getvalue())
+        write_checkpoint(self._checkpoint, self._fingerprint(), content)
 
     def resume(self) -> None:
         """Go on from the checkpoint of the same run, if there is one."""
-        try:
-            content = torch.load(self._checkpoint, weights_only=True, map_location=self._device)
-            if content["fingerprint"] != self._fingerprint():
-                return
-            self._descent.restore(content["descent"])
-            self._best = content["best"]
-            self.best = Validation(**content["validation"]) if content["validation"] else None
-            self.done, self.fruitless, self.steps = content["numbers"]
-            self._rng.bit_generator.state = content["rng"]
-        except Exception:  # missing, cut short or of another version: start over
-            return
+        resume_from(self._checkpoint, self._fingerprint(), self._restore, self._device)
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        self._descent.restore(content["descent"])
+        self._best = content["best"]
+        self.best = Validation(**content["validation"]) if content["validation"] else None
+        self.done, self.fruitless, self.steps = content["numbers"]
+        self._rng.bit_generator.state = content["rng"]
 
     def finish(self) -> None:
         """Write the best weights and what is known of them."""

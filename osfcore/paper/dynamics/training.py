@@ -9,7 +9,6 @@ of position on them after four actions are kept.
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import platform
@@ -29,6 +28,7 @@ from osfcore.fields.devices import pick_device
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
 from osfcore.io.push_file import PushEpisode, read_sound_pushes
+from osfcore.io.training_checkpoint import resume_from, write_checkpoint
 from osfcore.paper.dynamics.graph_network import GraphNetwork
 from osfcore.paper.dynamics.prediction import squared_error, unroll
 from osfcore.paper.dynamics.recordings import record, windows
@@ -198,7 +198,6 @@ class _Run:
     def save(self) -> None:
         """Everything that is needed to go on."""
         content: dict[str, Any] = {
-            "fingerprint": self._fingerprint(),
             "network": self._network.state_dict(),
             "optimiser": self._optimiser.state_dict(),
             "best": self._best,
@@ -206,24 +205,19 @@ class _Run:
             "numbers": [self.done, self.fruitless],
             "rng": self._rng.bit_generator.state,
         }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        write_atomically(self._checkpoint, buffer.getvalue())
+        write_checkpoint(self._checkpoint, self._fingerprint(), content)
 
     def resume(self) -> None:
         """Go on from the checkpoint of the same run, if there is one."""
-        try:
-            content = torch.load(self._checkpoint, weights_only=True, map_location=self._device)
-            if content["fingerprint"] != self._fingerprint():
-                return
-            self._network.load_state_dict(content["network"])
-            self._optimiser.load_state_dict(content["optimiser"])
-            self._best = content["best"]
-            self.best = Validation(**content["validation"]) if content["validation"] else None
-            self.done, self.fruitless = content["numbers"]
-            self._rng.bit_generator.state = content["rng"]
-        except Exception:  # missing, cut short or of another version: start over
-            return
+        resume_from(self._checkpoint, self._fingerprint(), self._restore, self._device)
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        self._network.load_state_dict(content["network"])
+        self._optimiser.load_state_dict(content["optimiser"])
+        self._best = content["best"]
+        self.best = Validation(**content["validation"]) if content["validation"] else None
+        self.done, self.fruitless = content["numbers"]
+        self._rng.bit_generator.state = content["rng"]
 
     def finish(self) -> None:
         """Write the best weights and what is known of them."""

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
-import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from osfcore.errors import CorruptFile
+from osfcore.dynamics.network_weights import described_sizes
+from osfcore.errors import CorruptFile, shown
 from osfcore.io.files import write_atomically
+from osfcore.io.network_file import load_parameters, read_parameters
 from osfcore.paper.dynamics.graph import UNKNOWN
 from osfcore.paper.dynamics.graph_network import GraphNetwork
 
 FORMAT = "paper-pushes-1"
 WEIGHTS_FILE = "paper_pushes.safetensors"
-_MOST_HIDDEN, _MOST_STEPS, _MOST_NAMES = 1024, 16, 10_000
+_MOST_NAMES = 10_000
 
 
 def weights_path(data_dir: Path | None) -> Path:
@@ -53,35 +54,21 @@ def read_network(path: Path) -> GraphNetwork:
     Raises:
         CorruptFile: if the file is missing, cut short, of another version or no such network.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise CorruptFile(path, f"it is not of the format {FORMAT}")
-            hidden, steps, names = int(metadata["hidden"]), int(metadata["steps"]), json.loads(metadata["names"])
-            if not (1 <= hidden <= _MOST_HIDDEN and 1 <= steps <= _MOST_STEPS):
-                raise CorruptFile(path, f"{hidden} units and {steps} steps are out of range")
-            if not _are_names(names):
-                raise CorruptFile(path, "its names of objects are no list of different names")
-            values = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError, KeyError, ValueError, RecursionError) as error:
-        if isinstance(error, CorruptFile):
-            raise
-        raise CorruptFile(path, f"it holds no network of pushes ({error})") from error
-    network = GraphNetwork(names, hidden, steps)
-    try:
-        network.load_state_dict(values)
-    except RuntimeError as error:
-        raise CorruptFile(path, "its parameters do not fit its description") from error
-    if not all(bool(torch.isfinite(value).all()) for value in values.values()):
-        raise CorruptFile(path, "its parameters are not all finite")
+    metadata, values = read_parameters(path, FORMAT, "network of pushes")
+    network = GraphNetwork(_names(metadata, path), *described_sizes(metadata, path))
+    load_parameters(network, values, path)
     if network.embedding.weight[UNKNOWN].any():
         raise CorruptFile(path, "its embedding of unknown objects is not zero")
     return network.eval()
 
 
-def _are_names(names: object) -> bool:
-    """Whether they are what `network_bytes` writes."""
-    if not isinstance(names, list) or len(names) > _MOST_NAMES or not all(isinstance(name, str) for name in names):
-        return False
-    return len(set(names)) == len(names)
+def _names(metadata: Mapping[str, str], path: Path) -> list[str]:
+    """The objects that a file says its network knows."""
+    try:
+        names: list[str] = json.loads(metadata["names"])
+    except (KeyError, ValueError, RecursionError) as error:
+        raise CorruptFile(path, f"it holds no network of pushes of known objects ({shown(error)})") from error
+    is_list = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not is_list or not len(set(names)) == len(names) <= _MOST_NAMES:
+        raise CorruptFile(path, "its names of objects are no list of different names")
+    return names

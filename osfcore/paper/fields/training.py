@@ -34,7 +34,6 @@ from osfcore.paper.fields.tiny_query import TinyQuery
 from osfcore.paper.fields.weights import field_bytes, field_from_bytes
 from osfcore.progress import Progress
 
-_REPORT_S, _CHECKPOINT_S = 1.0, 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MOST_BYTES = 1_950_000  # of a file's networks
 _METRICS = ("psnr_full", "psnr_mask")
@@ -53,6 +52,8 @@ class PaperFieldRecipe:
         rates: of fine-tuning.
         teacher_share: of the budget.
         distil_share: likewise.
+        report_s: between two steps that are told [s].
+        checkpoint_s: between two checkpoints [s].
     """
 
     teacher: TeacherRecipe = field(default_factory=TeacherRecipe)
@@ -62,6 +63,8 @@ class PaperFieldRecipe:
     rates: Rates = field(default_factory=lambda: Rates(2e-3, 3e-4))
     teacher_share: float = 0.3
     distil_share: float = 0.1
+    report_s: float = 1.0
+    checkpoint_s: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,10 +190,10 @@ class _Run:
             learner.step(batch, (share - start) / (end - start), self._rng, self._generator)
             now = time.monotonic()
             self._clock |= {"steps": self._clock["steps"] + 1, "seconds": already + now - began}
-            if now - reported > _REPORT_S:
+            if now - reported > self._recipe.report_s:
                 reported = now
                 yield self._look(name, learner)
-            if now - saved > _CHECKPOINT_S:
+            if now - saved > self._recipe.checkpoint_s:
                 saved = now
                 self._save(name, learner)
             began += time.monotonic() - now  # looking and saving cost nobody's budget

@@ -7,7 +7,6 @@ the budget, for there are minutes where the original has ten million steps.
 
 from __future__ import annotations
 
-import io
 import shlex
 import time
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from osfcore.experiments.rivals.fitvid.weights import fitvid_bytes
 from osfcore.fields.devices import pick_device
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
+from osfcore.io.training_checkpoint import resume_from, write_checkpoint
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng, stream_seed
 
@@ -206,28 +206,22 @@ class _Run:
     def save(self) -> None:
         """Everything that is needed to go on, also with a larger budget."""
         content: dict[str, Any] = {
-            "fingerprint": self._fingerprint(),
             "model": self._model.state_dict(),
             "adam": self._adam.state_dict(),
             "steps": self.steps,
             "spent_s": self._spent_s,
             "recent": self._recent,
         }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        write_atomically(self._checkpoint, buffer.getvalue())
+        write_checkpoint(self._checkpoint, self._fingerprint(), content)
 
     def resume(self) -> None:
         """Go on from the checkpoint of the same run, if there is one."""
-        try:
-            content = torch.load(self._checkpoint, weights_only=True, map_location=self._device)
-            if content["fingerprint"] != self._fingerprint():
-                return
-            self._model.load_state_dict(content["model"])
-            self._adam.load_state_dict(content["adam"])
-            self.steps, self._spent_s, self._recent = content["steps"], content["spent_s"], content["recent"]
-        except Exception:  # missing, cut short or of another version: start over
-            return
+        resume_from(self._checkpoint, self._fingerprint(), self._restore, self._device)
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        self._model.load_state_dict(content["model"])
+        self._adam.load_state_dict(content["adam"])
+        self.steps, self._spent_s, self._recent = content["steps"], content["spent_s"], content["recent"]
 
     def finish(self) -> Iterator[Progress]:
         """Measure on held-out videos, and write weights and metrics."""

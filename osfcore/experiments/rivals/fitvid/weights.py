@@ -6,13 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
 
 from osfcore.errors import CorruptFile, shown
 from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.io.files import write_atomically
+from osfcore.io.network_file import read_parameters
 
 FORMAT = "fitvid-1"
 _SIZES = ("side", "width", "features", "hidden", "latent")
@@ -47,23 +46,15 @@ def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidMod
     Raises:
         CorruptFile: if the file is missing, cut short, of another version or no such network.
     """
+    metadata, values = read_parameters(path, FORMAT, "video prediction network")
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise CorruptFile(path, f"it is not of the format {FORMAT}")
-            settings = FitVidSettings(**{name: int(metadata[name]) for name in _SIZES})
-            values: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
-        if isinstance(error, CorruptFile):
-            raise
-        raise CorruptFile(path, f"it holds no video prediction network ({shown(error)})") from error
+        settings = FitVidSettings(**{name: int(metadata[name]) for name in _SIZES})
+    except (KeyError, ValueError) as error:
+        raise CorruptFile(path, f"it holds no video prediction network of known size ({shown(error)})") from error
     with torch.device("meta"):  # what the file describes may be larger than what it holds
         model = FitVidModel(settings, precision)
     expected = model.state_dict()
     if {n: v.shape for n, v in values.items()} != {n: v.shape for n, v in expected.items()}:
         raise CorruptFile(path, "its parameters do not fit its description")
-    if not all(bool(torch.isfinite(value).all()) for value in values.values()):
-        raise CorruptFile(path, "its parameters are not all finite")
     model.load_state_dict({name: value.to(expected[name].dtype) for name, value in values.items()}, assign=True)
     return model.eval()

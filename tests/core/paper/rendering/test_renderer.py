@@ -4,7 +4,7 @@ import torch
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.fields.ray_sampling import camera_rays
-from osfcore.geometry.poses import quaternion_exp
+from osfcore.geometry.poses import quaternion_exp, quaternion_to_matrix
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.paper.fields.tiny_query import TinyQuery
 from osfcore.paper.rendering.renderer import PaperRenderer
@@ -32,8 +32,6 @@ def test_one_object_is_the_sum_of_equation_3():
     light /= np.linalg.norm(light)
     shown = PaperRenderer({"a": field}, None).render(batch([place], light, turn=turn), [CAMERA], quality=FINE)
     origins, directions = camera_rays(CAMERA)
-    from osfcore.geometry.poses import quaternion_to_matrix
-
     into = quaternion_to_matrix(quaternion_exp(turn)).T
     step = 0.5 * VOXEL
     t = (np.arange(int(0.6 / step)) + 0.5) * step
