@@ -19,7 +19,7 @@ from osfcore.fields.table_field import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT
 from osfcore.geometry.poses import quaternion_to_matrix
-from osfcore.paper.fields.tiny_field import TinyField
+from osfcore.paper.fields.tiny_field import TinyField, network_size
 from osfcore.paper.rendering.packing import PackedTiny, pack
 from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
 
@@ -100,7 +100,8 @@ class PaperRenderer:
         if names not in self._packs:
             different = list(dict.fromkeys(names))
             numbers = np.array([different.index(name) for name in names], np.int64)
-            self._packs[names] = pack([self._fields[name] for name in different]), numbers
+            fields = [self._fields[name] for name in different] or [_nothing()]
+            self._packs[names] = pack(fields), numbers
         return self._packs[names]
 
     def _scene(self, batch: SceneBatch, rotations: np.ndarray, directs: np.ndarray):  # noqa: ANN202 - of the kernels
@@ -125,3 +126,9 @@ class PaperRenderer:
             plain(pusher),
             batch.pusher is not None,
         )
+
+
+def _nothing() -> TinyField:
+    """A field that shows nothing: scenes without objects are rendered, too."""
+    cells, networks = np.full((1, 1, 1), -1, np.int32), np.zeros((1, network_size(1)), np.float32)
+    return TinyField(np.zeros(3, np.float32), 1.0, np.zeros((2, 2, 2), bool), cells, networks, 1)

@@ -136,6 +136,16 @@ def test_only_the_pixels_asked_for_are_looked_at():
     assert not part[16:].any()
 
 
+def test_a_table_without_objects_is_that_of_our_renderer():
+    empty = SceneBatch((), np.zeros((2, 0, 3)), np.zeros((2, 0, 4)), np.array([(0, 0, 1.0), (0.6, 0, 0.8)]), None)
+    for fields in ({}, {"a": uniform_block(RHO)}):
+        mine = PaperRenderer(fields, plain_table()).render(empty, [CAMERA], outputs={"masks", "depth"})
+        ours = SceneRenderer({}, plain_table()).render(empty, [CAMERA], outputs={"masks", "depth"})
+        np.testing.assert_allclose(mine.rgb, ours.rgb, atol=1e-5)
+        np.testing.assert_allclose(mine.depth, ours.depth, atol=1e-5)
+        assert mine.masks.shape == (2, 1, 0, 24, 24)
+
+
 def test_requests_that_cannot_be_met_are_refused():
     renderer = PaperRenderer({"a": uniform_block(RHO)}, None)
     with pytest.raises(UnknownName, match="field"):
