@@ -104,7 +104,14 @@ def table_sha256(table: TableField) -> str:
     return hashlib.sha256(b"".join(arrays)).hexdigest()
 
 
-def code_sha256(*packages: ModuleType) -> str:
-    """The same of packages' sources: figures are the code's that made them."""
-    files = sorted(path for package in packages for folder in package.__path__ for path in Path(folder).rglob("*.py"))
+def code_sha256(*modules: ModuleType) -> str:
+    """The same of the sources of modules, and of whole packages: figures are the code's that made them."""
+    files = sorted(path for module in modules for path in _sources(module))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def _sources(module: ModuleType) -> list[Path]:
+    if hasattr(module, "__path__"):
+        return [path for folder in module.__path__ for path in Path(folder).rglob("*.py")]
+    assert module.__file__ is not None
+    return [Path(module.__file__)]

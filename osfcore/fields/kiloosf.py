@@ -14,7 +14,7 @@ need no network; the ambient part of rho is kept apart, so that a shadow can rem
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
@@ -83,6 +83,15 @@ class KiloOSF:
         if not len(solid):
             return self.box
         return (self.origin + self.voxel * np.stack([solid.min(axis=0), solid.max(axis=0)])).astype(np.float32)
+
+
+def without_light(field: KiloOSF) -> KiloOSF:
+    """The same field with n = 0 and networks blind to n . l and l: its radiance is then the same under every light."""
+    rows, networks = field.rows.copy(), field.networks.copy()
+    rows[:, 4:7] = 0
+    first = networks[:, : NETWORK_INPUTS * field.hidden].reshape(len(networks), NETWORK_INPUTS, field.hidden)
+    first[:, [0, 2, 3, 4]] = 0
+    return replace(field, rows=rows, networks=networks)
 
 
 def block_distances(density: Float32[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "bx by bz"]:

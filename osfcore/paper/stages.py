@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from osfcore.control.estimators import Estimators
 from osfcore.control.scene_models import SceneModels
-from osfcore.errors import InvalidInput, UnknownName
+from osfcore.errors import UnknownName
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.fields.field_library import FieldLibrary
@@ -55,18 +55,6 @@ class PaperEstimators(Estimators):
     ) -> Iterator[EstimateStep]:
         """Poses and light of a frame without masks."""
         return estimate_next(models, observation, expected, rng, self.cma)
-
-
-def check_stages(stages: Iterable[str]) -> frozenset[str]:
-    """Stages that there are.
-
-    Raises:
-        InvalidInput: naming one that there is not.
-    """
-    for stage in stages:
-        if stage not in STAGES:
-            raise InvalidInput("stage", stage, ", ".join(STAGES))
-    return frozenset(stages)
 
 
 def paper_field_path(name: str, data_dir: Path | None) -> Path:

@@ -161,10 +161,19 @@ class EvaluateMpcCommand(_ParallelEvaluation):
     """Objects in a scene, 1 to 6."""
     actions: int = 30
     """Actions of 0.2 s that an episode may have; 30 in the paper."""
-    method: Literal["ours", "overhead", "known_light", "paper"] = "ours"
-    """Whose episodes: ours; with the light taken to be overhead; told the true light; the paper's, as published."""
+    method: Literal["ours", "overhead", "known_light", "nerf", "paper", "foresight"] = "ours"
+    """Whose episodes: ours; with the light taken to be overhead; told the true light; with fields that know of no
+    light; the paper's, as published; visual foresight on predicted video."""
     ours: tuple[Literal["fields", "estimation", "dynamics", "planning"], ...] = ()
     """With --method paper: stages that are replaced by ours."""
+    truths: tuple[Literal["poses", "goal", "dynamics"], ...] = ()
+    """With --method ours: stages that are replaced by the truth."""
+    views: int = 4
+    """Cameras that look, 1 to 4."""
+    samples: int = 160
+    """Sequences of actions in each round of our plans (K)."""
+    horizon: int = 30
+    """Actions in each (T)."""
     factor: str = ""
     """One thing in which the world differs from what the method takes for granted, such as table_wood."""
     cost: Literal["pose", "image"] = "pose"
@@ -173,11 +182,16 @@ class EvaluateMpcCommand(_ParallelEvaluation):
     """Also measure the planner that is told the truth."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
+        from osfcore.control.episode_settings import EpisodeSettings
         from osfcore.experiments.rearrangement.evaluation import EvaluateMpc, evaluate_mpc
+        from osfcore.experiments.rearrangement.methods import Variant
+        from osfcore.planning.mppi import PlanSettings
 
+        variant = Variant(self.method, frozenset(self.ours), frozenset(self.truths), self.views)
+        settings = EpisodeSettings(plan=PlanSettings(samples=self.samples, horizon=self.horizon))
         config = EvaluateMpc(
-            self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, self.method,
-            self.factor, self.cost, self.names, self.oracle, ours=self.ours,
+            self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,
+            self.factor, self.cost, self.names, self.oracle, settings,
         )  # fmt: skip
         return evaluate_mpc(config, fields, assets, executor)
 

@@ -37,8 +37,8 @@ class TrainFieldCommand:
     """The object has hollows that no silhouette shows, such as a bowl's."""
     iterations: int | None = None
     """Instead of a time budget: that many steps of descent, repeatable on one machine."""
-    method: Literal["ours", "paper"] = "ours"
-    """What is trained: our field, or a KiloOSF as published, tiny networks alone over a teacher."""
+    method: Literal["ours", "paper", "nerf"] = "ours"
+    """What is trained: our field; a KiloOSF as published, tiny networks alone over a teacher; ours without light."""
     recipe: Literal["direct", "distil"] = "direct"
     """Of ours: direct learns from the images at once; distil, the paper's way, goes over a teacher and is slower."""
     teacher_width: int = 64
@@ -62,7 +62,8 @@ class TrainFieldCommand:
         from osfcore.fields.training.kiloosf_training import train_field
         from osfcore.fields.training.recipes import TrainField
 
-        return train_field(TrainField(self.data, self.out, hollow=self.hollow, recipe=self.recipe, **self._common()))
+        given = {"hollow": self.hollow, "recipe": self.recipe, "lit": self.method != "nerf"}
+        return train_field(TrainField(self.data, self.out, **given, **self._common()))
 
     def _train_paper(self) -> Iterator[FieldStep]:
         from osfcore.paper.fields.training import TrainPaperField, train_paper_field

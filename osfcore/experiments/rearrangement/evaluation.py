@@ -16,21 +16,27 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from osfcore import control, dynamics, estimation, experiments, metrics, paper, planning, render, world
+from osfcore import control, dynamics, estimation, paper, planning, render, world
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
 from osfcore.dynamics.push_models import network_path
 from osfcore.errors import InvalidInput, MissingAssets, check_seed
+from osfcore.experiments import rivals
 from osfcore.experiments.pieces import Piece, results_of
+from osfcore.experiments.rearrangement import factors, measured_episodes, methods, own_pushes, runs, sensor, tasks
 from osfcore.experiments.rearrangement.factors import factor_named
-from osfcore.experiments.rearrangement.measured_episodes import METHODS, MeasuredEpisodes, Method
+from osfcore.experiments.rearrangement.measured_episodes import MeasuredEpisodes
+from osfcore.experiments.rearrangement.methods import Variant, check_variant
 from osfcore.experiments.rearrangement.report import MpcReport, write_pictures
 from osfcore.experiments.rearrangement.tasks import Family, TaskSet, check_tasks
+from osfcore.experiments.rivals.fitvid.weights import fitvid_path
+from osfcore.experiments.rivals.nerf import nerf_library
+from osfcore.experiments.rivals.visual_foresight import ForesightSettings
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
-from osfcore.paper.stages import STAGES, StageName, check_stages, paper_field_names, paper_field_path
+from osfcore.paper.stages import paper_field_names, paper_field_path
 from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"
@@ -39,7 +45,14 @@ _ORACLE_PLAN = PlanSettings(samples=96)
 _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
 _ORACLE_REPLANS_EVERY = 2
 
-_Work = Callable[[int, EpisodeSettings], TaskResult]
+_FORESIGHT = ForesightSettings(budget_s=3.0)  # what one of our looks and plans takes together, on one core
+
+_CODE = (
+    control, dynamics, estimation, paper, planning, render, rivals, world,
+    factors, measured_episodes, methods, own_pushes, runs, sensor, tasks,
+)  # fmt: skip
+
+_Work = Callable[[int], TaskResult]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +67,14 @@ class EvaluateMpc:
         seed: of the tasks.
         family: what goals ask for.
         actions: that an episode may have.
-        method: whose episodes.
-        ours: stages of the paper's method that are replaced by ours.
+        variant: whose episodes, and through how many cameras.
         factor: name of what differs from the usual world; "" for nothing.
         cost: what futures are compared by.
         names: objects to draw from; all that have a field and a mesh if None.
         oracle: also run the planner that is told the truth.
         settings: of the episodes but for their cost and number of actions.
         oracle_plan: how the oracle plans.
+        foresight: how visual foresight plans.
     """
 
     folder: Path
@@ -71,14 +84,14 @@ class EvaluateMpc:
     seed: int = 0
     family: Family = "shifted"
     actions: int = 30
-    method: Method = "ours"
+    variant: Variant = field(default_factory=Variant)
     factor: str = ""
     cost: CostKind = "pose"
     names: tuple[str, ...] | None = None
     oracle: bool = True
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     oracle_plan: PlanSettings = _ORACLE_PLAN
-    ours: tuple[StageName, ...] = ()
+    foresight: ForesightSettings = field(default_factory=lambda: _FORESIGHT)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -127,8 +140,11 @@ def evaluate_mpc(
     finished = [result for result in results if result is not None]
     report = MpcReport(tuple(finished[: config.tasks]), tuple(finished[config.tasks :]))
     write_pictures(config.folder, report)
-    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "method", "factor", "cost")}
-    figures = {**report.to_json(), **about, "ours": list(config.ours)}
+    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "cost")}
+    variant = config.variant
+    about |= {"method": variant.method, "views": variant.views}
+    about |= {"ours": sorted(variant.replaced), "truths": sorted(variant.truths)}
+    figures = {**report.to_json(), **about}
     write_json(config.folder / REPORT_FILE, figures)
     yield MpcEvaluationStep(total, total, "Everything is measured", figures)
 
@@ -136,38 +152,39 @@ def evaluate_mpc(
 def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
     if not 1 <= config.tasks <= MAX_TASKS:
         raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
-    if config.method not in METHODS:
-        raise InvalidInput("method", repr(config.method), f"one of {', '.join(METHODS)}")
+    check_variant(config.variant)
     if config.factor:
         factor_named(config.factor)
-    _check_stages(config)
     check_seed(config.seed)
     if config.names is None:
-        known = paper_field_names(config.data_dir) if _published(config, "fields") else fields.names()
-        names = tuple(name for name in known if fields.has(name) and assets.has(name))
+        names = tuple(name for name in _known(config, fields) if fields.has(name) and assets.has(name))
     else:
         names = tuple(dict.fromkeys(config.names))
         for name in names:
             fields.info(name)
             if not assets.has(name):
                 raise MissingAssets([name])
-            if _published(config, "fields"):
-                paper_field_path(name, config.data_dir)
+            _own_field(config, name)
     check_tasks(_tasks(replace(config, names=names)))
     return names
 
 
-def _check_stages(config: EvaluateMpc) -> None:
-    replaced = check_stages(config.ours)
-    if replaced and config.method != "paper":
-        raise InvalidInput("stages of ours", ", ".join(config.ours), "given with method paper alone")
-    if len(replaced) == len(STAGES):
-        raise InvalidInput("stages of ours", "all of them", "some; method ours is what replaces all")
+def _known(config: EvaluateMpc, fields: FieldLibrary) -> tuple[str, ...]:
+    """Objects that the method has a field of."""
+    if config.variant.published("fields"):
+        return paper_field_names(config.data_dir)
+    return nerf_library(config.data_dir).names() if config.variant.method == "nerf" else fields.names()
 
 
-def _published(config: EvaluateMpc, stage: StageName) -> bool:
-    """Whether a stage is the paper's."""
-    return config.method == "paper" and stage not in config.ours
+def _own_field(config: EvaluateMpc, name: str) -> Path | None:
+    """The method's field of an object, if that is not ours.
+
+    Raises:
+        UnknownName: if there is none.
+    """
+    if config.variant.published("fields"):
+        return paper_field_path(name, config.data_dir)
+    return nerf_library(config.data_dir).info(name).path if config.variant.method == "nerf" else None
 
 
 def _tasks(config: EvaluateMpc) -> TaskSet:
@@ -175,32 +192,48 @@ def _tasks(config: EvaluateMpc) -> TaskSet:
 
 
 def _pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
-    """Our episodes, then the oracle's."""
-    assert config.names is not None
+    """The method's episodes, then the oracle's."""
     settings = replace(config.settings, cost=config.cost, steps=config.actions)
     told_truth = replace(
         config.settings, steps=config.actions, plan=config.oracle_plan, replan_every=_ORACLE_REPLANS_EVERY,
         reached_rad=_ORACLE_REACHED_RAD,
     )  # fmt: skip
-    episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, frozenset(config.ours))
-    given = {
-        "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in config.names},
-        "network": file_sha256(network_path(config.data_dir)),
-        "code": code_sha256(control, dynamics, estimation, experiments, metrics, paper, planning, render, world),
-    }
-    if _published(config, "fields"):
-        given["paper_fields"] = [file_sha256(paper_field_path(name, config.data_dir)) for name in config.names]
-    if _published(config, "dynamics"):
-        given["paper_network"] = file_sha256(weights_path(config.data_dir))
+    episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
+    given, own = _circumstances(config, fields, assets)
     folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
-    method = "-".join(part for part in (config.method, *sorted(config.ours), config.cost, config.factor) if part)
-    kinds: list[tuple[str, EpisodeSettings, _Work]] = [
-        (method, settings, partial(episodes.from_images, method=config.method))
-    ]
+    method = "-".join(part for part in (config.variant.name(), config.cost, config.factor) if part)
+    kinds: list[tuple[str, dict[str, Any], _Work]]
+    if config.variant.method == "foresight":
+        plan = config.foresight
+        work: _Work = partial(episodes.by_foresight, settings=plan, actions=settings.steps)
+        kinds = [(method, {**own, "settings": asdict(plan)}, work)]
+    else:
+        work = partial(episodes.from_images, settings=settings)
+        kinds = [(method, {**own, "settings": asdict(settings)}, work)]
     if config.oracle:
-        kinds.append(("oracle", told_truth, episodes.oracle))
+        kinds.append(("oracle", {"settings": asdict(told_truth)}, partial(episodes.oracle, settings=told_truth)))
     return [
-        Piece(f"{n:04d}", TaskCache(folder / kind), {**given, "settings": asdict(how)}, partial(work, n, how))
-        for kind, how, work in kinds
+        Piece(f"{n:04d}", TaskCache(folder / kind), {**given, **circumstances}, partial(work, n))
+        for kind, circumstances, work in kinds
         for n in range(config.tasks)
     ]
+
+
+def _circumstances(
+    config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What all results depend on, and what those of the method do besides."""
+    names = config.names or ()
+    given = {
+        "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in names},
+        "network": file_sha256(network_path(config.data_dir)),
+        "code": code_sha256(*_CODE),
+    }
+    own: dict[str, Any] = {}
+    if any(_own_field(config, name) for name in names):
+        own["own_fields"] = [file_sha256(path) for name in names if (path := _own_field(config, name))]
+    if config.variant.published("dynamics"):
+        own["own_network"] = file_sha256(weights_path(config.data_dir))
+    if config.variant.method == "foresight":
+        own["own_network"] = file_sha256(fitvid_path(config.data_dir))
+    return given, own

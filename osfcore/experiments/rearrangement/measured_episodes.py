@@ -1,33 +1,28 @@
-"""Single episodes, measured: those of methods that see images, and of the planner that is told the truth.
-
-Methods:
-    ours         the loop as it ships.
-    overhead     the same, but it takes the light to be overhead: what estimating the light is worth.
-    known_light  the same, told the true lights of scene and goal image: what knowing them would be worth.
-    paper        the method as published; each of its stages can be replaced by ours (`MeasuredEpisodes.replaced`).
-"""
+"""Single episodes, measured: those of methods that see images, and of the planner that is told the truth."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.estimators import Estimators
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Stepped
-from osfcore.control.scene_models import SceneModels, load_scene_models
+from osfcore.control.scene_models import load_scene_models
 from osfcore.experiments.rearrangement.factors import Factor, factor_named
+from osfcore.experiments.rearrangement.methods import Variant, loop_parts
 from osfcore.experiments.rearrangement.own_pushes import Course, prediction_errors
 from osfcore.experiments.rearrangement.runs import Ended, TrueState, run_from_images, run_told_the_truth
 from osfcore.experiments.rearrangement.tasks import DrawnTask, TaskSet, draw_task
+from osfcore.experiments.rivals.fitvid.weights import fitvid_path, read_fitvid
+from osfcore.experiments.rivals.visual_foresight import Foreseen, ForesightSettings, run_visual_foresight
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.light import Light
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S
 from osfcore.inspection.contact_sheet import Comparison
@@ -35,11 +30,9 @@ from osfcore.io.image_file import to_uint8
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.paper.stages import STAGES, PaperEstimators, StageName, with_paper_stages
 from osfcore.random_streams import Stream, stream_rng
 
-Method = Literal["ours", "overhead", "known_light", "paper"]
-METHODS: tuple[Method, ...] = get_args(Method)
+_NO_ERRORS: Mapping[str, list[float]] = MappingProxyType({"mm": [], "deg": []})  # of who predicts no poses
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,7 +45,7 @@ class MeasuredEpisodes:
         assets: meshes for the simulator.
         data_dir: where networks trained on this machine are.
         factor: name of what differs from the usual world; "" for nothing.
-        replaced: stages of the paper's method that are ours.
+        variant: whose episodes.
     """
 
     tasks: TaskSet
@@ -60,41 +53,40 @@ class MeasuredEpisodes:
     assets: AssetLibrary
     data_dir: Path
     factor: str = ""
-    replaced: frozenset[StageName] = frozenset()
+    variant: Variant = field(default_factory=Variant)
 
-    def from_images(self, number: int, settings: EpisodeSettings, method: Method = "ours") -> TaskResult:
+    def from_images(self, number: int, settings: EpisodeSettings) -> TaskResult:
         """A task for a method that sees images alone; doubts about its goal are noted and overruled."""
-        drawn, models = self._prepared(number)
+        drawn = self._drawn(number)
+        models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
+        parts = loop_parts(self.variant, models, drawn.task, self.fields, self.data_dir)
+        settings, rng = replace(settings, despite_doubts=True), stream_rng(self.tasks.seed, Stream.EPISODE, number)
+        log = _Log(drawn.task, models.symmetries)
+        given = drawn.task, self.assets, parts, settings, rng, self._factor(), self.variant
+        ended = log.follow(run_from_images(*given))
+        return self._scored(drawn, ended, {**log.summary(), "predicted": prediction_errors(log.course, parts.models)})
+
+    def by_foresight(self, number: int, settings: ForesightSettings, actions: int) -> TaskResult:
+        """A task for visual foresight, which pushes until all actions are done."""
+        drawn = self._drawn(number)
         rng = stream_rng(self.tasks.seed, Stream.EPISODE, number)
-        log, ended, began = _Log(drawn.task, models.symmetries), None, time.perf_counter()
-        settings, estimators = replace(settings, despite_doubts=True), _estimators(method, drawn.task)
-        stages = frozenset(STAGES) - self.replaced if method == "paper" else frozenset[StageName]()
-        if stages:
-            models = with_paper_stages(models, stages, self.fields, self.data_dir)
-            estimators = PaperEstimators() if "estimation" in stages else estimators
-        given = drawn.task, self.assets, models, settings, rng, estimators, self._factor()
-        for event in run_from_images(*given, as_published="planning" in stages):
-            if isinstance(event, Ended):
-                ended = event
-            else:
-                log.take(event)
-        assert ended is not None, "the last event tells how it ended"
-        log.figures["episode_s"] = round(time.perf_counter() - began, 2)
-        figures = {**log.summary(), "predicted": prediction_errors(log.course, models)}
-        return self._scored(drawn, ended, figures)
+        log, predictor = _Log(drawn.task, {}), read_fitvid(fitvid_path(self.data_dir))
+        given = drawn.task, self.assets, predictor, settings, actions, rng, self._factor(), predictor.settings.side
+        ended = log.follow(run_visual_foresight(*given))
+        return self._scored(drawn, ended, {**log.summary(), "predicted": dict(_NO_ERRORS)})
 
     def oracle(self, number: int, settings: EpisodeSettings) -> TaskResult:
         """A task for the planner that is told the truth."""
-        drawn, models = self._prepared(number)
+        drawn = self._drawn(number)
+        models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
         rng = stream_rng(self.tasks.seed, Stream.ORACLE, number)
         ended = run_told_the_truth(drawn.task, self.assets, models, settings, rng)
         return self._scored(drawn, ended, {})
 
-    def _prepared(self, number: int) -> tuple[DrawnTask, SceneModels]:
+    def _drawn(self, number: int) -> DrawnTask:
         drawn = draw_task(self.assets, self.tasks, number)
         task = self._factor().task(drawn.task, stream_rng(self.tasks.seed, Stream.FACTOR_LIGHT, number))
-        drawn = replace(drawn, task=task)
-        return drawn, load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
+        return replace(drawn, task=task)
 
     def _factor(self) -> Factor:
         return factor_named(self.factor) if self.factor else Factor()
@@ -108,17 +100,6 @@ class MeasuredEpisodes:
         return TaskResult(told, (Comparison(label, to_uint8(ended.goal), to_uint8(ended.image)),))
 
 
-def _estimators(method: Method, task: RearrangementTask) -> Estimators:
-    overhead = Light(np.array([0.0, 0.0, 1.0]))
-    match method:
-        case "ours" | "paper":
-            return Estimators()
-        case "overhead":
-            return Estimators.with_known_lights(overhead, overhead)
-        case "known_light":
-            return Estimators.with_known_lights(task.start.light, task.goal.light)
-
-
 class _Log:
     """What is kept of a task's events."""
 
@@ -130,7 +111,19 @@ class _Log:
         self.course = Course()
         self._truth: SceneState | None = None
 
-    def take(self, event: Event | TrueState) -> None:
+    def follow(self, events: Iterator[Event | TrueState | Foreseen | Ended]) -> Ended:
+        """Take note of all events of an episode; how it ended is the last of them."""
+        began, ended = time.perf_counter(), None
+        for event in events:
+            if isinstance(event, Ended):
+                ended = event
+            else:
+                self.take(event)
+        assert ended is not None, "the last event tells how it ended"
+        self.figures["episode_s"] = round(time.perf_counter() - began, 2)
+        return ended
+
+    def take(self, event: Event | TrueState | Foreseen) -> None:
         """Take note of an event."""
         match event:
             case GoalFound():
@@ -152,11 +145,16 @@ class _Log:
                     self.figures |= self._first_errors(event.estimate.state)
                 for stage, seconds in event.seconds.items():
                     self._seconds.setdefault(stage, []).append(seconds)
+            case Foreseen():
+                self._seconds.setdefault("plan", []).append(event.plan.seconds)
+                self._note_end("out of steps", event.number + 1)
             case Finished():
-                robot_s = round(STEP_S * event.number, 3)
-                self.figures |= {"outcome": event.outcome, "steps": event.number, "robot_s": robot_s}
+                self._note_end(event.outcome, event.number)
             case _:
                 pass
+
+    def _note_end(self, outcome: str, steps: int) -> None:
+        self.figures |= {"outcome": outcome, "steps": steps, "robot_s": round(STEP_S * steps, 3)}
 
     def _first_errors(self, state: SceneState) -> dict[str, float]:
         """Of the first estimate: means over all objects [mm, deg], and the angle of the light [deg]."""

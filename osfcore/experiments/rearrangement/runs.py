@@ -10,13 +10,13 @@ from jaxtyping import Float
 
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.estimators import Estimators
 from osfcore.control.events import Event, Stepped
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
 from osfcore.control.scene_models import SceneModels
 from osfcore.experiments.rearrangement.factors import Factor, VariedWorld
-from osfcore.geometry.cameras import goal_camera
+from osfcore.experiments.rearrangement.methods import LoopParts, Variant, told_truths
+from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.states import SceneState
 from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
@@ -57,35 +57,36 @@ class Ended:
 def run_from_images(
     task: RearrangementTask,
     assets: AssetLibrary,
-    models: SceneModels,
+    parts: LoopParts,
     settings: EpisodeSettings,
     rng: np.random.Generator,
-    estimators: Estimators | None = None,
     factor: Factor | None = None,
-    *,
-    as_published: bool = False,
+    variant: Variant | None = None,
 ) -> Iterator[Event | TrueState | Ended]:
     """The whole loop, with the truth before each `Stepped`; the last step is how it ended.
 
     Args:
         task: what is told of it is the goal image alone.
         assets: meshes, for the simulator.
-        models: of the task's objects.
-        settings: how the loop goes.
+        parts: what the loop is made of.
+        settings: how the loop goes; of planning as published, the number of steps counts.
         rng: of estimates and plans.
-        estimators: how everything is estimated.
         factor: how the world differs from what is taken for granted.
-        as_published: plan as the paper does, with as many steps as the settings say.
+        variant: tells who plans, what is replaced by the truth, and how many cameras there are.
     """
-    world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0])
+    variant = variant or Variant()
+    cameras = default_cameras()[: variant.views]
+    world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)
     try:
         goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
-        if as_published:
+        parts = told_truths(parts, variant.truths, world.truth, assets)
+        if variant.published("planning"):
             how = AlgorithmSettings(settings.steps)
-            events = run_algorithm(world, models, goal, how, estimators or Estimators(), rng)
+            events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
         else:
-            events = Episode(world, models, goal, settings, rng, estimators=estimators).run()
+            target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal
+            events = Episode(world, parts.models, target, settings, rng, estimators=parts.estimators).run()
         for event in events:
             if isinstance(event, Stepped):
                 yield TrueState(world.truth())

@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 from osfcore.errors import CorruptFile, InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.fields.field_weights import field_bytes, field_from_bytes
-from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.kiloosf import KiloOSF, without_light
 from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.ray_sampling import RaySource
 from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -83,6 +83,8 @@ def train_field(config: TrainField, recipe: Recipe | None = None) -> Iterator[Fi
     if train.is_opaque:
         expected = "an object before a transparent background is expected (opaque sets show the bare table)"
         raise CorruptFile(config.data, f"its images are opaque all over; {expected}")
+    if not config.lit:  # l = 0 leaves n . l and the networks' weights for l without a gradient
+        train, test = (replace(part, light_directions=np.zeros_like(part.light_directions)) for part in (train, test))
     yield from _Run(config, recipe, device, train, test).steps()
 
 
@@ -91,6 +93,8 @@ def _check(config: TrainField) -> None:
         raise InvalidInput("minutes", config.minutes, "between 0.05 and 1440")
     if config.recipe not in ("direct", "distil"):
         raise InvalidInput("recipe", config.recipe, "direct or distil")
+    if config.recipe == "distil" and not config.lit:
+        raise InvalidInput("recipe of a field without light", config.recipe, "direct")
     OSFSize(config.teacher_depth, config.teacher_width)  # refuses what cannot be built
     check_seed(config.seed)
     if config.iterations is not None and not 10 <= config.iterations <= 10_000_000:
@@ -237,6 +241,7 @@ class _Run:
             "train_images": len(self._images.cameras),
             "image_size": list(self._source.image_shape),
             "hollow": self._config.hollow,
+            "lit": self._config.lit,
             "recipe": {"name": self._config.recipe, **asdict(self._recipe)},
         }
         if self._config.recipe == "distil":
@@ -252,6 +257,7 @@ class _Run:
     def _trimmed(self, field: KiloOSF) -> bytes:
         """The field as a file of at most the size aimed at, if leaving out what hardly shows can make it so."""
         data = b""
+        field = field if self._config.lit else without_light(field)
         for needed_weight in _NEEDED_WEIGHTS:
             data = field_bytes(trim(field, self._images, needed_weight))
             if len(data) <= _AIMED_BYTES:

@@ -64,6 +64,7 @@ class TrainField:
         recipe: "direct", or "distil" for the paper's way over a teacher.
         teacher_width: units of each layer of the teacher.
         teacher_depth: its layers.
+        lit: False for colours that do not depend on the light, as a NeRF's, to compare with; "direct" only.
     """
 
     data: Path
@@ -76,3 +77,4 @@ class TrainField:
     recipe: Literal["direct", "distil"] = "direct"
     teacher_width: int = 64
     teacher_depth: int = 4
+    lit: bool = True

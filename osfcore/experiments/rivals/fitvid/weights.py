@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from importlib.resources import files
 from pathlib import Path
 
 import torch
@@ -14,7 +15,16 @@ from osfcore.io.files import write_atomically
 from osfcore.io.network_file import read_parameters
 
 FORMAT = "fitvid-1"
+_FILE = "fitvid.safetensors"
 _SIZES = ("side", "width", "features", "hidden", "latent")
+
+
+def fitvid_path(data_dir: Path | None) -> Path:
+    """Where the network lies: DATA_DIR/fitvid.safetensors, else the package's."""
+    own = None if data_dir is None else data_dir / _FILE
+    if own is not None and own.is_file():
+        return own
+    return Path(str(files("osfcore.experiments.rivals") / "shipped" / _FILE))
 
 
 def fitvid_bytes(model: FitVidModel) -> bytes:

@@ -7,8 +7,10 @@ import pytest
 
 import osfcore.experiments.rearrangement.measured_episodes as measured
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Stepped
+from osfcore.experiments.rearrangement import methods
 from osfcore.experiments.rearrangement.factors import Factor
 from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.experiments.rivals.visual_foresight import Foreseen, ForesightPlan
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.objects.catalogue import CATALOGUE
@@ -26,12 +28,12 @@ def runs(monkeypatch):
     """
     made = []
 
-    def ours(task, _assets, _models, settings, _rng, estimators, factor, *, as_published):
-        held = estimators.first.held_light
-        assert (held is None) == (estimators.goal.held_light is None)
-        who = "ours" if held is None else "overhead" if held == (0, 0, 1) else "known_light"
+    def ours(task, _assets, parts, settings, _rng, factor, variant):
+        held = parts.estimators.first.held_light
+        assert (held is None) == (parts.estimators.goal.held_light is None)
+        assert (held == (0, 0, 1)) == (variant.method in ("overhead", "nerf"))
         assert isinstance(factor, Factor)
-        made.append((who, task.number, settings.cost))
+        made.append((variant.method, task.number, settings.cost))
         assert settings.despite_doubts
         one, doubt = np.full(len(task.start.names), 1e-3), "hidden" if task.number % 2 else ""
         estimate = EstimatedState(task.goal, one, one, 1e-3, ("",) * len(one), doubt)
@@ -45,11 +47,19 @@ def runs(monkeypatch):
         yield Finished(2, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, PAPER, PAPER)
 
+    def foresight(task, _assets, _predictor, settings, steps, _rng, _factor, _size):
+        made.append(("foresight", task.number, steps))
+        plan = ForesightPlan(np.zeros((1, 3)), np.zeros(2), 1, 2.5)
+        yield from (Foreseen(number, np.zeros(3), plan, PAPER) for number in range(steps))
+        yield Ended(task.start, PAPER, PAPER)
+
     def told(task, _assets, _models, settings, _rng):
         made.append(("oracle", task.number, settings.plan.samples))
         return Ended(task.start, PAPER, PAPER)
 
     monkeypatch.setattr(measured, "run_from_images", ours)
     monkeypatch.setattr(measured, "run_told_the_truth", told)
+    monkeypatch.setattr(measured, "run_visual_foresight", foresight)
     monkeypatch.setattr(measured, "load_scene_models", lambda *_: SimpleNamespace(symmetries=SYMMETRIES))
+    monkeypatch.setattr(methods, "with_nerfs", lambda models, *_: models)
     return made

@@ -8,7 +8,9 @@ import osfcore.experiments.rearrangement.measured_episodes as measured
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.rearrangement.evaluation import REPORT_FILE, EvaluateMpc, evaluate_mpc
-from osfcore.experiments.rearrangement.measured_episodes import METHODS
+from osfcore.experiments.rearrangement.methods import METHODS, Variant
+from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
+from osfcore.experiments.rivals.fitvid.weights import write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.planning.mppi import PlanSettings
 
@@ -137,11 +139,21 @@ def test_both_costs_share_an_oracle(library, tmp_path, runs):
     assert runs == [("ours", 0, "pose"), ("oracle", 0, 8), ("ours", 0, "image")]
 
 
-@pytest.mark.parametrize("method", sorted({*METHODS} - {"paper"}))
+@pytest.mark.parametrize("method", sorted({*METHODS} - {"paper", "foresight"}))
 def test_methods_differ_by_what_they_take_the_light_for(library, tmp_path, runs, method):
-    report = last(evaluate_mpc(config(tmp_path, oracle=False, method=method), FieldLibrary(None), library)).report
+    asked = config(tmp_path, oracle=False, variant=Variant(method))
+    report = last(evaluate_mpc(asked, FieldLibrary(None), library)).report
     assert runs == [(method, 0, "pose")]
     assert report["method"] == method
+
+
+def test_visual_foresight_pushes_until_all_actions_are_done(library, tmp_path, runs):
+    write_fitvid(tmp_path / "data" / "fitvid.safetensors", FitVidModel(FitVidSettings(16, 1, 2, 2, 1)).eval())
+    asked = config(tmp_path, oracle=False, variant=Variant("foresight"))
+    report = last(evaluate_mpc(asked, FieldLibrary(None), library)).report
+    assert runs == [("foresight", 0, 2)]
+    assert (report["steps_median"], report["replan_s_median"], report["success_2cm"]) == (2, 2.5, 0)
+    assert report["first_mm_median"] is report["own_pushes_mean_mm_4"] is None
 
 
 def test_an_executor_gets_all_episodes_and_changes_no_figure(library, tmp_path, runs):
@@ -170,7 +182,7 @@ def test_an_executor_gets_all_episodes_and_changes_no_figure(library, tmp_path, 
         ({"family": "crowded"}, InvalidInput, "between 2 and 6"),
         ({"family": "sorted"}, InvalidInput, "shifted, turned, crowded, relit"),
         ({"seed": -1}, InvalidInput, "seed"),
-        ({"method": "magic"}, InvalidInput, "one of ours, overhead, known_light"),
+        ({"variant": Variant("magic")}, InvalidInput, "one of ours, overhead, known_light"),
         ({"actions": 0}, InvalidInput, "number of steps is 0"),
         ({"objects": 2}, InvalidInput, "number of objects with a field and a mesh is 1"),
         ({"objects": 2, "names": (NAME, NAME)}, InvalidInput, "at least 2"),

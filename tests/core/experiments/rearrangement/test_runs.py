@@ -7,11 +7,13 @@ import osfcore.control.closed_loop as episode
 import osfcore.control.estimators as estimators
 import osfcore.experiments.rearrangement.runs as module
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed
+from osfcore.control.estimators import Estimators
+from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed, Stepped
 from osfcore.control.scene_models import load_scene_models
 from osfcore.errors import OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.experiments.rearrangement.factors import VariedWorld
+from osfcore.experiments.rearrangement.methods import TRUTHS, LoopParts, SimulatedModel, Variant
 from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
 from osfcore.experiments.rearrangement.tasks import TaskSet, draw_task
 from osfcore.fields.field_library import FieldLibrary
@@ -74,6 +76,10 @@ def eyes(monkeypatch, task, worlds):
     monkeypatch.setattr(episode, "estimate_goal", lambda *_: told(task.goal))
 
 
+def parts(models):
+    return LoopParts(models, Estimators())
+
+
 def is_closed(world):
     try:
         world.truth()
@@ -92,7 +98,7 @@ def pictures(library, state, cameras):
 
 
 def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, models, eyes, worlds):
-    events = list(run_from_images(task, library, models, QUICK, np.random.default_rng(0)))
+    events = list(run_from_images(task, library, parts(models), QUICK, np.random.default_rng(0)))
     first, *_, finished, ended = events
     assert isinstance(first, Observed)
     cameras = first.observation.cameras
@@ -110,8 +116,44 @@ def test_the_loop_goes_from_the_start_toward_the_goal_image(task, library, model
     np.testing.assert_allclose(ended.image, pictures(library, bare, (goal_camera(),))[0], atol=1e-6)
 
 
+def test_who_is_told_every_truth_needs_no_image(task, library, models, worlds, monkeypatch):
+    def refuse(*_args, **_more):
+        raise AssertionError("the truth is known")
+
+    for name in ("estimate_first", "estimate_next"):
+        monkeypatch.setattr(estimators, name, refuse)
+    monkeypatch.setattr(episode, "estimate_goal", refuse)
+    few = replace(QUICK, steps=1)
+    variant = Variant(truths=frozenset(TRUTHS), views=1)
+    events = list(run_from_images(task, library, parts(models), few, np.random.default_rng(0), variant=variant))
+    (found,) = (event for event in events if isinstance(event, GoalFound))
+    for name in task.moved:
+        np.testing.assert_array_equal(found.goal.pose(name).position, task.goal.pose(name).position)
+    assert isinstance(events[0], Observed)
+    assert len(events[0].observation.cameras) == 1
+    last = [event for event in events if isinstance(event, Stepped)][-1]
+    ended = events[-1].state
+    np.testing.assert_allclose(last.estimate.state.poses.position, ended.poses.position, atol=1e-9)
+
+
+def test_the_simulator_predicts_what_then_happens(task, library):
+    model = SimulatedModel(library, task.start.names)
+    world = Tabletop(library)
+    action = np.array([0.2, 0.1, 0.0])
+    try:
+        world.restore(task.start)
+        predicted = model.rollout(world.truth(), action[None, None])
+        world.act(action)
+        np.testing.assert_allclose(predicted.positions[0, 1], world.truth().poses.position, atol=2e-3)
+        np.testing.assert_allclose(predicted.pusher[0, 1], world.truth().pusher, atol=1e-6)
+    finally:
+        model.close()
+        world.close()
+    assert model.names == task.start.names
+
+
 def test_an_episode_that_is_left_closes_its_world(task, library, models, eyes, worlds):
-    events = run_from_images(task, library, models, QUICK, np.random.default_rng(0))
+    events = run_from_images(task, library, parts(models), QUICK, np.random.default_rng(0))
     next(events)
     assert not is_closed(worlds[0])
     events.close()

@@ -15,6 +15,9 @@ from osfcore.fields.field_weights import read_field
 from osfcore.fields.training import kiloosf_training as training
 from osfcore.fields.training.kiloosf_training import train_field
 from osfcore.fields.training.recipes import TrainField
+from osfcore.io.image_set import read_image_set
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import SceneBatch
 from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set, write_table_set
 from tests.core.render.scenes import plain_table
 
@@ -65,6 +68,20 @@ def test_a_field_learns_shape_colour_and_light_from_images(shape, request, tmp_p
     np.testing.assert_allclose(size, truth, atol=0.02)
 
 
+def test_a_field_without_light_learns_the_mean_over_lights(ball_set, tmp_path):
+    lit, unlit = (
+        TrainField(ball_set, tmp_path / f"{name}.safetensors", iterations=150, device="cpu", lit=name == "lit")
+        for name in ("lit", "unlit")
+    )
+    assert run(unlit)[-1].psnr_full < run(lit)[-1].psnr_full - 3
+    assert (metrics(unlit)["lit"], metrics(lit)["lit"]) == (False, True)
+    field = read_field(unlit.out)
+    scene = SceneBatch(("ball",), np.zeros((2, 1, 3)), np.tile([1.0, 0, 0, 0], (2, 1, 1)), np.eye(3)[1:], None)
+    seen = SceneRenderer({"ball": field}, None).render(scene, read_image_set(ball_set, "test").cameras[:1]).rgb
+    assert seen.max() > 0.1
+    np.testing.assert_array_equal(seen[0], seen[1])
+
+
 def test_the_same_seed_gives_the_same_field(block_set, tmp_path):
     outs = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
@@ -94,6 +111,9 @@ _KILLED = """
 import sys
 from pathlib import Path
 from osfcore.fields.training import kiloosf_training as training
+from osfcore.io.image_set import read_image_set
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import SceneBatch
 from tests.core.fields.rendered_sets import QUICK
 training._CHECKPOINT_S = training._REPORT_S = 0.2
 config = training.TrainField(Path(sys.argv[1]), Path(sys.argv[2]), iterations=240, device="cpu")

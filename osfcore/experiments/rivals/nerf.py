@@ -1,0 +1,109 @@
+"""Compositional neural radiance fields (Driess et al., 2022) in our loop: what relightable fields are worth.
+
+Each object has a field of ours whose radiance does not depend on the light (`osf train field --method nerf`): the same
+network, images, budget and renderer, without l in paper eq. 1. Trained on images under many lights, it learns how an
+object looks on average. Nothing casts a shadow, and the table is as bright as on average over the lights above it.
+
+Deviations from the published model: fields are composed by the object poses that our loop estimates, instead of by
+latent vectors that an encoder makes of images and masks, and pushes are predicted by our dynamics instead of a network
+over these vectors. What differs from our method is the field alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from osfcore.control.scene_models import SceneModels
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.table_field import TableField
+from osfcore.geometry.cameras import Camera
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch
+
+_FOLDER = "nerf"
+_NO_SHADOWS = 1e9  # voxels between samples of shadow rays: the first one already lies behind everything
+_LIGHTS = 4096
+
+
+class UnlitRenderer(SceneRenderer):
+    """Fields that know of no light: nothing casts a shadow."""
+
+    def __init__(self, fields: Mapping[str, KiloOSF], table: TableField | None) -> None:
+        """Prepare fields.
+
+        Args:
+            fields: trained without light, by name.
+            table: ours, of which the mean over all lights is shown; None for black surroundings.
+        """
+        super().__init__(fields, None if table is None else mean_table(table))
+
+    def render(
+        self,
+        batch: SceneBatch,
+        cameras: Sequence[Camera],
+        *,
+        quality: Quality = EXACT,
+        outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
+        only: Bool[np.ndarray, "V h w"] | None = None,
+    ) -> Rendered:
+        """Images of every scene of a batch from every camera; its lights play no part."""
+        unlit = replace(quality, shadow_voxels=_NO_SHADOWS)
+        return super().render(batch, cameras, quality=unlit, outputs=outputs, only=only)
+
+
+def mean_table(table: TableField) -> TableField:
+    """A table as bright under every light as it is on average over the hemisphere.
+
+    That is what least squares finds for a table without light from images under lights that are uniform over the sky.
+    """
+    z = (np.arange(_LIGHTS) + 0.5) / _LIGHTS  # equal areas of the hemisphere, along a spiral
+    angle = np.pi * (1 + 5**0.5) * np.arange(_LIGHTS)
+    radius = np.sqrt(1 - z**2)
+    lights = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    ambient = (table.ambient + table.direct(lights).mean(axis=0)).astype(np.float32)
+    return replace(table, ambient=ambient, w2=np.zeros_like(table.w2), b2=np.zeros_like(table.b2))
+
+
+def nerf_library(data_dir: Path | None) -> FieldLibrary:
+    """Fields without light: DATA_DIR/nerf/fields/NAME/field.safetensors, and those of the package."""
+    shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / "nerf"))
+    return FieldLibrary(None if data_dir is None else data_dir / _FOLDER, shipped=shipped)
+
+
+def load_nerf_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
+    """How objects and table look without light.
+
+    Args:
+        names: of the objects.
+        fields: library of the table.
+        data_dir: whose fields come before the installed ones.
+
+    Raises:
+        UnknownName: if an object has no such field.
+        CorruptFile: if a file is broken.
+    """
+    library = nerf_library(data_dir)
+    return ObjectModels.rendered_by(UnlitRenderer, {name: library.load(name) for name in names}, fields.load_table())
+
+
+def with_nerfs(models: SceneModels, fields: FieldLibrary, data_dir: Path | None) -> SceneModels:
+    """Models of which the appearance is that of fields without light.
+
+    Args:
+        models: ours, of a scene's objects.
+        fields: library of the table.
+        data_dir: whose fields come before the installed ones.
+
+    Raises:
+        UnknownName: if an object has no such field.
+        CorruptFile: if a file is broken.
+    """
+    return replace(models, appearance=load_nerf_appearance(tuple(models.shapes), fields, data_dir))
