@@ -42,6 +42,9 @@ class Stream(IntEnum):
     COLLECTED_LIGHT = 70  # of trajectories whose frames are kept
     VIDEO_WINDOWS = 71  # which of them video prediction learns from, and how they are varied
     VIDEO_WEIGHTS = 72  # that video prediction begins with
+    RELIT_SCENE = 80  # scenes that are shown under many lights, and the lights' azimuths
+    VIDEO_SCENE = 81  # scenes that predicted videos begin with
+    VIDEO_ESTIMATE = 82  # what is taken of them from images
 
 
 def _sequence(seed: int, stream: Stream, numbers: tuple[int, ...]) -> np.random.SeedSequence:

@@ -1,8 +1,8 @@
-"""Contact sheets: truth, ours and the difference, below each other."""
+"""Contact sheets: truth, ours and the difference, below each other; and grids of images with names."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +14,7 @@ from osfcore.errors import InvalidInput
 DIFFERENCE_GAIN = 4
 _LABEL_PX = 16
 _ROW_LABEL_PX = 40
+_NAME_PX = 76  # of a row of a grid
 _PAPER = 255
 
 
@@ -67,6 +68,32 @@ def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 
         for row, image in enumerate((column.truth, column.ours, shown)):
             top = _LABEL_PX + row * height
             sheet[top : top + height, left : left + width] = image
+    return sheet
+
+
+def image_grid(
+    rows: Mapping[str, Sequence[UInt8[np.ndarray, "h w 3"]]], columns: Sequence[str]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Images in rows and columns, with the columns' names above and the rows' on the left.
+
+    Args:
+        rows: by name.
+        columns: names, as many as each row has images.
+
+    Raises:
+        InvalidInput: if there is nothing to show, rows differ in length, or images in size.
+    """
+    shapes = {image.shape for row in rows.values() for image in row}
+    if len(shapes) != 1 or {len(row) for row in rows.values()} != {len(columns)}:
+        raise InvalidInput("images of a grid", f"{len(rows)} rows", "full rows of images, all of one size")
+    height, width = shapes.pop()[:2]
+    sheet = np.full((_LABEL_PX + len(rows) * height, _NAME_PX + len(columns) * width, 3), _PAPER, np.uint8)
+    for number, name in enumerate(columns):
+        put_text(sheet, name, (_NAME_PX + number * width + 2, _LABEL_PX - 5), width - 4)
+    for number, (name, images) in enumerate(rows.items()):
+        top = _LABEL_PX + number * height
+        put_text(sheet, name, (1, top + height // 2), _NAME_PX)
+        sheet[top : top + height, _NAME_PX:] = np.hstack(images)
     return sheet
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects
 from osfcore.experiments.fields.composite_scenes import HARSH_ELEVATION_DEG, Draw
@@ -56,11 +57,13 @@ class Episode:
 
     Attributes:
         frames: after each of the steps, without masks.
+        actions: one before each of them [m/s].
         moved_m: the farthest that each object came from its first place on the table's plane [m].
         redrawn: how often the pushes were drawn again because they moved nothing far enough.
     """
 
     frames: tuple[Frame, ...]
+    actions: Float[np.ndarray, "T 3"]
     moved_m: tuple[float, ...]
     redrawn: int
 
@@ -111,7 +114,7 @@ def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, s
     with opened(draw, library) as world:
         start = world.truth()
         for attempt in range(_EPISODES):
-            states = _pushes(world, start, stream_rng(draw.seed, Stream.MEASURED_PUSHES, attempt), steps)
+            states, actions = _pushes(world, start, stream_rng(draw.seed, Stream.MEASURED_PUSHES, attempt), steps)
             places = np.stack([state.poses.position[:, :2] for state in states])
             moved = np.linalg.norm(places - start.poses.position[:, :2], axis=2).max(axis=0)
             if moved.max() >= PUSHED_M or attempt == _EPISODES - 1:
@@ -119,7 +122,7 @@ def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, s
                 for state in states:
                     world.restore(state)
                     frames.append(take_frame(world, cameras, masks=False))
-                return Episode(tuple(frames), tuple(moved.tolist()), attempt)
+                return Episode(tuple(frames), actions, tuple(moved.tolist()), attempt)
     raise AssertionError("the last attempt returns")
 
 
@@ -192,13 +195,17 @@ def _absence(place: np.ndarray, *, is_seen: bool) -> Absence:
     return "" if is_seen else "out of view"
 
 
-def _pushes(world: Tabletop, start: SceneState, rng: np.random.Generator, steps: int) -> list[SceneState]:
+def _pushes(
+    world: Tabletop, start: SceneState, rng: np.random.Generator, steps: int
+) -> tuple[list[SceneState], Float[np.ndarray, "T 3"]]:
+    """States after each action, and the actions."""
     world.restore(start)
-    policy, states = DirectedPolicy(world.assets, rng), []
+    policy, states, actions = DirectedPolicy(world.assets, rng), [], []
     for _ in range(steps):
-        world.act(policy.action(world.truth()))
+        actions.append(policy.action(world.truth()))
+        world.act(actions[-1])
         states.append(world.truth())
-    return states
+    return states, np.array(actions)
 
 
 def _moved(world: Tabletop, name: str, pose: Pose, rng: np.random.Generator) -> bool:

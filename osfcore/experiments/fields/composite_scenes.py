@@ -14,11 +14,10 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.image_file import to_uint8
-from osfcore.metrics.image_errors import psnr
+from osfcore.metrics.image_errors import psnr, ssim
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.types import EXACT, Quality, SceneBatch
+from osfcore.render.types import EXACT, Quality, Renderer, SceneBatch
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
@@ -54,12 +53,14 @@ class SceneFigures:
 
     Attributes:
         psnr: over the whole image [dB].
+        ssim: over the whole image.
         psnr_object: over pixels that show an object [dB]; None if hardly any does.
         psnr_shadow: over table pixels in shadow [dB]; None if there is hardly any.
         comparison: both images.
     """
 
     psnr: float
+    ssim: float
     psnr_object: float | None
     psnr_shadow: float | None
     comparison: Comparison
@@ -117,14 +118,38 @@ def simulate(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) -> 
         UnknownName, MissingAssets: if an object has no mesh here.
         NoRoom: if the objects do not fit side by side.
     """
+    (truth,) = simulate_relit(draw, (draw.light,), library, cameras)
+    return truth
+
+
+def simulate_relit(
+    draw: Draw, lights: Sequence[Light], library: AssetLibrary, cameras: tuple[Camera, ...]
+) -> tuple[Truth, ...]:
+    """The same arrangement under one light after the other.
+
+    Args:
+        draw: the scene, of which its own light plays no part.
+        lights: to take pictures under.
+        library: meshes of its objects.
+        cameras: of one image size.
+
+    Raises:
+        UnknownName, MissingAssets: if an object has no mesh here.
+        NoRoom: if the objects do not fit side by side.
+    """
     world = Tabletop(library, cameras=cameras, request=SceneRequest(names=draw.names, light=draw.light))
     try:
         world.arrange(draw.seed)
-        state = replace(world.truth(), pusher=None)
-        pictures = world.pictures(cameras, with_pusher=False)
+        return tuple(_truth(world, light, cameras) for light in lights)
     finally:
         world.close()
-    return Truth(state, cameras, np.stack([p.rgb for p in pictures]), *_kinds(pictures, draw.light, cameras))
+
+
+def _truth(world: Tabletop, light: Light, cameras: tuple[Camera, ...]) -> Truth:
+    world.set_light(light)
+    pictures = world.pictures(cameras, with_pusher=False)
+    images = np.stack([picture.rgb for picture in pictures])
+    return Truth(replace(world.truth(), pusher=None), cameras, images, *_kinds(pictures, light, cameras))
 
 
 def _kinds(pictures: Sequence[Picture], light: Light, cameras: tuple[Camera, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -136,8 +161,8 @@ def _kinds(pictures: Sequence[Picture], light: Light, cameras: tuple[Camera, ...
     return objects, np.stack(darker) & ~objects
 
 
-def render_scene(renderer: SceneRenderer, truth: Truth) -> Float[np.ndarray, "V h w 3"]:
-    """Our images of the same scene."""
+def render_scene(renderer: Renderer, truth: Truth) -> Float[np.ndarray, "V h w 3"]:
+    """A renderer's images of the same scene."""
     rendered = renderer.render(SceneBatch.of(truth.state), truth.cameras, quality=SCENE_QUALITY)
     return np.clip(rendered.rgb[0], 0, 1)
 
@@ -148,6 +173,7 @@ def compare_scene(truth: Truth, ours: Float[np.ndarray, "V h w 3"]) -> tuple[Sce
     return tuple(
         SceneFigures(
             psnr(image, mine),
+            ssim(image, mine),
             _psnr_over(image, mine, on_object),
             _psnr_over(image, mine, in_shadow),
             Comparison(f"camera {camera.name}", to_uint8(image), to_uint8(mine)),
@@ -164,6 +190,7 @@ def figures_of(scene: Sequence[SceneFigures]) -> dict[str, list[float | None]]:
     """The figures of a scene's views as lists, for JSON."""
     return {
         "psnr": [view.psnr for view in scene],
+        "ssim": [view.ssim for view in scene],
         "psnr_object": [view.psnr_object for view in scene],
         "psnr_shadow": [view.psnr_shadow for view in scene],
     }

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CannotWrite, InvalidInput
-from osfcore.inspection.contact_sheet import Comparison, contact_sheet
+from osfcore.inspection.contact_sheet import Comparison, contact_sheet, image_grid
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.metrics.image_errors import dilated, psnr, ssim
 
@@ -105,6 +105,29 @@ def test_sheets_need_images_of_one_size():
         contact_sheet([])
     with pytest.raises(InvalidInput):
         contact_sheet([Comparison("", small, small), Comparison("", large, large)])
+
+
+def test_a_grid_shows_each_image_in_its_place():
+    rows = {f"row {n}": [np.full((20, 30, 3), 40 * n + 10 * m, np.uint8) for m in range(3)] for n in range(2)}
+    grid = image_grid(rows, ["a", "b", "c"])
+    top, left = grid.shape[0] - 2 * 20, grid.shape[1] - 3 * 30
+    for n, images in enumerate(rows.values()):
+        for m, image in enumerate(images):
+            np.testing.assert_array_equal(grid[top + 20 * n :, left + 30 * m :][:20, :30], image)
+    assert np.any(grid[:top] < 100)  # names of columns
+    assert np.any(grid[top:, :left] < 100)  # and of rows
+
+
+def test_a_grid_is_full_of_images_of_one_size():
+    black = np.zeros((20, 20, 3), np.uint8)
+    for rows, columns in (
+        ({}, []),
+        ({"a": [black]}, ["x", "y"]),
+        ({"a": [black, black], "b": [black]}, ["x", "y"]),
+        ({"a": [black, black[1:]]}, ["x", "y"]),
+    ):
+        with pytest.raises(InvalidInput, match="grid"):
+            image_grid(rows, columns)
 
 
 def test_an_unwritable_place_is_told():

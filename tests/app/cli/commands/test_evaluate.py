@@ -232,6 +232,8 @@ def test_the_command_explains_itself(capsys):
         ("estimate", "--bad"),
         ("dynamics", "--workers"),
         ("mpc", "--cost"),
+        ("relighting", "--elevations"),
+        ("video", "--steps"),
     ):
         with pytest.raises(SystemExit) as stop:
             main(["eval", command, "--help"])

@@ -13,6 +13,7 @@ from osfcore.experiments.fields.composite_scenes import (
     mean_of,
     render_scene,
     simulate,
+    simulate_relit,
 )
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
@@ -61,9 +62,24 @@ def test_the_truth_shows_the_objects_their_shadows_and_no_pusher(truth):
         assert in_shadow[umbra].all()
 
 
+def test_relit_scenes_differ_by_their_light_alone(library):
+    draw = draw_scene(SOLIDS, 2, 1, 0)
+    lights = [Light.from_angles(0.7, np.deg2rad(elevation)) for elevation in (20, 70)]
+    low, high = simulate_relit(draw, lights, library, default_cameras(48))
+    for truth, light in zip((low, high), lights, strict=True):
+        alone = simulate(replace(draw, light=light), library, default_cameras(48))
+        np.testing.assert_array_equal(truth.images, alone.images)
+        np.testing.assert_array_equal(truth.shadows, alone.shadows)
+        np.testing.assert_array_equal(truth.state.poses.position, alone.state.poses.position)
+        assert truth.state.light.angle_to(light) < 1e-6
+    assert low.shadows.sum() > 2 * high.shadows.sum()
+    np.testing.assert_array_equal(low.objects, high.objects)
+
+
 def test_equal_images_score_best_and_each_kind_of_pixel_counts_for_its_own_figure(truth):
     for view in compare_scene(truth, truth.images):
         assert (view.psnr, view.psnr_object, view.psnr_shadow) == (100, 100, 100)
+        assert view.ssim == pytest.approx(1)
     off = truth.images + 0.1 * truth.shadows[..., None]
     for view, in_shadow in zip(compare_scene(truth, off), truth.shadows, strict=True):
         assert view.psnr_shadow == pytest.approx(20, abs=1e-3)

@@ -1,0 +1,154 @@
+"""Figures of images along something, such as a light's elevation or predicted steps: means, intervals, differences."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.experiments.charts import Axis, Chart, Curve
+from osfcore.experiments.image_methods import TITLES
+from osfcore.experiments.pieces import Piece, results_of
+from osfcore.experiments.statistics import compare_means, mean_interval
+from osfcore.experiments.task_cache import TaskResult
+
+OURS = "ours"  # what others are compared with
+Tables = Mapping[str, Mapping[str, Float[np.ndarray, "tasks x"]]]  # by method and measure; NaN where there is no figure
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ImageComparisonStep:
+    """How far a comparison is.
+
+    Attributes:
+        done: scenes of single methods that are finished.
+        total: in all.
+        note: what is being done.
+        report: plain JSON, with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    report: dict[str, Any] | None = None
+
+
+def measured(
+    pieces: Mapping[str, Sequence[Piece]], executor: Executor | None
+) -> Generator[ImageComparisonStep, None, dict[str, list[TaskResult]]]:
+    """Work on all pieces, telling how far it is.
+
+    Args:
+        pieces: of each method, equally many.
+        executor: works on them side by side, if given.
+
+    Returns:
+        The results of each method.
+
+    Raises:
+        WorkerDied: if a worker process ended.
+        CannotWrite: if the disk refuses.
+    """
+    every = [piece for part in pieces.values() for piece in part]
+    results: list[TaskResult | None] = []
+    for results in results_of(every, executor):
+        done = sum(result is not None for result in results)
+        if done < len(every):
+            yield ImageComparisonStep(done, len(every), f"{done} of {len(every)} scenes")
+    finished = iter([result for result in results if result is not None])
+    return {method: [next(finished) for _ in part] for method, part in pieces.items()}
+
+
+def tables_of(results: Mapping[str, Sequence[TaskResult]], measures: Sequence[str]) -> Tables:
+    """What results hold: of each measure a list along x, with None where there is no figure."""
+    return {
+        method: {key: np.array([result.figures[key] for result in part], float) for key in measures}
+        for method, part in results.items()
+    }
+
+
+def summary(tables: Tables, spans: Mapping[str, Sequence[int]]) -> dict[str, Any]:
+    """What was measured as plain numbers; a task's figure is its mean over a span, over which tasks are averaged.
+
+    Args:
+        tables: of the methods.
+        spans: indices along x, by name.
+
+    Returns:
+        "methods": for each measure the mean over tasks "along" x and, for each of the "spans", "mean" and 95 %
+        "interval"; "against": for each other method and measure the mean "difference" of ours from it and its
+        "interval", task by task. None where nothing was measured.
+    """
+    methods = {
+        method: {
+            key: {
+                "along": [_mean(table[:, at]) for at in range(table.shape[1])],
+                "spans": {name: _interval(_task_means(table, at)) for name, at in spans.items()},
+            }
+            for key, table in part.items()
+        }
+        for method, part in tables.items()
+    }
+    ours = tables.get(OURS, {})
+    against = {
+        method: {
+            key: {name: _difference(_task_means(table, at), _task_means(part[key], at)) for name, at in spans.items()}
+            for key, table in ours.items()
+        }
+        for method, part in tables.items()
+        if ours and method != OURS
+    }
+    return {"methods": methods, "against": against}
+
+
+def chart_of(tables: Tables, key: str, x: Axis, places: Sequence[float], label: str, tick: float) -> Chart:
+    """Means of one measure over tasks, a curve for each method.
+
+    Args:
+        tables: of the methods.
+        key: of the measure.
+        x: axis along which it was measured.
+        places: on it.
+        label: of the measure, with its unit.
+        tick: the axis of the measure begins at a multiple of it.
+    """
+    means = {m: np.array([_mean(column) for column in part[key].T], float) for m, part in tables.items()}
+    lowest = min(float(np.nanmin(values, initial=np.inf)) for values in means.values())
+    low = tick * np.floor(lowest / tick) if np.isfinite(lowest) else 0.0
+    curves = [Curve(TITLES[method], np.asarray(places, float), values, dots=True) for method, values in means.items()]
+    return Chart("", x, Axis(label, low), curves)
+
+
+def _task_means(table: Float[np.ndarray, "tasks x"], at: Sequence[int]) -> Float[np.ndarray, "tasks"]:
+    """Over what there is; NaN where there is nothing."""
+    part = table[:, list(at)]
+    count = np.isfinite(part).sum(axis=1)
+    return np.where(count > 0, np.nansum(part, axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _mean(values: Float[np.ndarray, "tasks"]) -> float | None:
+    values = values[np.isfinite(values)]
+    return _rounded(values.mean()) if len(values) else None
+
+
+def _interval(values: Float[np.ndarray, "tasks"]) -> dict[str, Any]:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"mean": None, "interval": None}
+    return {"mean": _rounded(values.mean()), "interval": [_rounded(end) for end in mean_interval(values.tolist())]}
+
+
+def _difference(ours: Float[np.ndarray, "tasks"], others: Float[np.ndarray, "tasks"]) -> dict[str, Any]:
+    both = np.isfinite(ours) & np.isfinite(others)
+    if not both.any():
+        return {"difference": None, "interval": None}
+    told = compare_means(ours[both].tolist(), others[both].tolist())
+    return {"difference": _rounded(told["difference"]), "interval": [_rounded(end) for end in told["interval"]]}
+
+
+def _rounded(value: float | np.floating) -> float:
+    return float(f"{value:.6g}")
