@@ -30,7 +30,9 @@ class ReproduceCommand:
     """Folder for report.html, its figures as JSON, its pictures, and the results of all tasks."""
     quick: bool = False
     """A look in a quarter of an hour on two cores: three tasks a cell, short episodes, fewer cells."""
-    only: tuple[Literal["methods", "families", "ablations", "ladder", "factors", "attribution"], ...] = ()
+    only: tuple[
+        Literal["relighting", "video", "methods", "families", "ablations", "ladder", "factors", "attribution"], ...
+    ] = ()
     """Parts of the report; all by default."""
     tasks: int | None = None
     """Tasks of each cell; 3 with --quick, else 100 of the methods with three objects and 50 of all others."""

@@ -6,29 +6,35 @@ quick one, whose episodes are shorter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from osfcore.errors import InvalidInput, check_seed
+from osfcore.experiments.dynamics.video_episodes import VIDEO_METHODS
+from osfcore.experiments.dynamics.video_prediction import CompareVideos, compare_videos
+from osfcore.experiments.fields.relighting import CompareRelighting, compare_relighting
+from osfcore.experiments.image_methods import FIELD_METHODS, common_names
 from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
 from osfcore.experiments.reproduction.charts_of_sections import write_success_bars, write_success_curves
 from osfcore.experiments.reproduction.findings import findings, rows_of
+from osfcore.experiments.reproduction.image_parts import relighting_part, video_part
 from osfcore.experiments.reproduction.measured_cells import MeasuredSection, measure_cells
 from osfcore.experiments.reproduction.page import About, PagePart, check_jinja, write_page
 from osfcore.experiments.reproduction.sections import SECTIONS, Scale, SectionName, sections_of
-from osfcore.experiments.rivals.nerf import nerf_library
+from osfcore.experiments.rivals.fitvid.weights import is_trained
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.paper.stages import paper_field_names
 
 PAGE_FILE, FIGURES_FILE = "report.html", "reproduction.json"
 _CURVES = "success.png"
-PartName = Literal["methods", "families", "ablations", "ladder", "factors", "attribution"]
+PartName = Literal["relighting", "video", "methods", "families", "ablations", "ladder", "factors", "attribution"]
 PARTS: tuple[PartName, ...] = get_args(PartName)
+_TITLES = {"relighting": "Scenes under any light", "video": "Predicted futures"}
+_IMAGE_PARTS = {"relighting": relighting_part, "video": video_part}
 _HEADS = (
     "", "tasks", "2 cm and 0.1 rad", "2 cm", "refused", "6D mean", "with symmetry", "its median", "first frame [mm]",
     "[deg]", "light [deg]", "points against the first row",
@@ -101,34 +107,58 @@ def reproduce(
     for part in config.parts:
         if part not in PARTS:
             raise InvalidInput("part of the report", part, ", ".join(PARTS))
-    names = common_names(config.data_dir, fields, assets) if config.names is None else config.names
+    names = common_names(FIELD_METHODS, config.names, fields, assets, config.data_dir, config.scale.objects)
     config = replace(config, about=replace(config.about, names=names))
-    base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=names)
-    chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
-    measured: tuple[MeasuredSection, ...] = ()
-    for step in measure_cells(sections_of(base, config.scale, chosen), fields, assets, executor):
-        if step.sections is None:
-            yield ReproduceStep(step.done, step.total, f"{step.done} of {step.total} episodes")
-        else:
-            measured = step.sections
-    report = _figures(config, measured)
+    images = yield from _images(config, fields, assets, executor)
+    measured = yield from _episodes(config, fields, assets, executor)
+    report = _figures(config, images, measured)
     write_json(config.folder / FIGURES_FILE, report)
-    write_page(
-        config.folder / PAGE_FILE, config.about, _warnings(config), findings(measured), _parts(config.folder, measured)
-    )
+    parts = [_IMAGE_PARTS[name](config.folder, figures) for name, figures in images.items()]
+    parts += _section_parts(config.folder, measured)
+    write_page(config.folder / PAGE_FILE, config.about, _warnings(config), findings(measured), parts)
     yield ReproduceStep(1, 1, "The report is written", report)
 
 
-def common_names(data_dir: Path, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """Objects with a mesh that all methods have a field of."""
-    known = set(paper_field_names(data_dir)) & set(nerf_library(data_dir).names()) & set(fields.names())
-    return tuple(sorted(name for name in known if assets.has(name)))
+def _images(
+    config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
+) -> Generator[ReproduceStep, None, dict[str, dict[str, Any]]]:
+    """The reports of parts that compare images, by name."""
+    scale, about = config.scale, config.about
+    given = {"names": about.names, "seed": about.seed, "objects": scale.objects}
+    video_methods = tuple(m for m in VIDEO_METHODS if m != "fitvid" or is_trained(config.data_dir))
+    relit = CompareRelighting(config.folder, config.data_dir, tasks=scale.scenes, **given)
+    videos = CompareVideos(config.folder, config.data_dir, tasks=scale.videos, methods=video_methods, **given)
+    comparisons = {
+        "relighting": lambda: compare_relighting(relit, fields, assets, executor),
+        "video": lambda: compare_videos(videos, fields, assets, executor),
+    }
+    reports: dict[str, dict[str, Any]] = {}
+    for name in (part for part in comparisons if part in config.parts):
+        for step in comparisons[name]():
+            yield ReproduceStep(step.done, step.total, f"{_TITLES[name]}: {step.note}")
+            reports[name] = step.report or {}
+    return reports
 
 
-def _figures(config: Reproduce, measured: Sequence[MeasuredSection]) -> dict[str, Any]:
+def _episodes(
+    config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
+) -> Generator[ReproduceStep, None, tuple[MeasuredSection, ...]]:
+    """Episodes of all sections."""
+    base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=config.about.names)
+    chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
+    sections = sections_of(base, config.scale, chosen, has_foresight=is_trained(config.data_dir))
+    measured: tuple[MeasuredSection, ...] = ()
+    for step in measure_cells(sections, fields, assets, executor):
+        yield ReproduceStep(step.done, step.total, f"{step.done} of {step.total} episodes")
+        measured = step.sections or ()
+    return measured
+
+
+def _figures(config: Reproduce, images: Mapping[str, Any], measured: Sequence[MeasuredSection]) -> dict[str, Any]:
     return {
         "about": asdict(config.about),
         "quick": config.is_quick,
+        **images,
         "findings": list(findings(measured)),
         "sections": [
             {
@@ -144,22 +174,24 @@ def _figures(config: Reproduce, measured: Sequence[MeasuredSection]) -> dict[str
     }
 
 
-def _warnings(config: Reproduce) -> tuple[str, ...]:
+def _warnings(config: Reproduce) -> list[str]:
     """What a reader must know before anything else."""
-    if not config.is_quick:
-        return ()
-    scale = config.scale
+    scale, told = config.scale, list[str]()
+    if config.is_quick:
+        told.append(
+            f"A quick look and no measurement: {scale.tasks} tasks a cell, {scale.settings.steps} actions instead of "
+            f"30, plans of {scale.settings.plan.samples} sequences, {scale.objects} objects, and only the factors "
+            f"{', '.join(scale.factors)}. Intervals are as wide as that makes them."
+        )
     left_out = [part for part in PARTS if part not in config.parts]
-    more = f" Parts left out: {', '.join(left_out)}." if left_out else ""
-    return (
-        f"A quick look and no measurement: {scale.tasks} tasks a cell, {scale.settings.steps} actions instead of 30, "
-        f"plans of {scale.settings.plan.samples} sequences, {scale.objects} objects, and only the factors "
-        f"{', '.join(scale.factors)}. Intervals are as wide as that makes them; run it without --quick for figures "
-        f"that mean something.{more}",
-    )
+    if left_out:
+        told.append(f"Parts left out: {', '.join(left_out)}.")
+    if not is_trained(config.data_dir):
+        told.append("FitVid and visual foresight are left out, for no network of theirs is trained on this machine.")
+    return told
 
 
-def _parts(folder: Path, measured: Sequence[MeasuredSection]) -> list[PagePart]:
+def _section_parts(folder: Path, measured: Sequence[MeasuredSection]) -> list[PagePart]:
     parts: list[PagePart] = []
     methods = [section for section in measured if section.section.name == "methods"]
     if methods:

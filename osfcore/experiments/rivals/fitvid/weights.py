@@ -41,6 +41,15 @@ def fitvid_path(data_dir: Path | None) -> Path:
     raise UntrainedFitVid(own[0] if own else Path(_FILE))
 
 
+def is_trained(data_dir: Path | None) -> bool:
+    """Whether there is a network."""
+    try:
+        fitvid_path(data_dir)
+    except UntrainedFitVid:
+        return False
+    return True
+
+
 def fitvid_bytes(model: FitVidModel) -> bytes:
     """A network as the contents of a file; the statistics of batch norm keep their precision."""
     halved = {name for name, _ in model.named_parameters()}

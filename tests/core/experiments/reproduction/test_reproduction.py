@@ -7,7 +7,7 @@ import pytest
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput
 from osfcore.experiments.reproduction.page import About
-from osfcore.experiments.reproduction.reproduction import FIGURES_FILE, PAGE_FILE, Reproduce, common_names, reproduce
+from osfcore.experiments.reproduction.reproduction import FIGURES_FILE, PAGE_FILE, Reproduce, reproduce
 from osfcore.experiments.reproduction.sections import QUICK
 from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.experiments.rivals.fitvid.weights import write_fitvid
@@ -67,7 +67,7 @@ def test_the_page_needs_nothing_beside_it_and_warns_of_little(reported):
     assert all(source.startswith("data:") for source in sources)
     assert "a &lt;machine&gt;" in page
     assert "A quick look and no measurement: 2 tasks a cell" in page
-    assert "Parts left out: families, ablations, ladder" in page
+    assert "Parts left out: relighting, video, families, ablations, ladder." in page
 
 
 def test_findings_compare_methods_on_the_same_tasks(reported):
@@ -100,15 +100,33 @@ def test_another_plan_takes_over_no_episode(library, tmp_path, runs):
 
 def test_progress_counts_episodes(library, tmp_path, runs):
     steps = list(reproduce(config(tmp_path, parts=("attribution",)), FieldLibrary(None), library))
-    assert [step.done for step in steps[:-1]] == list(range(12))
+    assert [step.done for step in steps[:-1]] == list(range(13))
     assert {step.total for step in steps[:-1]} == {12}
-    assert [step.report is None for step in steps] == [True] * 12 + [False]
+    assert [step.report is None for step in steps] == [True] * 13 + [False]
 
 
-def test_objects_are_those_that_all_methods_know(library, tmp_path):
-    names = common_names(tmp_path, FieldLibrary(None), library)
-    assert NAME in names
-    assert "011_banana" not in names
+@pytest.mark.slow
+def test_images_are_compared_as_well(library, tmp_path):
+    few = replace(SMALLEST, scenes=1, videos=1)
+    asked = config(tmp_path, parts=("relighting", "video"), scale=few)
+    (asked.data_dir / "fitvid.safetensors").unlink()
+    report = last(reproduce(asked, FieldLibrary(None), library)).report
+    page = (asked.folder / PAGE_FILE).read_text()
+    assert list(report["relighting"]["methods"]) == ["ours", "paper", "nerf"]
+    assert list(report["video"]["methods"]) == ["copied", "ours", "paper", "nerf"]
+    assert page.count("data:image/png;base64,") == 4
+    assert "FitVid and visual foresight are left out" in page
+    gap = report["relighting"]["against"]["nerf"]["psnr"]["all"]["difference"]
+    assert gap > 3
+    assert f"{gap:.3g} (" in page
+
+
+def test_without_a_network_foresight_is_left_out(library, tmp_path, runs):
+    asked = config(tmp_path, parts=("methods",))
+    (asked.data_dir / "fitvid.safetensors").unlink()
+    report = last(reproduce(asked, FieldLibrary(None), library)).report
+    assert "visual foresight" not in [cell["label"] for cell in report["sections"][0]["cells"]]
+    assert "are left out" in (asked.folder / PAGE_FILE).read_text()
 
 
 @pytest.mark.parametrize(
