@@ -21,6 +21,7 @@ from app.cli.commands.evaluate import Evaluate
 from app.cli.commands.predict import Predict
 from app.cli.commands.record import Record
 from app.cli.commands.render import Render
+from app.cli.commands.reproduce import ReproduceCommand
 from app.cli.commands.serve import Serve
 from app.cli.commands.train import Train
 from osfcore.errors import OsfError
@@ -51,6 +52,9 @@ Commands = Annotated[
     | Annotated[Clip, tyro.conf.subcommand("clip", description="Make a clip of an episode.")]
     | Annotated[Record, tyro.conf.subcommand("record", description="Make the stories that the page plays.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
+    | Annotated[
+        ReproduceCommand, tyro.conf.subcommand("reproduce", description="The paper's experiments in one report.")
+    ]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
     | Annotated[Backup, tyro.conf.subcommand("backup", description="Write all that the service keeps to one zip.")]
     | Annotated[Restore, tyro.conf.subcommand("restore", description="Make a data directory from a backup.")]

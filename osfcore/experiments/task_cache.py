@@ -42,7 +42,7 @@ class TaskCache:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
 
     def read(self, name: str, circumstances: Mapping[str, Any]) -> TaskResult | None:
         """The result of a task, or None if it has to be done (again).
@@ -52,10 +52,10 @@ class TaskCache:
             circumstances: plain JSON that tells everything the result depends on; another one makes it stale.
         """
         try:
-            content = json.loads((self._folder / f"{name}.json").read_text())
+            content = json.loads((self.folder / f"{name}.json").read_text())
             if content["circumstances"] != json.loads(json.dumps(circumstances)):
                 return None
-            arrays = io.BytesIO((self._folder / f"{name}.npz").read_bytes())
+            arrays = io.BytesIO((self.folder / f"{name}.npz").read_bytes())
             with np.load(arrays, allow_pickle=False) as stored:
                 labels, truth, ours = (stored[key] for key in ("labels", "truth", "ours"))
             shown = tuple(Comparison(str(a), b, c) for a, b, c in zip(labels, truth, ours, strict=True))
@@ -81,9 +81,9 @@ class TaskCache:
             truth=np.stack([c.truth for c in result.shown]),
             ours=np.stack([c.ours for c in result.shown]),
         )
-        write_atomically(self._folder / f"{name}.npz", arrays.getvalue())
+        write_atomically(self.folder / f"{name}.npz", arrays.getvalue())
         # Last: where the JSON is, the images are.
-        write_json(self._folder / f"{name}.json", {"circumstances": circumstances, "figures": result.figures})
+        write_json(self.folder / f"{name}.json", {"circumstances": circumstances, "figures": result.figures})
 
 
 def file_sha256(path: Path) -> str:

@@ -9,7 +9,7 @@ where it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -129,24 +129,32 @@ def evaluate_mpc(
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
-    config = replace(config, names=_checked(config, fields, assets))
-    pieces = _pieces(config, fields, assets)
+    pieces = episode_pieces(config, fields, assets)
     total = len(pieces)
     results: list[TaskResult | None] = []
     for results in results_of(pieces, executor):
         done = sum(result is not None for result in results)
         if done < total:
             yield MpcEvaluationStep(done, total, f"{done} of {total} episodes")
-    finished = [result for result in results if result is not None]
-    report = MpcReport(tuple(finished[: config.tasks]), tuple(finished[config.tasks :]))
+    report = episodes_report(config, [result for result in results if result is not None])
     write_pictures(config.folder, report)
+    figures = figures_of(config, report)
+    write_json(config.folder / REPORT_FILE, figures)
+    yield MpcEvaluationStep(total, total, "Everything is measured", figures)
+
+
+def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcReport:
+    """What the results of `episode_pieces` tell, in their order."""
+    return MpcReport(tuple(results[: config.tasks]), tuple(results[config.tasks :]))
+
+
+def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
+    """The figures of a report with what was measured, as plain JSON."""
     about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "cost")}
     variant = config.variant
     about |= {"method": variant.method, "views": variant.views}
     about |= {"ours": sorted(variant.replaced), "truths": sorted(variant.truths)}
-    figures = {**report.to_json(), **about}
-    write_json(config.folder / REPORT_FILE, figures)
-    yield MpcEvaluationStep(total, total, "Everything is measured", figures)
+    return {**report.to_json(), **about}
 
 
 def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
@@ -191,8 +199,18 @@ def _tasks(config: EvaluateMpc) -> TaskSet:
     return TaskSet(config.names or (), config.family, config.objects, config.seed)
 
 
-def _pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
-    """The method's episodes, then the oracle's."""
+def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
+    """The method's episodes, then the oracle's, after everything asked for was found possible.
+
+    Args:
+        config: what to measure.
+        fields: of the objects.
+        assets: meshes for the simulator.
+
+    Raises:
+        UnknownName, MissingAssets, InvalidInput, NoRoom: as `evaluate_mpc` does.
+    """
+    config = replace(config, names=_checked(config, fields, assets))
     settings = replace(config.settings, cost=config.cost, steps=config.actions)
     told_truth = replace(
         config.settings, steps=config.actions, plan=config.oracle_plan, replan_every=_ORACLE_REPLANS_EVERY,
@@ -201,7 +219,8 @@ def _pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> 
     episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
     given, own = _circumstances(config, fields, assets)
     folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
-    method = "-".join(part for part in (config.variant.name(), config.cost, config.factor) if part)
+    parts = (config.variant.name(), config.cost, _plan_name(config.settings.plan), config.factor)
+    method = "-".join(part for part in parts if part)
     kinds: list[tuple[str, dict[str, Any], _Work]]
     if config.variant.method == "foresight":
         plan = config.foresight
@@ -217,6 +236,12 @@ def _pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> 
         for kind, circumstances, work in kinds
         for n in range(config.tasks)
     ]
+
+
+def _plan_name(plan: PlanSettings) -> str:
+    """What tells results of unusual plans from others."""
+    usual = PlanSettings()
+    return "" if plan == usual else f"K{plan.samples}T{plan.horizon}"
 
 
 def _circumstances(

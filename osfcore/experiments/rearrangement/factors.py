@@ -2,7 +2,7 @@
 
 The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 10
 deg and more above the table; a table of one known colour; exact calibration; linear images without noise; exact masks;
-friction as the dynamics were trained on. Objects that nothing was trained on are no factor here but a choice of names.
+friction as the dynamics were trained on; objects that they were trained on.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ class Factor:
         camera_shift_m: by which every camera is moved, each in a direction of its own [m].
         image: what becomes of every image.
         mask_radius_px: by which masks reach too far [px], or not far enough where it is negative.
+        has_unseen_objects: the dynamics are those that were trained without mustard bottle and tuna can, whose shapes
+            are then all that is known of them. Fields are of single objects in any case.
         light_elevation_deg: between which the light stands above the table [deg]; None leaves it where it is.
     """
 
@@ -52,6 +54,7 @@ class Factor:
     camera_shift_m: float = 0.0
     image: ImageChange = "none"
     mask_radius_px: int = 0
+    has_unseen_objects: bool = False
     light_elevation_deg: tuple[float, float] | None = None
 
     def light(self, light: Light, rng: np.random.Generator) -> Light:
@@ -100,6 +103,7 @@ FACTORS: Mapping[str, Factor] = MappingProxyType(
         "friction_2": Factor(Conditions(friction_factor=2.0)),
         "mass_0.5": Factor(Conditions(mass_factor=0.5)),
         "mass_2": Factor(Conditions(mass_factor=2.0)),
+        "objects_unseen": Factor(has_unseen_objects=True),
     }
 )
 

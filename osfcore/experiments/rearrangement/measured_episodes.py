@@ -14,6 +14,9 @@ import numpy as np
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Stepped
 from osfcore.control.scene_models import load_scene_models
+from osfcore.dynamics.network_weights import read_network
+from osfcore.dynamics.push_models import shipped
+from osfcore.dynamics.rollout import PushModel
 from osfcore.experiments.rearrangement.factors import Factor, factor_named
 from osfcore.experiments.rearrangement.methods import Variant, loop_parts
 from osfcore.experiments.rearrangement.own_pushes import Course, prediction_errors
@@ -59,6 +62,8 @@ class MeasuredEpisodes:
         """A task for a method that sees images alone; doubts about its goal are noted and overruled."""
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
+        if self._factor().has_unseen_objects:
+            models = replace(models, dynamics=PushModel(read_network(shipped("pushes_without_two")), models.shapes))
         parts = loop_parts(self.variant, models, drawn.task, self.fields, self.data_dir)
         settings, rng = replace(settings, despite_doubts=True), stream_rng(self.tasks.seed, Stream.EPISODE, number)
         log = _Log(drawn.task, models.symmetries)

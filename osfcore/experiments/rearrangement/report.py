@@ -88,8 +88,8 @@ class MpcReport:
             "steps_median": self._median("steps"),
             **self._own_pushes(),
             **{f"{key}_median": self._median(key) for key in ("goal_mm", "first_mm", "first_deg", "light_deg")},
-            "against_noaction": self._against(nothing),
-            "against_oracle": self._against(self.told_truth) if self.oracle else None,
+            "against_noaction": paired(scores, nothing),
+            "against_oracle": paired(scores, self.told_truth) if self.oracle else None,
             "by_object": _by_object(scores),
             "rejected_layouts": self._rejected(),
         }
@@ -106,16 +106,6 @@ class MpcReport:
         pairs = zip(self.ours, self.shipped, strict=True)
         seconds = [result.figures["robot_s"] for result, score in pairs if score.is_success()]
         return _rounded(np.median(seconds), 2) if seconds else None
-
-    def _against(self, others: Sequence[RearrangementScore]) -> dict[str, Any]:
-        """Paired by task."""
-        told: dict[str, Any] = {}
-        for key in ("success_tight", "success_2cm"):
-            test = _TESTS[key]
-            told[key] = compare_shares([test(score) for score in self.shipped], [test(score) for score in others])
-        for key in ("pose6d", "pose6d_symmetric"):
-            told[key] = compare_means(*([getattr(score, key) for score in them] for them in (self.shipped, others)))
-        return told
 
     def _own_pushes(self) -> dict[str, float | int | None]:
         """How well our own pushes were predicted four actions ahead, from estimated poses."""
@@ -152,6 +142,17 @@ def _figures(scores: Sequence[RearrangementScore], who: str) -> dict[str, Any]:
         told[f"{who}{key}_mean"] = _rounded(np.mean(values), 4) if scores else None
         told[f"{who}{key}_median"] = _rounded(np.median(values), 4) if scores else None
         told[f"{who}{key}_mean_interval"] = [_rounded(end, 4) for end in mean_interval(values)] if scores else None
+    return told
+
+
+def paired(ours: Sequence[RearrangementScore], others: Sequence[RearrangementScore]) -> dict[str, Any]:
+    """Two methods compared task by task: differences with intervals, and McNemar's test of the shares."""
+    told: dict[str, Any] = {}
+    for key in ("success_tight", "success_2cm"):
+        test = _TESTS[key]
+        told[key] = compare_shares([test(score) for score in ours], [test(score) for score in others])
+    for key in ("pose6d", "pose6d_symmetric"):
+        told[key] = compare_means(*([getattr(score, key) for score in them] for them in (ours, others)))
     return told
 
 

@@ -166,7 +166,7 @@ def runs(monkeypatch):
     """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
     made, image = [], np.full((16, 16, 3), 0.5)
 
-    def ours(task, _assets, _models, settings, _rng, _estimators, _factor, *, as_published):
+    def ours(task, _assets, _parts, settings, _rng, _factor, _variant):
         made.append(settings.cost)
         yield Finished(0, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, image, image)
@@ -210,6 +210,10 @@ def test_episodes_are_measured(data_dir, runs, capsys):
         (["--tasks", "0"], "number of tasks is 0"),
         (["--objects", "7"], "between 1 and 6"),
         (["--workers", "0"], "workers"),
+        (["--truths", "goal", "--method", "paper"], "given with method ours alone"),
+        (["--views", "5"], "between 1 and 4"),
+        (["--samples", "7"], "number of samples is 7"),
+        (["--method", "nerf", "--names", "013_apple"], "013_apple"),
     ],
 )
 def test_a_mistake_about_episodes_is_one_sentence(data_dir, runs, tmp_path, capsys, arguments, words):

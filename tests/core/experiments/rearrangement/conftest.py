@@ -61,5 +61,6 @@ def runs(monkeypatch):
     monkeypatch.setattr(measured, "run_told_the_truth", told)
     monkeypatch.setattr(measured, "run_visual_foresight", foresight)
     monkeypatch.setattr(measured, "load_scene_models", lambda *_: SimpleNamespace(symmetries=SYMMETRIES))
-    monkeypatch.setattr(methods, "with_nerfs", lambda models, *_: models)
+    for appearance in ("with_nerfs", "with_paper_stages"):
+        monkeypatch.setattr(methods, appearance, lambda models, *_: models)
     return made

@@ -2,6 +2,7 @@ import json
 from concurrent.futures import Future
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import osfcore.experiments.rearrangement.measured_episodes as measured
@@ -9,6 +10,8 @@ from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.rearrangement.evaluation import REPORT_FILE, EvaluateMpc, evaluate_mpc
 from osfcore.experiments.rearrangement.methods import METHODS, Variant
+from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.experiments.rearrangement.tasks import TaskSet, draw_task
 from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.experiments.rivals.fitvid.weights import write_fitvid
 from osfcore.fields.field_library import FieldLibrary
@@ -145,6 +148,24 @@ def test_methods_differ_by_what_they_take_the_light_for(library, tmp_path, runs,
     report = last(evaluate_mpc(asked, FieldLibrary(None), library)).report
     assert runs == [(method, 0, "pose")]
     assert report["method"] == method
+
+
+def test_unseen_objects_are_predicted_by_a_network_that_was_trained_without_them(library, tmp_path, monkeypatch):
+    given = []
+
+    def ours(task, _assets, parts, *_):
+        given.append(parts.models.dynamics)
+        yield Ended(task.goal, np.zeros((8, 8, 3)), np.zeros((8, 8, 3)))
+
+    monkeypatch.setattr(measured, "run_from_images", ours)
+    state = draw_task(library, TaskSet((NAME,), objects=1), 0).task.start
+    push = np.full((1, 1, 3), [0.2, 0.1, 0.0])
+    state = replace(state, pusher=np.array([*(state.poses.position[0, :2] - [0.06, 0.03]), state.pusher[2]]))
+    for factor in ("", "objects_unseen"):
+        last(evaluate_mpc(config(tmp_path, oracle=False, factor=factor), FieldLibrary(None), library))
+    usual, unseen = (dynamics.rollout(state, push).positions for dynamics in given)
+    assert not np.array_equal(usual, unseen)
+    np.testing.assert_allclose(usual, unseen, atol=0.03)
 
 
 def test_visual_foresight_pushes_until_all_actions_are_done(library, tmp_path, runs):

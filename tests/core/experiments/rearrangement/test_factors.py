@@ -44,7 +44,7 @@ def test_factors_are_those_that_were_asked_for():
     sensor = ("camera_shifted", "noise_2", "jpeg_80", "srgb_8bit", "srgb_8bit_decoded")
     masks = ("masks_eroded_2", "masks_dilated_2")
     contacts = ("friction_0.5", "friction_2", "mass_0.5", "mass_2")
-    assert tuple(FACTORS) == light + table + sensor + masks + contacts
+    assert tuple(FACTORS) == (*light, *table, *sensor, *masks, *contacts, "objects_unseen")
     assert factor_named("jpeg_80") is FACTORS["jpeg_80"]
     with pytest.raises(UnknownName, match="jpeg_80"):
         factor_named("jpeg_50")

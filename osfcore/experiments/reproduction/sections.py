@@ -1,0 +1,202 @@
+"""Which episodes the report shows: sections of cells, each of which is one method on one set of tasks.
+
+All cells with the same family and number of objects get the same tasks, so that any two can be compared task by task.
+Cells that stand in several sections, such as ours in the usual world, are measured once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import MappingProxyType
+from typing import Literal, get_args
+
+from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
+from osfcore.experiments.rearrangement.factors import FACTORS
+from osfcore.experiments.rearrangement.methods import TRUTHS, Variant
+from osfcore.experiments.rearrangement.tasks import Family
+from osfcore.paper.stages import StageName
+from osfcore.planning.mppi import PlanSettings
+
+SectionName = Literal["methods", "families", "ablations", "ladder", "factors", "attribution"]
+SECTIONS: tuple[SectionName, ...] = get_args(SectionName)
+_LADDER: tuple[StageName, ...] = (
+    "estimation",
+    "dynamics",
+    "planning",
+    "fields",
+)  # ours take their places in this order
+_METHODS: Mapping[str, Variant] = MappingProxyType(
+    {
+        "ours": Variant(),
+        "as published": Variant("paper"),
+        "compositional NeRF": Variant("nerf"),
+        "visual foresight": Variant("foresight"),
+        "light overhead": Variant("overhead"),
+        "light known": Variant("known_light"),
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How much is measured.
+
+    Attributes:
+        tasks: of each cell.
+        headline: of the methods with three objects.
+        counts: numbers of objects that the methods are compared with.
+        objects: in the scenes of all other sections.
+        settings: of the episodes.
+        factors: of variation.
+        families: beside `shifted`, with three objects.
+        scenes: that fields are compared on.
+        videos: that predictions are compared on.
+        has_short_plans: also ablate the plans.
+    """
+
+    tasks: int = 50
+    headline: int = 100
+    counts: tuple[int, ...] = (2, 3, 4)
+    objects: int = 3
+    settings: EpisodeSettings = field(default_factory=EpisodeSettings)
+    factors: tuple[str, ...] = tuple(FACTORS)
+    families: tuple[Family, ...] = ("turned", "crowded", "relit")
+    scenes: int = 20
+    videos: int = 20
+    has_short_plans: bool = True
+
+
+_FEW = EpisodeSettings(steps=12, plan=PlanSettings(samples=48, horizon=12))
+QUICK = Scale(
+    tasks=3, headline=3, counts=(2,), objects=2, settings=_FEW, factors=("light_low", "table_wood", "friction_2"),
+    families=(), scenes=3, videos=3, has_short_plans=False,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One method on one set of tasks.
+
+    Attributes:
+        label: in tables and charts.
+        config: what is measured.
+    """
+
+    label: str
+    config: EvaluateMpc
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Cells that are compared.
+
+    Attributes:
+        name: of the section.
+        title: over it.
+        text: that tells what is compared.
+        cells: the first of which all others are compared with.
+    """
+
+    name: SectionName
+    title: str
+    text: str
+    cells: tuple[Cell, ...]
+
+
+def sections_of(
+    base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS, *, has_foresight: bool = True
+) -> tuple[Section, ...]:
+    """All sections with cells, in their order.
+
+    Args:
+        base: where results are kept, the objects to draw from, and the seed.
+        scale: how much is measured.
+        chosen: sections that are shown.
+        has_foresight: whether its network is there.
+    """
+    settings = scale.settings
+    base = replace(
+        base, tasks=scale.tasks, objects=scale.objects, settings=settings, actions=settings.steps, oracle=False
+    )
+    methods = {label: one for label, one in _METHODS.items() if has_foresight or one.method != "foresight"}
+    makers = {
+        "methods": partial(_methods, methods=methods),
+        "families": _families,
+        "ablations": _ablations,
+        "ladder": _ladder,
+        "factors": _factors,
+        "attribution": _attribution,
+    }
+    sections = [section for name in SECTIONS if name in chosen for section in makers[name](base, scale)]
+    return tuple(section for section in sections if len(section.cells) > 1)
+
+
+def _methods(base: EvaluateMpc, scale: Scale, methods: Mapping[str, Variant]) -> list[Section]:
+    sections = []
+    for count in scale.counts:
+        tasks = scale.headline if count == scale.objects else scale.tasks
+        given = replace(base, objects=count, tasks=tasks, oracle=count == scale.objects)
+        cells = [
+            Cell(label, replace(given, variant=variant, oracle=given.oracle and label == "ours"))
+            for label, variant in methods.items()
+        ]
+        title = f"Success by threshold, {count} objects (Fig. 7)"
+        text = (
+            "Closed loops toward a goal image. All methods get the same tasks; compositional NeRFs and the two lights "
+            "take the place of our fields and our estimate of the light in our loop."
+        )
+        sections.append(Section("methods", title, text, tuple(cells)))
+    return sections
+
+
+def _families(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    cells = [Cell(f"goals {family}", replace(base, family=family)) for family in ("shifted", *scale.families)]
+    text = "Harder goals: turned as well, in one another's places, photographed under another light."
+    return [Section("families", "Families of tasks", text, tuple(cells))]
+
+
+def _ablations(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    plan = base.settings.plan
+    cells = [Cell("ours", base)]
+    cells += [Cell(f"{n} view{'s' * (n > 1)}", replace(base, variant=Variant(views=n))) for n in (1, 2)]
+    if scale.has_short_plans:
+        for label, change in (
+            (f"K = {plan.samples // 4}", {"samples": plan.samples // 4}),
+            (f"T = {plan.horizon // 3}", {"horizon": plan.horizon // 3}),
+        ):
+            settings = replace(base.settings, plan=replace(plan, **change))
+            cells.append(Cell(label, replace(base, settings=settings)))
+    cells += [Cell("cost of rendered images", replace(base, cost="image"))]
+    cells += [Cell("light overhead", replace(base, variant=Variant("overhead")))]
+    text = (
+        f"Ours has four views, K = {plan.samples} sequences of T = {plan.horizon} actions and a cost of poses. "
+        "Masks are given in the first frame alone, in all rows."
+    )
+    return [Section("ablations", "Ablations", text, tuple(cells))]
+
+
+def _ladder(base: EvaluateMpc, _scale: Scale) -> list[Section]:
+    cells = [Cell("as published", replace(base, variant=Variant("paper")))]
+    for count in range(1, len(_LADDER)):
+        variant = Variant("paper", frozenset(_LADDER[:count]))
+        cells.append(Cell(f"+ our {_LADDER[count - 1]}", replace(base, variant=variant)))
+    cells.append(Cell(f"+ our {_LADDER[-1]} = ours", base))
+    text = "From the method as published to ours, one stage after another; each row keeps what those above it changed."
+    return [Section("ladder", "The ladder", text, tuple(cells))]
+
+
+def _factors(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    cells = [Cell("usual world", base)] + [Cell(name, replace(base, factor=name)) for name in scale.factors]
+    text = "One thing differs from what the method takes for granted, and it is not told."
+    return [Section("factors", "Factors of variation", text, tuple(cells))]
+
+
+def _attribution(base: EvaluateMpc, _scale: Scale) -> list[Section]:
+    cells = [Cell("ours", base), Cell("true light", replace(base, variant=Variant("known_light")))]
+    cells += [Cell(f"true {truth}", replace(base, variant=Variant(truths=frozenset({truth})))) for truth in TRUTHS]
+    cells.append(Cell("all true", replace(base, variant=Variant(truths=frozenset(TRUTHS)))))
+    text = "Each stage in turn is replaced by the truth: what its errors cost."
+    return [Section("attribution", "Where episodes fail", text, tuple(cells))]
