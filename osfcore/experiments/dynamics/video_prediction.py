@@ -14,7 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from osfcore import control, dynamics, estimation, paper, render, world
+import numpy as np
+from jaxtyping import UInt8
+
+from osfcore import control, dynamics, estimation, metrics, paper, render, world
 from osfcore import fields as fields_room
 from osfcore.dynamics.push_models import network_path
 from osfcore.errors import InvalidInput, check_seed
@@ -44,7 +47,7 @@ from osfcore.random_streams import Stream
 REPORT_FILE, CHART_FILE, IMAGES_FILE = "video.json", "video.png", "video_episode.png"
 HORIZONS = (10, 30)  # steps over which means are told
 MAX_TASKS = 10_000
-_CODE = (control, dynamics, estimation, fields_room, paper, render, rivals, tasks, video_episodes, world)
+_CODE = (control, dynamics, estimation, fields_room, metrics, paper, render, rivals, tasks, video_episodes, world)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +181,7 @@ def _circumstances(
     }
 
 
-def _first_episode(results: Mapping[str, Sequence[TaskResult]]) -> Any:  # noqa: ANN401 - an image
+def _first_episode(results: Mapping[str, Sequence[TaskResult]]) -> UInt8[np.ndarray, "H W 3"]:
     """The first episode: a row for the truth and for each method; some of the steps."""
     shown = {TITLES[method]: part[0].shown for method, part in results.items()}
     first = next(iter(shown.values()))

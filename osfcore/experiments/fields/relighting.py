@@ -14,8 +14,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import UInt8
+
 from osfcore import fields as fields_room
-from osfcore import paper, render, world
+from osfcore import metrics, paper, render, world
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.experiments import image_methods
 from osfcore.experiments.charts import Axis, write_charts
@@ -41,7 +44,7 @@ REPORT_FILE, CHART_FILE, IMAGES_FILE = "relighting.json", "relighting.png", "rel
 ELEVATIONS_DEG = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0)
 ALL = "all"  # the span of all elevations
 MAX_TASKS = 10_000
-_CODE = (composite_scenes, fields_room, image_methods, nerf, paper, relit_scenes, render, world)
+_CODE = (composite_scenes, fields_room, image_methods, metrics, nerf, paper, relit_scenes, render, world)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +161,7 @@ def _circumstances(
     }
 
 
-def _first_scene(results: Mapping[str, Sequence[TaskResult]]) -> Any:  # noqa: ANN401 - an image
+def _first_scene(results: Mapping[str, Sequence[TaskResult]]) -> UInt8[np.ndarray, "H W 3"]:
     """The first scene: a row for each light; the truth, then the methods."""
     shown = [part[0].shown for part in results.values()]
     rows = {lights[0].label: [lights[0].truth, *(one.ours for one in lights)] for lights in zip(*shown, strict=True)}
