@@ -115,6 +115,8 @@ class EvaluateMpcCommand(ParallelEvaluation):
     """Futures are compared with the goal's poses, or rendered and compared with the goal image."""
     oracle: bool = True
     """Also measure the planner that is told the truth."""
+    oracle_samples: int = 96
+    """Sequences of actions in each round of its plans."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.control.episode_settings import EpisodeSettings
@@ -126,7 +128,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
         settings = EpisodeSettings(plan=PlanSettings(samples=self.samples, horizon=self.horizon))
         config = EvaluateMpc(
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,
-            self.factor, self.cost, self.names, self.oracle, settings,
+            self.factor, self.cost, self.names, self.oracle, settings, PlanSettings(samples=self.oracle_samples),
         )  # fmt: skip
         return evaluate_mpc(config, fields, assets, executor)
 

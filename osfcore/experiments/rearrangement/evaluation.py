@@ -219,7 +219,7 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
     episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
     given, own = _circumstances(config, fields, assets)
     folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
-    parts = (config.variant.name(), config.cost, _plan_name(config.settings.plan), config.factor)
+    parts = (config.variant.name(), config.cost, _plan_name(config.settings.plan, PlanSettings()), config.factor)
     method = "-".join(part for part in parts if part)
     kinds: list[tuple[str, dict[str, Any], _Work]]
     if config.variant.method == "foresight":
@@ -230,7 +230,8 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
         work = partial(episodes.from_images, settings=settings)
         kinds = [(method, {**own, "settings": asdict(settings)}, work)]
     if config.oracle:
-        kinds.append(("oracle", {"settings": asdict(told_truth)}, partial(episodes.oracle, settings=told_truth)))
+        told = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, _ORACLE_PLAN)) if part)
+        kinds.append((told, {"settings": asdict(told_truth)}, partial(episodes.oracle, settings=told_truth)))
     return [
         Piece(f"{n:04d}", TaskCache(folder / kind), {**given, **circumstances}, partial(work, n))
         for kind, circumstances, work in kinds
@@ -238,9 +239,8 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
     ]
 
 
-def _plan_name(plan: PlanSettings) -> str:
+def _plan_name(plan: PlanSettings, usual: PlanSettings) -> str:
     """What tells results of unusual plans from others."""
-    usual = PlanSettings()
     return "" if plan == usual else f"K{plan.samples}T{plan.horizon}"
 
 
