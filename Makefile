@@ -33,6 +33,7 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml requirements.lock
 
 $(VENV)/.dev-installed: $(VENV)/.installed
 	@$(PIP) install -q -c requirements.lock -e '.[dev]' || { $(OFFLINE); exit 1; }
+	@$(PIP) install -q -c requirements.lock --no-deps gym-pusht || { $(OFFLINE); exit 1; }
 	@touch $@
 
 # Two processes; one that runs several tests at a time would upset those that watch a browser.

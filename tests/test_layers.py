@@ -51,6 +51,8 @@ OWNERS = {  # who alone may import a package
     "coacd": ("osfcore.geometry.convex_parts",),
     "viser": ("app.viewer", "app.episodes.recording", "app.api.relay"),
     "websockets": ("app.api.relay", "app.viewer.private_server"),
+    "gym_pusht": ("osfcore.experiments.benchmarks.pusht.environment",),
+    "pytorch_mppi": ("osfcore.experiments.benchmarks.pusht.planners",),
     "imageio_ffmpeg": ("app.episodes.frames", "app.episodes.clip.clip"),
     "fastapi": ("app",),
     "uvicorn": ("app",),

@@ -61,7 +61,7 @@ def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Ite
 
 def _alone(pieces: Sequence[Piece], missing: Sequence[int]) -> Iterator[tuple[int, TaskResult]]:
     for n in missing:
-        with _torch_in_one_thread():
+        with torch_in_one_thread():
             result = pieces[n].work()
         yield n, result
 
@@ -88,14 +88,15 @@ def _in_one_thread(work: Callable[[], TaskResult]) -> TaskResult:
     before = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        with _torch_in_one_thread():
+        with torch_in_one_thread():
             return work()
     finally:
         numba.set_num_threads(before)
 
 
 @contextmanager
-def _torch_in_one_thread() -> Iterator[None]:
+def torch_in_one_thread() -> Iterator[None]:
+    """Let torch compute in one thread meanwhile."""
     import torch
 
     before = torch.get_num_threads()

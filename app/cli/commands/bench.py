@@ -139,6 +139,54 @@ class BenchDynamicsCommand(_Benchmark):
         )
 
 
+@dataclass(frozen=True)
+class BenchPlannerCommand(_Benchmark):
+    """Our planner, the paper's and pytorch-mppi's on Push-T, told its true dynamics."""
+
+    FIGURES: ClassVar[str] = "planner.json"
+    tasks: int = 20
+    """Start states."""
+    samples: int = 64
+    """Sequences that each plan looks at."""
+    horizon: int = 15
+    """Actions of 0.2 s in each of them."""
+    steps: int = 50
+    """Actions in an episode at most."""
+    seed: int = 0
+    """The environment's seed of the first task; the others follow."""
+
+    def _measure(self) -> dict[str, Any]:
+        from osfcore.experiments.benchmarks.pusht.comparison import BenchPlanner, bench_planner
+
+        settings = {"samples": self.samples, "horizon": self.horizon, "steps": self.steps, "seed": self.seed}
+        last = follow(bench_planner(BenchPlanner(self.tasks, **settings)))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        return {**settings, **last.report.to_json()}
+
+    def _show(self, result: dict[str, Any]) -> None:
+        _show_planners(result)
+
+
+def _show_planners(result: dict[str, Any]) -> None:
+    print(
+        f"{result['tasks']} tasks, {result['samples']} sequences of {result['horizon']} actions a plan, one thread; "
+        f"coverage at the start {result['start_mean']:.2f}.\n"
+        f"{'planner':14}{'success':>22}{'most coverage':>22}{'median':>8}{'least':>8}{'plans a second':>16}"
+        f"{'plan: mean':>12}{'p90':>8}{'most':>8}{'without dynamics':>18}"
+    )
+    for name, row in result["planners"].items():
+        low, high = (100 * limit for limit in row["success_interval"])
+        success = f"{100 * row['success']:.0f} % ({low:.0f} to {high:.0f})"
+        coverage = "{:.2f} ({:.2f} to {:.2f})".format(row["coverage_mean"], *row["coverage_interval"])
+        times = "".join(f"{row[f'plan_s_{key}']:>{width}.2f}" for key, width in (("mean", 10), ("p90", 6), ("most", 6)))
+        print(
+            f"{name:14}{success:>22}{coverage:>22}{row['coverage_median']:>8.2f}{row['coverage_least']:>8.2f}"
+            f"{row['plan_hz']:>13.1f} Hz{times}"
+            f"{row['own_hz']:>15.0f} Hz"
+        )
+
+
 def _show_render(result: dict[str, Any]) -> None:
     print(
         f"New scene: TinyRenderer {result['tinyrenderer_ms']:.1f} ms, ours {result['scene_ms']:.1f} ms "
@@ -158,6 +206,7 @@ def _show_render(result: dict[str, Any]) -> None:
 Bench = Annotated[
     Annotated[BenchRenderCommand, tyro.conf.subcommand("render")]
     | Annotated[BenchEstimateCommand, tyro.conf.subcommand("estimate")]
-    | Annotated[BenchDynamicsCommand, tyro.conf.subcommand("dynamics")],
+    | Annotated[BenchDynamicsCommand, tyro.conf.subcommand("dynamics")]
+    | Annotated[BenchPlannerCommand, tyro.conf.subcommand("planner")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

@@ -59,9 +59,21 @@ def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "_ 3"]] = ())
     if len(surface) < 4 or np.ptp(surface, axis=0).min() <= 0:
         raise OsfError("A field without any solid part has no shape to predict the motion of.")
     surface = field.origin + field.voxel * surface
-    corners = surface[ConvexHull(surface).vertices]
     solid = np.asarray(ndimage.binary_fill_holes(field.density > SURFACE_G))
     centre = field.origin + field.voxel * np.argwhere(solid).mean(axis=0)
+    return solid_shape(surface[ConvexHull(surface).vertices], centre, parts)
+
+
+def solid_shape(
+    corners: Float[np.ndarray, "M 3"], centre: Float[np.ndarray, "3"], parts: Sequence[Float[np.ndarray, "_ 3"]] = ()
+) -> ObjectShape:
+    """The shape of a solid whose corners are known.
+
+    Args:
+        corners: of its convex hull, in the object's frame [m].
+        centre: of mass [m].
+        parts: corners of convex parts that together fill it; none if its hull is good enough.
+    """
     return ObjectShape(
         half_extents=np.ptp(corners, axis=0) / 2,
         centre=centre,

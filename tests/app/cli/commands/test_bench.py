@@ -1,4 +1,5 @@
 import json
+import sys
 from functools import partial
 
 import pytest
@@ -118,3 +119,28 @@ def test_an_option_that_does_not_apply_is_refused(command, option, capsys):
         main(["bench", command, option, "1"])
     assert stop.value.code == 2
     assert option in capsys.readouterr().err
+
+
+def test_planners_are_compared(tmp_path, capsys):
+    pytest.importorskip("gym_pusht")
+    pytest.importorskip("pytorch_mppi")
+    arguments = ["bench", "planner", "--tasks", "1", "--samples", "16", "--horizon", "2", "--steps", "2"]
+    assert main([*arguments, "--out", str(tmp_path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert list(result["planners"]) == ["ours", "paper", "pytorch_mppi"]
+    assert (result["samples"], result["horizon"], result["steps"], result["seed"]) == (16, 2, 2, 0)
+    assert json.loads((tmp_path / "planner.json").read_text()) == result
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("1 tasks, 16 sequences of 2 actions")
+    assert len(shown.splitlines()) == 5
+    assert main([*arguments, "--tasks", "0"]) == 1
+    assert "number of tasks is 0" in capsys.readouterr().err
+
+
+def test_planners_need_the_benchmark(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gym_pusht", None)
+    monkeypatch.setitem(sys.modules, "gym_pusht.envs.pusht", None)
+    assert main(["bench", "planner"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pip install 'osf-manipulation[pusht]'" in line

@@ -1,0 +1,1 @@
+"""Planners alone, with true dynamics, on the public benchmark Push-T."""
