@@ -18,10 +18,10 @@ from app.cli.commands.collect import Collect
 from app.cli.commands.episode import RunEpisode
 from app.cli.commands.estimate import Estimate
 from app.cli.commands.evaluate import Evaluate
+from app.cli.commands.evaluations.reproduce import ReproduceCommand
 from app.cli.commands.predict import Predict
 from app.cli.commands.record import Record
 from app.cli.commands.render import Render
-from app.cli.commands.reproduce import ReproduceCommand
 from app.cli.commands.serve import Serve
 from app.cli.commands.train import Train
 from osfcore.errors import OsfError

@@ -16,6 +16,7 @@ from osfcore.errors import InvalidInput, MissingAssets
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.experiments.rivals.nerf import load_nerf_appearance, nerf_library
 from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.stages import load_paper_appearance, paper_field_names, paper_field_path
 
@@ -58,8 +59,10 @@ def common_names(
 
     Raises:
         UnknownName, MissingAssets: if an object that is named lacks a field or a mesh.
-        InvalidInput: if there are too few.
+        InvalidInput: if there are too few, or no scene has so many objects.
     """
+    if not 1 <= count <= MAX_OBJECTS:
+        raise InvalidInput("objects in a scene", count, f"between 1 and {MAX_OBJECTS}")
     if names is None:
         libraries = [paper_field_names(data_dir)] if "paper" in methods else []
         libraries += [nerf_library(data_dir).names()] if "nerf" in methods else []

@@ -36,7 +36,6 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.geometry.rollouts import MAX_HORIZON
-from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.inspection.contact_sheet import image_grid
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
@@ -116,7 +115,6 @@ def _checked(config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary) 
     """The same with methods and names in order."""
     for what, value, high in (
         ("number of tasks", config.tasks, MAX_TASKS),
-        ("objects in a scene", config.objects, MAX_OBJECTS),
         ("predicted steps", config.steps, MAX_HORIZON),
     ):
         if not 1 <= value <= high:

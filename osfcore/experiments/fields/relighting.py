@@ -33,7 +33,6 @@ from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, f
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
-from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.inspection.contact_sheet import image_grid
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
@@ -113,12 +112,8 @@ def compare_relighting(
 
 def _checked(config: CompareRelighting, fields: FieldLibrary, assets: AssetLibrary) -> CompareRelighting:
     """The same with methods, names and elevations in order."""
-    for what, value, high in (
-        ("number of tasks", config.tasks, MAX_TASKS),
-        ("objects in a scene", config.objects, MAX_OBJECTS),
-    ):
-        if not 1 <= value <= high:
-            raise InvalidInput(what, value, f"between 1 and {high}")
+    if not 1 <= config.tasks <= MAX_TASKS:
+        raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
     check_seed(config.seed)
     image_side(config.size)
     elevations = tuple(sorted(set(config.elevations_deg)))

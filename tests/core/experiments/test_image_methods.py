@@ -49,6 +49,8 @@ def test_what_cannot_be_shown_by_all_is_told(library, tmp_path):
         common_names(("paper",), ("011_banana",), fields, library, tmp_path, 1)
     with pytest.raises(MissingAssets, match="011_banana"):
         common_names(("ours",), ("011_banana",), fields, library, tmp_path, 1)
+    with pytest.raises(InvalidInput, match="objects in a scene is 9"):
+        common_names(("ours",), None, fields, library, tmp_path, 9)
     with pytest.raises(InvalidInput, match="at least 3"):
         common_names(("ours",), SOLIDS[:2], fields, library, tmp_path, 3)
 
