@@ -33,6 +33,7 @@ STATUS_OF_KIND = {
     "ObjectNeeded": 409,
     "CatalogueObject": 409,
     "MissingFields": 409,
+    "NoPublishedField": 409,
     "NoScene": 409,
     "NoTable": 409,
     "NoTrajectory": 409,

@@ -11,6 +11,7 @@ from pathlib import Path
 from app.storage.field_files import install, uninstall
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
+from osfcore.paper.method import Method, paper_field_names
 
 
 class ShippedField(OsfError):
@@ -34,6 +35,15 @@ class MissingFields(OsfError):
         super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
 
 
+class NoPublishedField(OsfError):
+    """Objects without a field as published."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        super().__init__(
+            f"There is no field as published for {', '.join(names)}; choose our method, or train one under Fields."
+        )
+
+
 class FieldCatalogue:
     """Reads and deletes fields.
 
@@ -43,7 +53,7 @@ class FieldCatalogue:
     """
 
     def __init__(self, data_dir: Path, meshes: Callable[[], Collection[str]]) -> None:
-        self._library = FieldLibrary(data_dir)
+        self._data_dir, self._library = data_dir, FieldLibrary(data_dir)
         self._meshes = meshes
 
     def all(self) -> tuple[FieldInfo, ...]:
@@ -57,6 +67,22 @@ class FieldCatalogue:
     def names(self) -> tuple[str, ...]:
         """Objects with a field."""
         return self._library.names()
+
+    def published(self) -> tuple[str, ...]:
+        """Objects with a field as published."""
+        return paper_field_names(self._data_dir)
+
+    def require(self, names: Collection[str], method: Method) -> None:
+        """Refuse objects that a method cannot recognise.
+
+        Raises:
+            MissingFields: if one has no field at all.
+            NoPublishedField: if one has none as published, and that method wants it.
+        """
+        if missing := sorted(set(names) - set(self.names())):
+            raise MissingFields(missing)
+        if method == "paper" and (missing := sorted(set(names) - set(self.published()))):
+            raise NoPublishedField(missing)
 
     def stamp(self, name: str) -> object:
         """Changes with the field."""

@@ -92,7 +92,8 @@ def use(services: ServicesDep, name: FieldName, body: UseIn) -> FieldOut:
     """Use a field that was trained here, though it is not as good as the one that is in use."""
     _known_field(services, name)
     job = services.runner.jobs.get(body.job, "train_field")
-    if job.params["name"] != name or job.state != "done":
+    is_ours = job.params.get("method", "ours") == "ours"  # one as published is in use anyway, elsewhere
+    if job.params["name"] != name or job.state != "done" or not is_ours:
         raise NoTrainedField(name)
     services.fields.use(name, services.runner.jobs.folder(job.id))
     services.runner.storage.outdate()
@@ -115,6 +116,7 @@ def _out(services: Services, info: FieldInfo) -> FieldOut:
         source=info.source,
         bytes=info.bytes,
         metrics=dict(info.metrics),
+        is_published=info.name in services.fields.published(),
         has_mesh=has_mesh,
         note=None if has_mesh else NEEDS_MESH,
     )
