@@ -25,9 +25,11 @@ class TimeLeft:
 
     Attributes:
         clock: tells the time [s].
+        finds_goal: whether the goal image is looked at for poses.
     """
 
     clock: Callable[[], float] = time.monotonic
+    finds_goal: bool = True
     _now: float = field(init=False)
     _elapsed: float = field(init=False, default=0.0)  # [s], of the whole episode
     _since: dict[str, float] = field(init=False, default_factory=dict)  # when each part began, on `_elapsed`
@@ -41,6 +43,8 @@ class TimeLeft:
     def __post_init__(self) -> None:
         """Begin."""
         self._now = self.clock()
+        if not self.finds_goal:
+            del self._left["goal"]
 
     def go_on(self) -> None:
         """A rest is over."""

@@ -7,11 +7,12 @@ import shutil
 import tempfile
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Literal
 
-from app.storage.field_files import install, uninstall
+from app.storage.field_files import install, uninstall, uninstall_published
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
-from osfcore.paper.method import Method, paper_field_names
+from osfcore.paper.method import Method, own_field_path, paper_field_names
 
 
 class ShippedField(OsfError):
@@ -72,6 +73,12 @@ class FieldCatalogue:
         """Objects with a field as published."""
         return paper_field_names(self._data_dir)
 
+    def origin_of_published(self, name: str) -> Literal["shipped", "trained"] | None:
+        """Where an object's field as published comes from; None if there is none."""
+        if own_field_path(name, self._data_dir).is_file():
+            return "trained"
+        return "shipped" if name in self.published() else None
+
     def require(self, names: Collection[str], method: Method) -> None:
         """Refuse objects that a method cannot recognise.
 
@@ -126,3 +133,14 @@ class FieldCatalogue:
         if self._library.info(name).source != "trained":
             raise ShippedField(name)
         uninstall(self._library.folder(name))
+
+    def remove_published(self, name: str) -> None:
+        """Delete a field as published that was trained here; a shipped one of the same name then counts again.
+
+        Raises:
+            ShippedField: if none was trained here.
+            CannotWrite: if that is not allowed.
+        """
+        if self.origin_of_published(name) != "trained":
+            raise ShippedField(name)
+        uninstall_published(own_field_path(name, self._data_dir))

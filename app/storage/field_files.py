@@ -138,6 +138,19 @@ def install_published(made: Path, weights: Path) -> None:
         raise CannotWrite(weights, error.strerror or str(error)) from error
 
 
+def uninstall_published(weights: Path) -> None:
+    """Delete a field as published and its metrics.
+
+    Raises:
+        CannotWrite: if that is not allowed.
+    """
+    try:
+        for name in (FIELD_FILE, METRICS_FILE):
+            weights.with_suffix(Path(name).suffix).unlink(missing_ok=True)
+    except OSError as error:
+        raise CannotWrite(weights, error.strerror or str(error)) from error
+
+
 def uninstall(place: Path) -> None:
     """Delete a field's folder, in one piece.
 

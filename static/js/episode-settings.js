@@ -21,7 +21,7 @@ const COSTS = {
 };
 const METHODS = {
   ours: "It finds where things should be in the goal image, and plans pushes toward that.",
-  paper: "It compares rendered futures with the goal image, anew for each push. It never knows how far things are from their goals.",
+  paper: "The method of the paper: it compares rendered futures with the goal image, anew for each push. It never knows how far things are from their goals.",
 };
 const FINE = 1000; // places of a slider
 

@@ -39,7 +39,7 @@ function reason(changes = {}) {
   const missing = fields ? scene.objects.filter(({ name }) => !fields.some((field) => field.name === name)) : [];
   if (missing.length) return `No field has been learned of ${missing.map(({ label }) => label).join(", ")}; train one under Fields.`;
   if (!chosenSettings()) return "A setting cannot be used; see Settings.";
-  const unpublished = fields && isPublished() ? scene.objects.filter(({ name }) => !fields.find((field) => field.name === name).is_published) : [];
+  const unpublished = fields && isPublished() ? scene.objects.filter(({ name }) => !fields.find((field) => field.name === name).published) : [];
   if (unpublished.length) return `There is no field as published of ${unpublished.map(({ label }) => label).join(", ")}; choose our method in Settings, or train one under Fields.`;
   if (known("check")?.refused && !{ ...chosenSettings(), ...changes }.despite_doubts) return known("check").text;
   return "";

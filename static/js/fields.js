@@ -33,16 +33,24 @@ function entry(field) {
       el("span", { className: "title", textContent: field.label, title: field.name }),
       field.source === "trained" ? deleteButton(field.name) : null),
     el("span", { className: "state", textContent: quality }),
-    el("span", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}${field.is_published ? "; also one as published" : ""}` }),
+    el("span", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}` }),
+    published(field),
     field.has_mesh ? null : el("span", { className: "missing", textContent: "needs a mesh for scenes", title: field.note }),
   );
   item.dataset.field = field.name;
   return item;
 }
 
-function deleteButton(name) {
+/** What is told of a field as published beside ours; null if there is none. */
+function published({ name, published: origin }) {
+  if (!origin) return null;
+  const text = `Also as published, ${origin === "trained" ? "trained here" : "shipped"}`;
+  return el("div", { className: "row" }, el("span", { className: "hint", textContent: text }), origin === "trained" ? deleteButton(name, "?method=paper") : null);
+}
+
+function deleteButton(name, query = "") {
   return doubted(el("button", { type: "button", className: "plain danger", textContent: "Delete" }), "Really delete", async () => {
-    await remove(`fields/${encodeURIComponent(name)}`);
+    await remove(`fields/${encodeURIComponent(name)}${query}`);
     await refreshFields();
   });
 }

@@ -113,7 +113,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         loop = Episode(world, models, wanted, settings, rng, prepared=prepared)
     else:
         loop = _Published(world, models, image, settings, rng)
-    progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft()
+    progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
     pictures = LookPictures(models.appearance.together, wanted)
     for event in loop.run():
         for change in place.orders.changes():
