@@ -38,6 +38,7 @@ STATUS_OF_KIND = {
     "NoTable": 409,
     "NoTrajectory": 409,
     "NoClip": 409,
+    "GoalUnknown": 409,
     "EpisodeGoesOn": 409,
     "NotDriving": 409,
     "NoRoomToNudge": 409,

@@ -541,5 +541,5 @@ def test_an_episode_keeps_its_method_and_the_one_as_published_all_else(episodes,
 
 
 def test_what_never_knew_goal_poses_becomes_no_clip(episodes, runner, published):
-    with pytest.raises(GoalUnknown, match="see the video"):
+    with pytest.raises(GoalUnknown, match="watch the video"):
         episodes.make_clip(runner.jobs.put(published.id, state="done"))
