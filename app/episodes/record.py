@@ -20,6 +20,7 @@ from app.episodes.trajectory import write_trajectory
 from app.episodes.trajectory_recorder import TrajectoryRecorder
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.goal import GoalImage
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_atomically, write_json
@@ -30,6 +31,7 @@ from osfcore.io.state_file import estimated_to_json
 from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
+from osfcore.paper.method import Method
 
 
 class Table(Protocol):
@@ -54,6 +56,8 @@ class About:
         goal: how the table truly should be; None where nobody knows.
         moved: objects that truly should move, where that is known.
         symmetries: which orientations of the objects look the same.
+        method: whose.
+        image: the goal, where a method looks at the image alone: it finds no poses in it.
     """
 
     seed: int
@@ -61,6 +65,8 @@ class About:
     goal: SceneState | None
     moved: tuple[str, ...]
     symmetries: Mapping[str, Symmetry]
+    method: Method = "ours"
+    image: GoalImage | None = None
 
 
 class EpisodeRecord:
@@ -77,6 +83,7 @@ class EpisodeRecord:
         self._folder, self._table, self._about = folder, table, about
         self._views: Float[np.ndarray, "V h w 3"] | None = None
         self._goal: GoalFound | None = None
+        self._image = about.image
         self._steps: list[dict[str, Any]] = []
         self._notices: list[dict[str, Any]] = []
         self._began = time.perf_counter()
@@ -86,6 +93,8 @@ class EpisodeRecord:
         self._course = TrajectoryRecorder(self._start)
         for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
             left.unlink()
+        if about.image is not None:
+            self._keep_image(about.image)
 
     @property
     def states(self) -> list[SceneState]:
@@ -104,7 +113,7 @@ class EpisodeRecord:
                 self._views = event.observation.images
             case GoalFound():
                 self._goal = event
-                write_png(self._folder / GOAL_FILE, to_uint8(event.image))
+                self._keep_image(GoalImage(event.camera, event.image))
             case ActionExecuted():
                 self._actions.append(event.action.tolist())
             case Noticed():
@@ -136,18 +145,22 @@ class EpisodeRecord:
         self._write_csv()
         return report
 
+    def _keep_image(self, goal: GoalImage) -> None:
+        self._image = goal
+        write_png(self._folder / GOAL_FILE, to_uint8(goal.image))
+
     def _step_entry(self, event: Stepped) -> dict[str, Any]:
-        """A step as the report has it; lengths in mm, angles in degrees."""
-        assert self._goal is not None
+        """A step as the report has it; lengths in mm, angles in degrees; None for what is not known."""
+        assert self._image is not None
         truth, estimate = self._table.truth(), event.estimate
         off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
         entry = {
             "step": event.number,
             "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
             "image_cost": event.image_cost,
-            "ssim": round(ssim(self._goal.image, event.rendered), 4),
-            "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m),
-            "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)),
+            "ssim": round(ssim(self._image.image, event.rendered), 4),
+            "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m) if event.offsets_m.size else None,
+            "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
             "estimate_off_mm": _by_name(truth.names, 1000 * off),
             "light_off_deg": round(float(np.rad2deg(estimate.state.light.angle_to(truth.light))), 3),
             "estimate": estimated_to_json(estimate),
@@ -158,19 +171,19 @@ class EpisodeRecord:
         return entry
 
     def _draw(self, event: Stepped) -> None:
-        assert self._goal is not None
+        assert self._image is not None
         assert self._views is not None
-        camera = self._goal.camera
+        camera = self._image.camera
         scale = TILE_PX / max(camera.width, camera.height)
         now = self._table.photo(camera.resized(round(scale * camera.width), round(scale * camera.height)))
         title = f"step {event.number} of {event.steps}"
-        picture = frame(self._goal.image, now, event.rendered, self._views, title)
+        picture = frame(self._image.image, now, event.rendered, self._views, title)
         write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps) - 1:03d}.png", picture)
 
     def _write_csv(self) -> None:
         names = self._start.names
         keys = ("to_goal_mm", "to_goal_deg", "estimate_off_mm", "truly_to_goal_mm")
-        present = [key for key in keys if self._steps and key in self._steps[0]]
+        present = [key for key in keys if self._steps and self._steps[0].get(key) is not None]
         stages = ("first", "goal", "estimate", "plan", "act")
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
@@ -191,6 +204,7 @@ class EpisodeRecord:
             "seconds": round(time.perf_counter() - self._began, 2),
             "seed": about.seed,
             "objects": list(self._start.names),
+            "method": about.method,
             "settings": asdict(about.settings),
             "goal": None if self._goal is None else _goal_to_json(self._goal),
             "noticed": self._notices,

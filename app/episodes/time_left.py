@@ -20,25 +20,31 @@ class TimeLeft:
     """The share of an episode that is over, from its events.
 
     A look takes a usual time, or what its steps so far predict, by the share that is over; pushing goes on until
-    the sum of the offsets from the goal is gone at the mean rate so far. A rest that ends with `go_on` does not count.
+    the sum of the offsets from the goal is gone at the mean rate so far, or to the last push where offsets are not
+    known. A rest that ends with `go_on` does not count.
 
     Attributes:
         clock: tells the time [s].
+        finds_goal: whether the goal image is looked at for poses.
     """
 
     clock: Callable[[], float] = time.monotonic
+    finds_goal: bool = True
     _now: float = field(init=False)
     _elapsed: float = field(init=False, default=0.0)  # [s], of the whole episode
     _since: dict[str, float] = field(init=False, default_factory=dict)  # when each part began, on `_elapsed`
     _left: dict[str, float] = field(init=False, default_factory=lambda: dict(_LOOK_S))
     _first_off_m: float = field(init=False, default=0.0)
     _off_m: float = field(init=False, default=0.0)
+    _is_blind: bool = field(init=False, default=False)  # offsets are not known
     _pushes: int = field(init=False, default=0)
     _share: float = field(init=False, default=0.0)
 
     def __post_init__(self) -> None:
         """Begin."""
         self._now = self.clock()
+        if not self.finds_goal:
+            del self._left["goal"]
 
     def go_on(self) -> None:
         """A rest is over."""
@@ -62,7 +68,7 @@ class TimeLeft:
                 self._look(look, event)
             case Stepped():
                 self._left.clear()
-                self._off_m = float(event.offsets_m.sum())
+                self._off_m, self._is_blind = float(event.offsets_m.sum()), event.offsets_m.size == 0
                 self._first_off_m = self._first_off_m or self._off_m
             case ActionExecuted(number):
                 self._since.setdefault("push", self._elapsed)
@@ -83,7 +89,7 @@ class TimeLeft:
     def _pushing(self, most: int) -> float:
         """Time for the pushes that are still needed [s]."""
         gained = self._first_off_m - self._off_m
-        needed = max(_PUSHES - self._pushes, 1.0)
+        needed = most if self._is_blind else max(_PUSHES - self._pushes, 1.0)
         if self._pushes > _FEW and gained > 0:
             needed = self._off_m / (gained / self._pushes)
         spent = self._elapsed - self._since.get("push", self._elapsed)

@@ -17,6 +17,7 @@ from app.processes.messages.neural_messages import Order, Predicted, PredictPush
 from app.processes.process_server import IsOvertaken, ProcessServer
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
+from osfcore.paper.method import Method
 
 if TYPE_CHECKING:
     from osfcore.dynamics.dynamics_model import DynamicsModel
@@ -53,7 +54,7 @@ class PushPredictor:
             raise TypeError(f"{type(order).__name__} is no prediction")
         if is_overtaken():
             return None
-        model = self._model(order.state.names)
+        model = self._model(order.state.names, order.method)
         start = time.perf_counter()
         rollouts = model.rollout(order.state, order.actions, order.before)
         took_s = time.perf_counter() - start
@@ -61,14 +62,19 @@ class PushPredictor:
             raise OsfError("The prediction runs out of all bounds, so there is none; begin with objects on the table.")
         return Predicted(rollouts, took_s)
 
-    def _model(self, names: tuple[str, ...]) -> DynamicsModel:
-        from osfcore.dynamics.push_models import load_push_model, network_path
+    def _model(self, names: tuple[str, ...], method: Method) -> DynamicsModel:
+        if method == "paper":
+            from osfcore.paper.dynamics.rollout import load_paper_push_model as load
+            from osfcore.paper.dynamics.weights import weights_path as network
+        else:
+            from osfcore.dynamics.push_models import load_push_model as load
+            from osfcore.dynamics.push_models import network_path as network
 
         chosen = tuple(sorted(names))
         stamps = [_stamp(self._fields.folder(name) / FIELD_FILE) for name in chosen]
-        key = (chosen, *stamps, _stamp(network_path(self._data_dir)))
+        key = (method, chosen, *stamps, _stamp(network(self._data_dir)))
         if key not in self._models:
-            self._models[key] = load_push_model(self._data_dir, self._fields, chosen)
+            self._models[key] = load(self._data_dir, self._fields, chosen)
             while len(self._models) > _MOST_MODELS:
                 self._models.popitem(last=False)
         self._models.move_to_end(key)

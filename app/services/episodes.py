@@ -11,23 +11,34 @@ from typing import Any
 
 from app.episodes.file_names import GOAL_FILE, PREPARED_FILE
 from app.jobs.job import Job, JobPage
-from app.jobs.kinds.episodes import settings_of
+from app.jobs.kinds.episodes import method_of, settings_of
+from app.processes.messages.scene_messages import ComposeGoal
 from app.services.episode_results import EpisodeResults
 from app.services.examples.stories import Stories
-from app.services.fields import FieldCatalogue, MissingFields
+from app.services.fields import FieldCatalogue
 from app.services.goals.goal_checks import GoalChecks
-from app.services.goals.goals import Goals, NoTable
+from app.services.goals.goals import GOAL_SIDE, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
 from app.storage.goal_store import Poses, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput, OsfError, check_seed
+from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import unit_quaternion
+from osfcore.io.files import write_atomically
 from osfcore.io.scene_file import camera_to_json
+from osfcore.paper.method import Method
+from osfcore.paper.mppi import GaussianPlanSettings
 
 KIND, CLIP_KIND = "episode", "clip"
 _MOST_NAMES = 1000  # that a new one is compared with
 _PLAN = ("samples", "horizon", "temperature")
+_FIXED = {  # of the method as published: what it is called, and what it cannot but be
+    "cost": ("cost", "image"),
+    "replan_every": ("actions of each plan", 1),
+    "planning": ("planning", True),
+    "acting": ("acting", True),
+}
 
 
 class NoGoal(OsfError):
@@ -44,6 +55,15 @@ class EpisodeGoesOn(OsfError):
         super().__init__("The episode goes on; a clip can be made when it is over.")
 
 
+class GoalUnknown(OsfError):
+    """A clip of an episode that looked at images alone."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "A clip shows distances to the goal, which the method as published never knows; watch the video."
+        )
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class AskedEpisode:
     """What to do.
@@ -53,7 +73,8 @@ class AskedEpisode:
         goal: identifier of a goal image; None where poses are given.
         poses: where all objects shall be; None where a goal image is named.
         seed: of the searches.
-        settings: changes of the defaults, see `EpisodeSettings` and `PlanSettings`.
+        settings: changes of the method's defaults, see `defaults`.
+        method: whose; the one as published looks at the goal as an image alone.
     """
 
     scene: str | None = None
@@ -61,6 +82,7 @@ class AskedEpisode:
     poses: Poses | None = None
     seed: int = 0
     settings: Mapping[str, Any] = field(default_factory=dict)
+    method: Method = "ours"
 
 
 class Episodes(EpisodeResults):
@@ -87,7 +109,7 @@ class Episodes(EpisodeResults):
         Raises:
             NoTable, UnknownName: if there is no such scene or goal.
             NoGoal: if there is neither goal nor poses, or both.
-            MissingFields: if an object cannot be recognised.
+            MissingFields, NoPublishedField: if an object cannot be recognised.
             GoalRefused: if the goal image does not show the scene's objects, unless doubts are not to matter.
             InvalidInput: if a setting is out of range, or the poses are not those of the scene's objects.
             QueueFull: if too many jobs wait.
@@ -98,9 +120,8 @@ class Episodes(EpisodeResults):
         if scene is None:
             raise NoTable
         names = self._runner.scene(scene).state.names
-        if missing := sorted(set(names) - set(self._fields.names())):
-            raise MissingFields(missing)
-        settings = nested(asked.settings)
+        self._fields.require(names, asked.method)
+        settings = nested(asked.settings, asked.method)
         despite_doubts = settings_of(settings).despite_doubts
         if asked.goal is not None and asked.poses is None and not despite_doubts:
             self._checks.require(asked.goal, scene)
@@ -110,6 +131,7 @@ class Episodes(EpisodeResults):
                 "title": self._new_name(asked, names),
                 "names": list(names),
                 "seed": asked.seed,
+                "method": asked.method,
                 "settings": settings,
                 "goal": self._goal(asked, scene, names, folder),
             }
@@ -121,10 +143,16 @@ class Episodes(EpisodeResults):
         """Let an episode go on with other settings.
 
         Raises:
-            InvalidInput: if one is out of range.
+            InvalidInput: if one is out of range, or another method, or the method as published, which goes as it began.
             WrongJobState: if the episode neither runs nor pauses.
         """
-        merged = nested({**flat(self.settings(job)), **settings})
+        own = method_of(job.params)
+        if (method := settings.get("method", own)) != own:
+            raise InvalidInput("method", method, f"{own}, as when the episode began")
+        if own == "paper":
+            raise InvalidInput("change of settings", "asked for", "left out: the method as published goes as it began")
+        given = {key: value for key, value in settings.items() if key != "method"}
+        merged = nested({**flat(self.settings(job)), **given})
         settings_of(merged)
         return self._runner.jobs.change(job.id, {"settings": merged})
 
@@ -135,7 +163,10 @@ class Episodes(EpisodeResults):
         try:
             folder.mkdir(parents=True)
             if asked.goal is None:
-                poses = poses_to_json(_of_all(asked.poses or (), names))
+                given = _of_all(asked.poses or (), names)
+                if asked.method == "paper":
+                    return self._rendered(given, scene, folder)
+                poses = poses_to_json(given)
                 return {"id": None, "camera": None, "poses": poses, "truth": poses}
             goal = self._goals.get(asked.goal)
             shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
@@ -148,17 +179,27 @@ class Episodes(EpisodeResults):
         truth = poses_to_json(goal.poses) if is_known and goal.poses is not None else None
         return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": None, "truth": truth}
 
+    def _rendered(self, poses: Poses, scene: str, folder: Path) -> dict[str, Any]:
+        """A goal that was given as poses, as the image that a method wants which knows of nothing else."""
+        made = self._runner.compose(ComposeGoal(scene, poses, size=GOAL_SIDE))
+        write_atomically(folder / GOAL_FILE, made.png)
+        camera = camera_to_json(goal_camera(GOAL_SIDE))
+        return {"id": None, "camera": camera, "poses": None, "truth": poses_to_json(made.poses)}
+
     def make_clip(self, job: Job) -> Job:
         """Queue the job that makes a clip of an episode; the one that is at it already, if there is one.
 
         Raises:
             NoTrajectory: if the episode cannot be drawn again.
             EpisodeGoesOn: if it is not over yet.
+            GoalUnknown: if it never knew goal poses.
             QueueFull: if too many jobs wait.
             StorageFull: if nothing more may be written.
         """
         if not job.is_finished:
             raise EpisodeGoesOn
+        if method_of(job.params) == "paper":
+            raise GoalUnknown
         self.trajectory(job)
         for other in self._runner.jobs.live(CLIP_KIND):
             if other.params["episode"] == job.id:
@@ -229,11 +270,28 @@ class Episodes(EpisodeResults):
         return settings_of(job.params["settings"])
 
 
-def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as a job has them, those of the plan by themselves; what is left out is as by default."""
-    given = {**flat(EpisodeSettings()), **settings}
+def nested(settings: Mapping[str, Any], method: Method = "ours") -> dict[str, Any]:
+    """Settings as a job has them, those of the plan by themselves; what is left out is as by default.
+
+    Raises:
+        InvalidInput: if one means something that the method does not have.
+    """
+    given = {**defaults(method), **settings}
+    if method == "paper":
+        for key, (what, only) in _FIXED.items():
+            if given[key] != only:
+                raise InvalidInput(what, given[key], f"{only} with the method as published")
     own = {key: value for key, value in given.items() if key not in _PLAN}
     return {**own, "plan": {key: given[key] for key in _PLAN}}
+
+
+def defaults(method: Method) -> dict[str, Any]:
+    """What settings are where nothing is said, as `flat` tells them."""
+    if method == "ours":
+        return flat(EpisodeSettings())
+    plan = GaussianPlanSettings()
+    own = {key: only for key, (_, only) in _FIXED.items()} | {key: getattr(plan, key) for key in _PLAN}
+    return {**flat(EpisodeSettings()), **own}
 
 
 def flat(settings: EpisodeSettings) -> dict[str, Any]:

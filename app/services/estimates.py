@@ -16,12 +16,23 @@ import numpy as np
 from starlette.concurrency import run_in_threadpool
 
 from app.jobs.job import Job, JobPage
-from app.jobs.kinds.estimates import OBSERVATION, PRIOR, STATE, STEPS, TRUTH, Mode, read_steps, state_of_step
+from app.jobs.kinds.estimates import (
+    OBSERVATION,
+    PRIOR,
+    STATE,
+    STEPS,
+    TRUTH,
+    Mode,
+    check_method,
+    read_steps,
+    state_of_step,
+)
 from app.processes.messages.neural_messages import CompareView
-from app.services.fields import FieldCatalogue, MissingFields
+from app.services.fields import FieldCatalogue
 from app.services.runner import Runner
+from app.services.uploaded_observations import ARCHIVE, Uploaded, check_fits, examine, names_for_people
 from app.storage.uploads import Examiner, save
-from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName, check_seed
+from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import SceneState
@@ -31,9 +42,9 @@ from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson
 from osfcore.io.scene_file import read_scene, state_to_json
 from osfcore.io.state_file import EstimateJson, read_estimated, write_estimated
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.method import Method
 
 KIND = "estimate"
-_ARCHIVE = "observation.zip"
 
 
 class NoScene(OsfError):
@@ -70,25 +81,16 @@ class Asked:
     mode: Mode = "first"
     seed: int = 0
     prior: str | None = None
+    method: Method = "ours"
 
+    def check(self) -> None:
+        """Refuse what cannot be.
 
-@dataclass(frozen=True, slots=True)
-class Uploaded:
-    """What was found in an uploaded observation.
-
-    Attributes:
-        names: of the objects.
-        cameras: their names.
-        has_masks: whether it tells visible pixels.
-        unseen: objects whose masks are all empty.
-        has_prior: whether a state of how the objects lie came with it.
-    """
-
-    names: tuple[str, ...]
-    cameras: tuple[str, ...]
-    has_masks: bool
-    unseen: tuple[str, ...]
-    has_prior: bool
+        Raises:
+            InvalidInput: if the seed is out of range, or a method cannot do the mode.
+        """
+        check_seed(self.seed)
+        check_method(self.mode, self.method)
 
 
 class Estimates:
@@ -102,7 +104,7 @@ class Estimates:
     def __init__(self, runner: Runner, fields: FieldCatalogue) -> None:
         self._runner = runner
         self._fields = fields
-        self._examiner: Examiner[Uploaded] = Examiner(examine, "observation", _names, _ARCHIVE)
+        self._examiner: Examiner[Uploaded] = Examiner(examine, "observation", names_for_people, ARCHIVE)
 
     def stop(self) -> None:
         """End the process that looks at an upload, if there is one. Calling it again does nothing."""
@@ -115,17 +117,16 @@ class Estimates:
 
         Raises:
             NoScene, UnknownName: if there is no such scene.
-            MissingFields: if an object in it cannot be recognised.
+            MissingFields, NoPublishedField: if an object in it cannot be recognised.
             NoPrior: if an earlier estimate is needed and there is none.
             QueueFull: if too many jobs wait.
         """
-        check_seed(asked.seed)
+        asked.check()
         scene = scene or self._runner.current
         if scene is None:
             raise NoScene
         names = self._runner.scene(scene).state.names
-        if missing := sorted(set(names) - set(self._fields.names())):
-            raise MissingFields(missing)
+        self._fields.require(names, asked.method)
         prior = None if asked.mode == "first" else self._prior(asked, names, scene)
         with self._runner.jobs.new_inputs() as folder:
             is_goal = asked.mode == "goal"
@@ -152,10 +153,10 @@ class Estimates:
             NoPrior: if an earlier estimate is needed and there is none.
             QueueFull, StorageFull: if too many jobs wait, or nothing more may be written.
         """
-        check_seed(asked.seed)
+        asked.check()
         await run_in_threadpool(self._runner.storage.check_room)
         with self._runner.jobs.new_inputs() as folder:
-            await save(chunks, folder / _ARCHIVE)
+            await save(chunks, folder / ARCHIVE)
             uploaded = await self._examiner.examine(folder)
             return await run_in_threadpool(self._of_examined, asked, uploaded, folder, file_name)
 
@@ -164,7 +165,8 @@ class Estimates:
         for name in uploaded.names:
             if name not in known:
                 raise UnknownName("field", name, known)
-        _check_fits(asked.mode, uploaded)
+        self._fields.require(uploaded.names, asked.method)
+        check_fits(asked.mode, uploaded)
         if asked.mode != "first" and not (uploaded.has_prior and asked.prior is None):
             write_estimated(folder / PRIOR, self._prior(asked, uploaded.names, None))
         of = {"scene": None, "revision": None, "file_name": file_name}
@@ -173,7 +175,8 @@ class Estimates:
     def _submit(
         self, asked: Asked, of: dict[str, Any], names: tuple[str, ...], cameras: tuple[str, ...], folder: Path
     ) -> Job:
-        params = {"mode": asked.mode, "seed": asked.seed, "of": of, "names": list(names), "cameras": list(cameras)}
+        how = {"mode": asked.mode, "method": asked.method, "seed": asked.seed}
+        params = {**how, "of": of, "names": list(names), "cameras": list(cameras)}
         return self._runner.submit_with_inputs(KIND, params, folder)
 
     def _prior(self, asked: Asked, names: tuple[str, ...], scene: str | None) -> EstimatedState:
@@ -272,56 +275,6 @@ class Estimates:
 
     def _state(self, job: Job) -> EstimatedState:
         return read_estimated(self._runner.jobs.folder(job.id) / STATE)
-
-
-def examine(folder: Path) -> Uploaded:
-    """Unpack `observation.zip` of a folder to `observation` beside it and judge it, as `osf check` does.
-
-    Raises:
-        OsfError: if it is no sound observation.
-    """
-    from osfcore.io.archives import unpack_observation
-    from osfcore.io.observation_file import read_observation
-
-    place = unpack_observation(folder / _ARCHIVE, folder / OBSERVATION)
-    (folder / _ARCHIVE).unlink()
-    observation = read_observation(place)
-    unseen = (
-        ()
-        if observation.masks is None
-        else tuple(n for i, n in enumerate(observation.names) if not observation.masks[:, i].any())
-    )
-    has_prior = (place / PRIOR).is_file()
-    if has_prior:
-        prior = read_estimated(place / PRIOR)
-        if set(prior.state.names) != set(observation.names):
-            raise InvalidInput("objects of prior.json", ", ".join(prior.state.names), ", ".join(observation.names))
-        try:
-            (place / PRIOR).rename(folder / PRIOR)
-        except OSError as error:
-            raise CannotWrite(folder, error.strerror or str(error)) from error
-    return Uploaded(
-        observation.names, tuple(c.name for c in observation.cameras), observation.masks is not None, unseen, has_prior
-    )
-
-
-def _names(folder: Path) -> dict[str, str]:
-    """What the uploader calls the places in a folder."""
-    return {
-        f"{folder / _ARCHIVE}": "The uploaded file",
-        f"{folder / OBSERVATION}/": "",
-        f"{folder / OBSERVATION}": "The uploaded observation",
-    }
-
-
-def _check_fits(mode: Mode, uploaded: Uploaded) -> None:
-    """Refuse at once what the estimator would refuse."""
-    if mode == "first" and not uploaded.has_masks:
-        raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
-    if mode == "first" and uploaded.unseen:
-        raise InvalidInput(f"mask of {uploaded.unseen[0]}", "empty in every view", "not empty in at least one view")
-    if mode == "goal" and len(uploaded.cameras) != 1:
-        raise InvalidInput("number of views of a goal", len(uploaded.cameras), "1")
 
 
 def _observation(folder: Path) -> ObservationJson:

@@ -7,10 +7,12 @@ import shutil
 import tempfile
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Literal
 
-from app.storage.field_files import install, uninstall
+from app.storage.field_files import install, uninstall, uninstall_published
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
+from osfcore.paper.method import Method, own_field_path, paper_field_names
 
 
 class ShippedField(OsfError):
@@ -34,6 +36,15 @@ class MissingFields(OsfError):
         super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
 
 
+class NoPublishedField(OsfError):
+    """Objects without a field as published."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        super().__init__(
+            f"There is no field as published for {', '.join(names)}; choose our method, or train one under Fields."
+        )
+
+
 class FieldCatalogue:
     """Reads and deletes fields.
 
@@ -43,7 +54,7 @@ class FieldCatalogue:
     """
 
     def __init__(self, data_dir: Path, meshes: Callable[[], Collection[str]]) -> None:
-        self._library = FieldLibrary(data_dir)
+        self._data_dir, self._library = data_dir, FieldLibrary(data_dir)
         self._meshes = meshes
 
     def all(self) -> tuple[FieldInfo, ...]:
@@ -57,6 +68,28 @@ class FieldCatalogue:
     def names(self) -> tuple[str, ...]:
         """Objects with a field."""
         return self._library.names()
+
+    def published(self) -> tuple[str, ...]:
+        """Objects with a field as published."""
+        return paper_field_names(self._data_dir)
+
+    def origin_of_published(self, name: str) -> Literal["shipped", "trained"] | None:
+        """Where an object's field as published comes from; None if there is none."""
+        if own_field_path(name, self._data_dir).is_file():
+            return "trained"
+        return "shipped" if name in self.published() else None
+
+    def require(self, names: Collection[str], method: Method) -> None:
+        """Refuse objects that a method cannot recognise.
+
+        Raises:
+            MissingFields: if one has no field at all.
+            NoPublishedField: if one has none as published, and that method wants it.
+        """
+        if missing := sorted(set(names) - set(self.names())):
+            raise MissingFields(missing)
+        if method == "paper" and (missing := sorted(set(names) - set(self.published()))):
+            raise NoPublishedField(missing)
 
     def stamp(self, name: str) -> object:
         """Changes with the field."""
@@ -100,3 +133,14 @@ class FieldCatalogue:
         if self._library.info(name).source != "trained":
             raise ShippedField(name)
         uninstall(self._library.folder(name))
+
+    def remove_published(self, name: str) -> None:
+        """Delete a field as published that was trained here; a shipped one of the same name then counts again.
+
+        Raises:
+            ShippedField: if none was trained here.
+            CannotWrite: if that is not allowed.
+        """
+        if self.origin_of_published(name) != "trained":
+            raise ShippedField(name)
+        uninstall_published(own_field_path(name, self._data_dir))

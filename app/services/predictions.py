@@ -17,6 +17,7 @@ from app.services.runner import Runner
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.rollouts import check_actions
 from osfcore.geometry.states import SceneState
+from osfcore.paper.method import Method
 
 
 class NothingToPush(OsfError):
@@ -62,6 +63,7 @@ class Predictions:
         actions: Float[np.ndarray, "K T 3"],
         key: str | None = None,
         before: SceneState | None = None,
+        method: Method = "ours",
     ) -> Future[NeuralAnswer]:
         """Ask where actions would lead; the future tells a Predicted, or None where a newer order of the key overtook.
 
@@ -70,6 +72,7 @@ class Predictions:
             actions: velocities of the pusher [m/s].
             key: of who asks, if only the latest question of theirs counts.
             before: the same objects one action ago, if something may still be moving.
+            method: whose model predicts.
 
         Raises:
             InvalidInput: if there are no objects or no pusher, other objects before, or actions are out of range.
@@ -86,4 +89,4 @@ class Predictions:
         missing = [name for name in state.names if name not in known]
         if missing:
             raise MissingFields(missing)
-        return self._link.submit(PredictPushes(key or uuid.uuid4().hex, state, actions, before))
+        return self._link.submit(PredictPushes(key or uuid.uuid4().hex, state, actions, before, method))

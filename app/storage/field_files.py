@@ -1,7 +1,8 @@
 """Where training a field for the service leaves its files, and how a finished field is put in place.
 
 The workshop DATA_DIR/training/NAME holds images and checkpoint while NAME is being trained; it outlives a service or a
-job that was killed, so that the same order goes on from there. A finished field moves to DATA_DIR/fields/NAME.
+job that was killed, so that the same order goes on from there. A finished field moves to DATA_DIR/fields/NAME,
+one as published to DATA_DIR/paper_fields/NAME.safetensors.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from app.storage.durable import sync, sync_tree
 from app.storage.usage import folder_bytes
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from osfcore.io.files import write_atomically
 
 _ORDER = "order.json"
 _TEMPORARY_PREFIX = ".writing-"
@@ -120,6 +122,33 @@ def install(made: Path, place: Path) -> None:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
         raise CannotWrite(place, error.strerror or str(error)) from error
+
+
+def install_published(made: Path, weights: Path) -> None:
+    """Copy a field as published from `made` to the file `weights`, and its metrics beside it as JSON.
+
+    Raises:
+        CannotWrite: if the disk is full or the folder cannot be written.
+    """
+    try:
+        weights.parent.mkdir(parents=True, exist_ok=True)
+        for name in (METRICS_FILE, FIELD_FILE):  # what is looked for comes last
+            write_atomically(weights.with_suffix(Path(name).suffix), (made / name).read_bytes())
+    except OSError as error:
+        raise CannotWrite(weights, error.strerror or str(error)) from error
+
+
+def uninstall_published(weights: Path) -> None:
+    """Delete a field as published and its metrics.
+
+    Raises:
+        CannotWrite: if that is not allowed.
+    """
+    try:
+        for name in (FIELD_FILE, METRICS_FILE):
+            weights.with_suffix(Path(name).suffix).unlink(missing_ok=True)
+    except OSError as error:
+        raise CannotWrite(weights, error.strerror or str(error)) from error
 
 
 def uninstall(place: Path) -> None:

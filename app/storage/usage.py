@@ -18,6 +18,7 @@ _PATIENCE_S = 1.0  # longer than that, no request waits for a new figure
 FOLDERS = {  # kinds by their folder in the data directory; "other" is what else is there
     "objects": "objects",
     "fields": "fields",
+    "paper_fields": "fields",
     "goals": "goals",
     "sets": "sets",
     "collections": "jobs",

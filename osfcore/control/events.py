@@ -104,7 +104,7 @@ class Stepped:
         number: actions executed so far.
         steps: at most.
         estimate: where everything is now.
-        offsets_m: of each object from where it should be, on the table's plane [m].
+        offsets_m: of each object from where it should be, on the table's plane [m]; empty where that is not known.
         offsets_rad: likewise its orientation [rad].
         image_cost: mean squared difference between the goal image and the estimate rendered under its light.
         rendered: that rendering.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,7 +12,6 @@ from jaxtyping import Float
 
 from osfcore.control.estimators import Estimators
 from osfcore.control.scene_models import SceneModels
-from osfcore.errors import UnknownName
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.fields.field_library import FieldLibrary
@@ -22,11 +20,11 @@ from osfcore.paper.dynamics.rollout import load_paper_push_model
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first, estimate_next
 from osfcore.paper.fields.tiny_field import TinyField
 from osfcore.paper.fields.weights import read_field
+from osfcore.paper.method import paper_field_path
 from osfcore.paper.rendering.renderer import PaperRenderer
 
 StageName = Literal["fields", "estimation", "dynamics", "planning"]
 STAGES: tuple[StageName, ...] = get_args(StageName)
-_FOLDER = "paper_fields"
 
 
 @dataclass(frozen=True)
@@ -55,30 +53,6 @@ class PaperEstimators(Estimators):
     ) -> Iterator[EstimateStep]:
         """Poses and light of a frame without masks."""
         return estimate_next(models, observation, expected, rng, self.cma)
-
-
-def paper_field_path(name: str, data_dir: Path | None) -> Path:
-    """Where an object's KiloOSF as published lies: DATA_DIR/paper_fields/NAME.safetensors, else the package's.
-
-    Raises:
-        UnknownName: if there is none.
-    """
-    for folder in _field_folders(data_dir):
-        path = folder / f"{name}.safetensors"
-        if path.is_file():
-            return path
-    raise UnknownName("field as published", name, paper_field_names(data_dir))
-
-
-def paper_field_names(data_dir: Path | None) -> tuple[str, ...]:
-    """Objects with a KiloOSF as published, in order."""
-    return tuple(sorted({path.stem for folder in _field_folders(data_dir) for path in folder.glob("*.safetensors")}))
-
-
-def _field_folders(data_dir: Path | None) -> tuple[Path, ...]:
-    """Where to look, in this order."""
-    shipped = Path(str(files("osfcore.paper") / "shipped" / "fields"))
-    return (shipped,) if data_dir is None else (data_dir / _FOLDER, shipped)
 
 
 def load_paper_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:

@@ -8,7 +8,7 @@ import { byId, el } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { takeSettings } from "./episode-settings.js";
 import { LIVE } from "./jobs.js";
-import { farthest, parts } from "./run-summary.js";
+import { NOT_KNOWN, farthest, offsets, parts } from "./run-summary.js";
 import { resetScene } from "./scenes.js";
 import { current, known, set } from "./state.js";
 import { scrollTo } from "./tabs.js";
@@ -16,6 +16,7 @@ import { act, tellFailure, toast } from "./toasts.js";
 
 const MOST = 100; // that are offered
 const SETTINGS = {
+  method: "Method",
   cost: "Cost", horizon: "Horizon, actions", samples: "Samples", temperature: "Temperature", steps: "Pushes at most",
   replan_every: "Replan every, actions", planning: "Plan", acting: "Act", despite_doubts: "Despite doubts",
 };
@@ -25,7 +26,7 @@ let at = 0; // the step that is on view
 let offeredFor = ""; // the episode for which the list was fetched
 
 const path = (id) => `episodes/${encodeURIComponent(id)}`;
-const told = (value) => ({ true: "yes", false: "no" })[value] ?? String(value);
+const told = (value) => ({ true: "yes", false: "no", paper: "as published" })[value] ?? String(value);
 
 /** The other episodes that have steps, those toward the same goal first. */
 async function offer() {
@@ -35,7 +36,7 @@ async function offer() {
   const others = episodes.filter(({ id, done, status }) => id !== mine.id && done > 0 && !LIVE.has(status));
   const isRival = ({ goal, scene }) => goal === mine.goal && scene === mine.scene;
   const option = (episode) => el("option", {
-    value: episode.id, textContent: `${episode.name}: ${episode.settings.cost} cost, ${episode.settings.samples} samples, ${episode.done} pushes`,
+    value: episode.id, textContent: `${episode.name}: ${episode.settings.method === "paper" ? "as published" : `${episode.settings.cost} cost`}, ${episode.settings.samples} samples, ${episode.done} pushes`,
   });
   const group = (label, list) => (list.length ? el("optgroup", { label }, ...list.map(option)) : null);
   byId("beside-select").replaceChildren(...[
@@ -75,9 +76,9 @@ function draw() {
     if (byId(id).getAttribute("src") !== url) byId(id).src = url;
   }
   const lines = [["this run", mine], [other.name, other]].map(([label, { steps }], i) => ({
-    label, colour: COLOURS[i], values: steps.map((step) => [step.step, farthest(step)]),
+    label, colour: COLOURS[i], values: steps.filter(offsets).map((step) => [step.step, farthest(step)]),
   }));
-  drawLines(byId("beside-chart"), lines, { unit: "mm", at, name: "Farthest object from its goal" });
+  drawLines(byId("beside-chart"), lines, { unit: "mm", at, name: "Farthest object from its goal", none: NOT_KNOWN });
   drawLegend(byId("beside-key"), lines);
 }
 

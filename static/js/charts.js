@@ -64,9 +64,9 @@ function chartIn(node, series, unit, isBars) {
   return chart;
 }
 
-function draw(node, series, { unit, at, name }, isBars) {
+function draw(node, series, { unit, at, name, none }, isBars) {
   const steps = [...new Set(series.flatMap(({ values }) => values.map(([step]) => step)))].sort((a, b) => a - b);
-  if (!steps.length) return empty(node, name);
+  if (!steps.length) return empty(node, name, none);
   const chart = chartIn(node, series, unit, isBars);
   const rows = series.map(({ values }) => { const own = new Map(values); return steps.map((step) => own.get(step) ?? null); });
   // What is stacked is drawn from the highest sum down, so that each layer covers what is not its own.
@@ -85,10 +85,10 @@ export const drawLines = (node, series, options) => draw(node, series, options, 
 /** Stacked bars: [{ label, colour, values: [[step, value]] }], the same steps in each. */
 export const drawBars = (node, series, options) => draw(node, series, options, true);
 
-function empty(node, name) {
+function empty(node, name, why = "comes with the first steps") {
   drop(node);
-  node.replaceChildren(el("p", { className: "hint" }, "comes with the first steps"));
-  node.setAttribute("aria-label", `${name}; no steps yet`);
+  node.replaceChildren(el("p", { className: "hint" }, why));
+  node.setAttribute("aria-label", `${name}; ${why}`);
 }
 
 export function drawLegend(node, series) {

@@ -18,7 +18,7 @@ export function drawClip(episode = shown) {
   const isLive = LIVE.has(job?.state);
   const isThere = !isLive && (job?.state === "done" || shown.files.includes(FILE));
   const url = `api/episodes/${encodeURIComponent(shown.id)}/files/${FILE}`;
-  byId("make-clip").hidden = isLive || isThere;
+  byId("make-clip").hidden = isLive || isThere || shown?.settings.method === "paper"; // it shows distances to the goal
   byId("save-clip").hidden = byId("clip").hidden = !isThere;
   if (isThere && byId("clip").getAttribute("src") !== url) {
     byId("clip").src = url;

@@ -3,7 +3,7 @@ import { drawClip } from "./clip.js";
 import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
 import { LIVE } from "./jobs.js";
-import { length, offsets, summary } from "./run-summary.js";
+import { NOT_KNOWN, length, offsets, summary } from "./run-summary.js";
 import { current, known, labelOf, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { toast } from "./toasts.js";
@@ -17,8 +17,8 @@ let shown = null;
 function missing({ objects, steps }) {
   const last = steps.at(-1);
   return objects.flatMap((name) => {
-    const far = offsets(last)[name];
-    const turned = last.to_goal_deg[name];
+    const far = offsets(last)?.[name] ?? 0; // what is not known is not told as missing
+    const turned = last.to_goal_deg?.[name] ?? 0;
     if (far <= NEAR_MM && turned <= TURNED_DEG) return [];
     const parts = [far > NEAR_MM && `${length(far)} away`, turned > TURNED_DEG && `turned by ${turned.toFixed(0)}°`].filter(Boolean);
     return [`${labelOf(name)} is still ${parts.join(" and ")}`];
@@ -27,6 +27,7 @@ function missing({ objects, steps }) {
 
 function why(episode) {
   if (episode.outcome === "refused") return "Nothing was moved, since the goal image is doubtful.";
+  if (!offsets(episode.steps.at(-1))) return `How far things are from their goals is ${NOT_KNOWN}.`;
   const left = missing(episode);
   if (!left.length) return "";
   return `${left.join("; ")}.`;

@@ -12,12 +12,16 @@ const SLIDERS = [
   { name: "samples", label: "Samples", title: "How many futures are predicted in each round", low: 16, high: 1024, isLog: true },
   { name: "temperature", label: "Temperature", title: "How much worse futures count: small keeps the best alone", low: 0.001, high: 1, isLog: true },
   { name: "steps", label: "Pushes at most", title: "Of 0.2 s each", low: 1, high: 100 },
-  { name: "replan_every", label: "Replan after, actions", title: "Actions that are executed of each plan", low: 1, high: 10 },
+  { name: "replan_every", label: "Replan after, actions", title: "Actions that are executed of each plan", low: 1, high: 10, isOurs: true },
 ];
 const SWITCHES = ["planning", "acting", "despite_doubts"];
 const COSTS = {
   pose: "Futures are compared with where the objects should be: fast.",
   image: "Futures are rendered and compared with the goal image, as in the paper: slower.",
+};
+const METHODS = {
+  ours: "It finds where things should be in the goal image, and plans pushes toward that.",
+  paper: "The method of the paper: it compares rendered futures with the goal image, anew for each push. It never knows how far things are from their goals.",
 };
 const FINE = 1000; // places of a slider
 
@@ -44,6 +48,7 @@ export function chosenSettings() {
   if (!offered || !form().checkValidity()) return null;
   const { elements } = form();
   return {
+    method: elements.method.value,
     cost: elements.cost.value,
     ...Object.fromEntries(SLIDERS.map(({ name }) => [name, elements[name].valueAsNumber])),
     ...Object.fromEntries(SWITCHES.map((name) => [name, elements[name].checked])),
@@ -58,13 +63,26 @@ function fill(settings) {
   }
   for (const name of SWITCHES) elements[name].checked = settings[name];
   elements.cost.value = settings.cost;
+  elements.method.value = settings.method;
   tell();
 }
 
 function tell() {
-  const { cost, samples, steps } = form().elements;
+  const { method, cost, samples, steps } = form().elements;
+  const isPaper = method.value === "paper";
+  byId("method-hint").textContent = METHODS[method.value];
   byId("cost-hint").textContent = COSTS[cost.value];
-  byId("settings-facts").textContent = `${cost.value} cost, ${samples.value} samples, ${steps.value} pushes`;
+  byId("settings-facts").textContent = `${isPaper ? "as published" : `${cost.value} cost`}, ${samples.value} samples, ${steps.value} pushes`;
+  for (const node of form().querySelectorAll(".ours-only")) node.hidden = isPaper; // the other method has no such thing
+  // An episode keeps its method, and the one as published all else, too.
+  for (const element of form().elements) element.disabled = Boolean(live()) && (isPaper || element === method);
+}
+
+/** Another method begins with its own defaults. */
+function changeMethod({ target }) {
+  if (!offered || target !== form().elements.method) return;
+  const { method, despite_doubts: doubts } = form().elements;
+  fill({ ...(method.value === "paper" ? offered.published : offered.defaults), despite_doubts: doubts.checked });
 }
 
 /** A change by hand: at once, where an episode runs. */
@@ -78,14 +96,16 @@ function change() {
 }
 
 function row(slider) {
-  const { name, label, title } = slider;
+  const { name, label, title, isOurs } = slider;
   const number = el("input", { type: "number", name, id: `setting-${name}`, step: isWhole(name) ? 1 : "any", required: true });
   const range = el("input", { type: "range", id: `slide-${name}`, min: 0, max: FINE, step: 1, attributes: { "aria-label": `${label}, slider` } });
   range.addEventListener("input", () => { number.value = valueAt(slider, Number(range.value)); });
   number.addEventListener("input", () => { if (number.value > 0) range.value = share(slider, number.valueAsNumber); });
   const caption = el("label", { textContent: label, title });
   caption.htmlFor = number.id;
-  return [caption, range, number];
+  const nodes = [caption, range, number];
+  if (isOurs) for (const node of nodes) node.classList.add("ours-only");
+  return nodes;
 }
 
 /** Takes over the settings of another run; one that runs keeps its own. */
@@ -128,6 +148,7 @@ export function setUpEpisodeSettings() {
   byId("settings-sliders").append(...SLIDERS.flatMap(row));
   form().addEventListener("submit", (event) => event.preventDefault());
   form().addEventListener("input", tell);
+  form().addEventListener("change", changeMethod);
   form().addEventListener("change", change);
   byId("despite-doubts").addEventListener("change", change); // it stands where doubts are told, outside the form
   byId("settings-defaults").addEventListener("click", () => {
@@ -140,6 +161,7 @@ export function setUpEpisodeSettings() {
   watch("episode", (job) => {
     if (LIVE.has(before) && !LIVE.has(job?.state)) takeBack();
     before = job?.state;
+    tell();
   });
   watch("report", () => {
     if (offered && running() && !changes.isBusy && !form().contains(document.activeElement)) fill(running().settings);

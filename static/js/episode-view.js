@@ -8,6 +8,7 @@ import { drawEnding } from "./ending.js";
 import { preload, setUpPictures, showFrame, standIn } from "./pictures.js";
 import { drawProgress, setUpProgress } from "./progress-charts.js";
 import { drawResults } from "./results.js";
+import { NOT_KNOWN, offsets } from "./run-summary.js";
 import { current, inWords, known, labelOf, set, watch } from "./state.js";
 import { scrollTo } from "./tabs.js";
 import { Timeline } from "./timeline.js";
@@ -26,6 +27,7 @@ let isLive = true; // whether the 3D view is left on the live table
 
 const NOTE_MS = 300;
 const PREPARED = "What it found in table and photo was prepared with this example; from the first push on, all is live.";
+const PUBLISHED = "This is the method as published.";
 const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
 const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
 const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
@@ -108,7 +110,8 @@ function drawHead(episode) {
   byId("shown-outcome").textContent = text;
   byId("shown-outcome").dataset.state = state;
   const isPrepared = episode.notices.some(({ matter }) => matter === "prepared");
-  byId("shown-text").textContent = inWords(episode.text ?? "") || (isPrepared ? PREPARED : "");
+  const told = [episode.settings.method === "paper" && PUBLISHED, inWords(episode.text ?? "") || (isPrepared && PREPARED)];
+  byId("shown-text").textContent = told.filter(Boolean).join(" ");
   byId("shown-text").hidden = !byId("shown-text").textContent;
   byId("shown-error").textContent = inWords(episode.error ?? "");
   byId("shown-error").hidden = !episode.error;
@@ -152,11 +155,12 @@ function drawStep(at) {
   byId("shown-likeness").title = step ? `PSNR and SSIM of goal image and rendered estimate; image cost ${step.image_cost.toPrecision(3)}` : "";
   const knowsTruth = shown.steps.some((other) => other.estimate_off_mm);
   byId("estimate-off-head").hidden = !knowsTruth;
-  byId("to-go-head").title = knowsTruth ? "True distance to where it should be, which only the simulation knows" : "Distance to where it should be, as estimated";
+  const far = step && offsets(step);
+  byId("to-go-head").title = step?.truly_to_goal_mm ? "True distance to where it should be, which only the simulation knows"
+    : `Distance to where it should be, ${step && !far ? NOT_KNOWN : "as estimated"}`;
   byId("offset-rows").replaceChildren(...shown.objects.map((name) => {
-    const far = step && (step.truly_to_goal_mm ?? step.to_goal_mm)[name];
-    const cells = [far, step?.to_goal_deg[name], ...(knowsTruth ? [step?.estimate_off_mm?.[name]] : [])];
-    const row = el("tr", {}, el("td", { textContent: labelOf(name) }), ...cells.map((value) => el("td", { textContent: one(value) })));
+    const cells = [far, step?.to_goal_deg, ...(knowsTruth ? [step?.estimate_off_mm] : [])];
+    const row = el("tr", {}, el("td", { textContent: labelOf(name) }), ...cells.map((of) => el("td", { textContent: of ? one(of[name]) : step ? "–" : "" })));
     row.dataset.object = name;
     return row;
   }));

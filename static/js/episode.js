@@ -24,6 +24,8 @@ const path = (what = "") => `episodes/${live().id}${what}`;
 
 // Starting
 
+const isPublished = () => chosenSettings()?.method === "paper";
+
 /** Why an episode cannot start now; "" if it can. */
 function reason(changes = {}) {
   const scene = current();
@@ -37,6 +39,8 @@ function reason(changes = {}) {
   const missing = fields ? scene.objects.filter(({ name }) => !fields.some((field) => field.name === name)) : [];
   if (missing.length) return `No field has been learned of ${missing.map(({ label }) => label).join(", ")}; train one under Fields.`;
   if (!chosenSettings()) return "A setting cannot be used; see Settings.";
+  const unpublished = fields && isPublished() ? scene.objects.filter(({ name }) => !fields.find((field) => field.name === name).published) : [];
+  if (unpublished.length) return `There is no field as published of ${unpublished.map(({ label }) => label).join(", ")}; choose our method in Settings, or train one under Fields.`;
   if (known("check")?.refused && !{ ...chosenSettings(), ...changes }.despite_doubts) return known("check").text;
   return "";
 }
@@ -58,7 +62,7 @@ export function startEpisode(changes = {}) {
 function drawStart() {
   const why = reason();
   byId("start-episode").disabled = why !== "";
-  byId("start-reason").textContent = why || "It looks, plans and pushes until the table looks like the goal.";
+  byId("start-reason").textContent = why || `It looks, plans and pushes ${isPublished() ? "as often as Settings say" : "until the table looks like the goal"}.`;
 }
 
 // Controls

@@ -23,14 +23,14 @@ let details = null;
 // Asking
 
 async function start() {
-  const { mode, seed } = form().elements;
-  await post("estimates", { mode: mode.value, seed: Number(seed.value) });
+  const { mode, seed, method } = form().elements;
+  await post("estimates", { mode: mode.value, seed: Number(seed.value), method: method.value });
 }
 
 async function send(blob, name) {
   const bar = byId("observation-bar");
-  const { mode, seed } = form().elements;
-  const query = new URLSearchParams({ mode: mode.value, seed: seed.value, file_name: name.slice(-200) });
+  const { mode, seed, method } = form().elements;
+  const query = new URLSearchParams({ mode: mode.value, seed: seed.value, method: method.value, file_name: name.slice(-200) });
   bar.hidden = false;
   bar.value = 0;
   try {
@@ -60,7 +60,8 @@ function draw(job) {
   const isLive = LIVE.has(job.state);
   const of = job.params.of.file_name ?? "the scene";
   byId("estimating").dataset.state = job.state;
-  byId("estimating-title").textContent = { first: `First frame of ${of}`, next: `Next frame of ${of}`, goal: `Goal view of ${of}` }[job.params.mode];
+  const what = { first: `First frame of ${of}`, next: `Next frame of ${of}`, goal: `Goal view of ${of}` }[job.params.mode];
+  byId("estimating-title").textContent = `${what}${job.params.method === "paper" ? ", as published" : ""}`;
   byId("estimating-stage").textContent = isLive ? (job.result?.stage ?? "") : "";
   byId("estimating-bar").hidden = !isLive;
   byId("estimating-bar").value = job.total ? job.done / job.total : 0;

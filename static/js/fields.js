@@ -34,15 +34,23 @@ function entry(field) {
       field.source === "trained" ? deleteButton(field.name) : null),
     el("span", { className: "state", textContent: quality }),
     el("span", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}` }),
+    published(field),
     field.has_mesh ? null : el("span", { className: "missing", textContent: "needs a mesh for scenes", title: field.note }),
   );
   item.dataset.field = field.name;
   return item;
 }
 
-function deleteButton(name) {
+/** What is told of a field as published beside ours; null if there is none. */
+function published({ name, published: origin }) {
+  if (!origin) return null;
+  const text = `Also as published, ${origin === "trained" ? "trained here" : "shipped"}`;
+  return el("div", { className: "row" }, el("span", { className: "hint", textContent: text }), origin === "trained" ? deleteButton(name, "?method=paper") : null);
+}
+
+function deleteButton(name, query = "") {
   return doubted(el("button", { type: "button", className: "plain danger", textContent: "Delete" }), "Really delete", async () => {
-    await remove(`fields/${encodeURIComponent(name)}`);
+    await remove(`fields/${encodeURIComponent(name)}${query}`);
     await refreshFields();
   });
 }
@@ -115,7 +123,7 @@ async function deleteSet() {
 // Training
 
 async function train() {
-  const { mesh, set, name, images, minutes, seed, hollow } = form().elements;
+  const { mesh, set, name, images, minutes, seed, method, hollow } = form().elements;
   const isMesh = source() === "mesh";
   if (isMesh && !mesh.value) throw new Error("No meshes are on this machine yet; fetch objects first.");
   if (!isMesh && !set.value) throw new Error("Upload a zip with an image set first.");
@@ -125,7 +133,8 @@ async function train() {
     source: isMesh ? { mesh: mesh.value } : { set: set.value },
     minutes: Number(minutes.value),
     seed: Number(seed.value),
-    hollow: hollow.checked,
+    method: method.value,
+    hollow: hollow.checked && method.value === "ours",
     ...(isMesh ? { images: Number(images.value) } : {}),
   };
   showJob(await post("jobs", { kind: "train_field", params }));
@@ -155,7 +164,7 @@ function drawTraining(job) {
   const result = job.result ?? {};
   const label = objects().find((object) => object.name === job.params.name)?.label ?? job.params.name;
   byId("training").dataset.state = job.state;
-  byId("training-title").textContent = label;
+  byId("training-title").textContent = `${label}${job.params.method === "paper" ? ", as published" : ""}`;
   byId("training-title").title = titleText(job);
   byId("training-psnr").textContent = Number.isFinite(result.psnr_mask) ? psnrText(result) : "";
   byId("training-bar").hidden = !LIVE.has(job.state);
@@ -208,7 +217,7 @@ function drawPreview(address) {
 
 function tellEnd(job, label) {
   if (job.state === "done") {
-    if (job.result?.in_use !== false) toast(`The field of ${label} is ready.`);
+    if (job.result?.in_use !== false) toast(`The field ${job.params.method === "paper" ? "as published " : ""}of ${label} is ready.`);
     refreshFields();
   } else if (job.state === "failed") {
     toast(job.error, "error");
@@ -218,6 +227,9 @@ function tellEnd(job, label) {
 function drawSource() {
   byId("from-mesh").hidden = source() !== "mesh";
   byId("from-set").hidden = source() !== "set";
+  const isPaper = form().elements.method.value === "paper";
+  byId("hollow-choice").hidden = isPaper;
+  byId("published-hint").hidden = !isPaper;
   form().elements.images.disabled = source() !== "mesh"; // what is hidden must not hold the form up
   drawTime();
 }

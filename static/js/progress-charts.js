@@ -2,13 +2,14 @@
 import { drawBars, drawLegend, drawLines, stepAt } from "./charts.js";
 import { COLOURS } from "./curves.js";
 import { byId } from "./dom.js";
+import { NOT_KNOWN, offsets } from "./run-summary.js";
 import { labelOf } from "./state.js";
 
 const STAGES = [["estimate", "look", COLOURS[0]], ["search", "search", COLOURS[4]], ["plan", "plan", COLOURS[1]], ["act", "act", COLOURS[2]]];
 const MILLI = 1000;
 const ACTION_S = 0.2;
 
-const distance = (step, name) => (step.truly_to_goal_mm ?? step.to_goal_mm)[name];
+const distance = (step, name) => offsets(step)?.[name];
 
 function distances({ objects, steps }) {
   return objects.map((name, i) => ({
@@ -34,9 +35,11 @@ function realTime(spent) {
 export function drawProgress(episode, at) {
   const { steps } = episode;
   const far = distances(episode);
-  drawLines(byId("chart-distance"), far, { unit: "mm", at, name: "Distance to the goal" });
-  drawLegend(byId("key-distance"), far);
-  byId("distance-kind").textContent = steps.length ? (steps[0].truly_to_goal_mm ? "true, of each object" : "as estimated, of each object") : "";
+  const isKnown = steps.length > 0 && offsets(steps[0]);
+  const none = steps.length && !isKnown ? NOT_KNOWN : undefined;
+  drawLines(byId("chart-distance"), far, { unit: "mm", at, name: "Distance to the goal", none });
+  drawLegend(byId("key-distance"), none ? [] : far);
+  byId("distance-kind").textContent = isKnown ? (steps[0].truly_to_goal_mm ? "true, of each object" : "as estimated, of each object") : "";
   const cost = steps.map(({ step, image_cost: value }) => [step, MILLI * value]);
   drawLines(byId("chart-cost"), [{ label: "image cost", colour: COLOURS[0], values: cost }], { unit: "10⁻³", at, name: "Image cost" });
   const spent = times(episode);

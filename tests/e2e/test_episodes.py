@@ -268,3 +268,48 @@ def test_two_runs_are_compared_side_by_side_and_one_is_run_again(page, service):
     assert page.is_visible("#episode-settings")
     page.click("#close-shown")
     until(lambda: "beside=" not in page.url)
+
+
+def test_the_method_as_published_is_chosen_in_the_settings(page, service):
+    ensure_goal(service)
+    page.evaluate("document.getElementById('settings-card').open = true")
+    page.wait_for_selector("#episode-settings select[name=cost]", state="visible")
+    page.select_option("#episode-settings select[name=method]", "paper")
+    page.wait_for_selector("#episode-settings select[name=cost]", state="hidden")
+    assert page.input_value("#setting-samples") == "100"
+    assert page.inner_text("#settings-facts") == "as published, 100 samples, 30 pushes"
+    begin(page, {"steps": 2, "samples": 8})
+    settings = service.episode()["settings"]
+    assert (settings["method"], settings["cost"], settings["samples"]) == ("paper", "image", 8)
+    page.wait_for_selector("#settings-facts:text-is('as published, 8 samples, 2 pushes')", timeout=WAIT_MS)
+    assert page.is_disabled("#episode-settings select[name=method]")
+    assert page.is_disabled("#setting-samples")
+    assert "the method as published" in page.inner_text("#shown-text")
+    page.click("#run-cancel")
+    page.wait_for_selector("#run-idle:not([hidden])", timeout=WAIT_MS)
+    assert service.episode()["status"] == "cancelled"
+    assert page.is_enabled("#episode-settings select[name=method]")
+    page.click("#settings-defaults")
+    assert page.input_value("#episode-settings select[name=method]") == "ours"
+
+
+def test_distances_that_nobody_knows_are_told_so(page, service):
+    ensure_goal(service)
+    goal = service.call("GET", "goals")["goals"][0]["id"]
+    asked = {"goal": goal, "settings": {"method": "paper", "despite_doubts": True}}
+    episode = service.call("POST", "episodes", asked)
+    service.call("DELETE", f"episodes/{episode['id']}")
+    unknown = dict.fromkeys(("to_goal_mm", "to_goal_deg"))
+    steps = [
+        {"step": n, "seconds": {"plan": 2.0}, "image_cost": 0.02 - 0.01 * n, "estimate_off_mm": {}, **unknown}
+        for n in range(2)
+    ]
+    report = service.data_dir / "collections" / episode["id"] / "report.json"
+    report.parent.mkdir(exist_ok=True)
+    report.write_text(json.dumps({"steps": steps}))
+    page.goto(f"{service.url}/?episode={episode['id']}")
+    page.wait_for_selector("#chart-distance:has-text('not known: this method looks at images alone')", timeout=WAIT_MS)
+    assert page.locator("#chart-cost canvas").count() == 1
+    assert page.inner_text("#ending-sum").startswith("image cost 20 to 10 · 10⁻³")
+    assert "not known" in page.inner_text("#ending-why")
+    assert page.is_hidden("#make-clip")

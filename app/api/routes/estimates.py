@@ -17,13 +17,14 @@ from app.api.routes import FORGOTTEN, Forget, problems
 from app.api.routes.comparisons import COMPARED, compared, compared_png
 from app.api.routes.events import StreamDep, followed
 from app.api.schemas.common import Seed
-from app.api.schemas.estimates import EstimateIn, EstimateList, EstimateOut
+from app.api.schemas.estimates import METHOD, EstimateIn, EstimateList, EstimateOut
 from app.api.schemas.limits import FILE_NAME, GUESS, NAME, VIEW, sized, within
 from app.api.schemas.paging import DEFAULT_PAGE, AfterJob, Limit
 from app.jobs.job import Job
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked, Estimates
 from osfcore.errors import OsfError
+from osfcore.paper.method import Method
 
 UPLOAD_PATH = "/api/estimates"
 _ZIP = "application/zip"
@@ -68,6 +69,7 @@ async def create(
         str | None, Query(**sized(NAME), description="Of an upload: the earlier estimate, else its prior.json.")
     ] = None,
     file_name: Annotated[str, Query(**sized(FILE_NAME), description="Of an upload, for people.")] = "observation.zip",
+    method: Annotated[Method, Query(description=f"Of an upload: {METHOD}")] = "ours",
 ) -> EstimateOut:
     """Queue an estimate of the current scene (JSON, or no body at all) or of a zipped observation folder.
 
@@ -77,7 +79,7 @@ async def create(
     kind = kind_of(request)
     if kind == _ZIP:
         try:
-            job = await services.estimates.of_upload(Asked(mode, seed, prior), request.stream(), file_name)
+            job = await services.estimates.of_upload(Asked(mode, seed, prior, method), request.stream(), file_name)
         except ClientDisconnect:
             raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
     else:
@@ -137,7 +139,7 @@ async def image(
         int | None, Query(**within(GUESS), description="Whose guess is rendered; the latest if left out.")
     ] = None,
 ) -> Response:
-    """Show what a camera saw, and what it would see if a step's guess were true."""
+    """Show what a camera saw, and what it would see if a step's guess were true, by our fields."""
     with named_in_path():
         if kind == "observed":
             return await asyncio.to_thread(_observed, services.estimates, job, view)

@@ -16,6 +16,7 @@ from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.services.fields import NoTrainedField
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
+from osfcore.paper.method import Method
 
 UPLOAD_PATH = "/api/fields/sets"
 NEEDS_MESH = "It needs a mesh of the same name before scenes can hold it; add one with 'osf assets add'."
@@ -92,7 +93,8 @@ def use(services: ServicesDep, name: FieldName, body: UseIn) -> FieldOut:
     """Use a field that was trained here, though it is not as good as the one that is in use."""
     _known_field(services, name)
     job = services.runner.jobs.get(body.job, "train_field")
-    if job.params["name"] != name or job.state != "done":
+    is_ours = job.params.get("method", "ours") == "ours"  # one as published is in use anyway, elsewhere
+    if job.params["name"] != name or job.state != "done" or not is_ours:
         raise NoTrainedField(name)
     services.fields.use(name, services.runner.jobs.folder(job.id))
     services.runner.storage.outdate()
@@ -100,10 +102,17 @@ def use(services: ServicesDep, name: FieldName, body: UseIn) -> FieldOut:
 
 
 @router.delete("/{name}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 409, 507))
-def delete(services: ServicesDep, name: FieldName) -> None:
+def delete(
+    services: ServicesDep,
+    name: FieldName,
+    method: Annotated[Method, Query(description='"paper" for the field as published.')] = "ours",
+) -> None:
     """Delete a field that was trained here; a shipped one of the same name then counts again."""
     _known_field(services, name)
-    services.fields.remove(name)
+    if method == "paper":
+        services.fields.remove_published(name)
+    else:
+        services.fields.remove(name)
     services.runner.storage.outdate()
 
 
@@ -115,6 +124,7 @@ def _out(services: Services, info: FieldInfo) -> FieldOut:
         source=info.source,
         bytes=info.bytes,
         metrics=dict(info.metrics),
+        published=services.fields.origin_of_published(info.name),
         has_mesh=has_mesh,
         note=None if has_mesh else NEEDS_MESH,
     )

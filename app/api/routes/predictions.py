@@ -34,6 +34,8 @@ async def predict(services: ServicesDep, body: PredictionIn) -> Response:
     before = None if body.before is None else body.before.state()
     if before is not None and body.state is None:
         raise InvalidInput("state", "missing", "given together with what was before")
+    if before is not None and body.method == "paper":
+        raise InvalidInput("before", "given", "left out with the method as published, which has no velocities")
     record, state = (services.predictions.current(), None) if body.state is None else (None, body.state.state())
     if state is None:
         assert record is not None
@@ -41,7 +43,7 @@ async def predict(services: ServicesDep, body: PredictionIn) -> Response:
     else:
         _check_known(state, services.fields.names())
     actions = await asyncio.to_thread(_actions, body, len(state.names))
-    order = functools.partial(services.predictions.submit, state, actions, before=before)
+    order = functools.partial(services.predictions.submit, state, actions, before=before, method=body.method)
     answer = await asyncio.wrap_future(await asyncio.to_thread(order))
     assert isinstance(answer, Predicted)  # nothing overtakes an order with a key of its own
     content = await asyncio.to_thread(_json, answer, record)

@@ -11,9 +11,11 @@ from app.api.schemas.goals import Poses, SceneRef
 from app.api.schemas.limits import GOAL_NAME, HORIZON, NAME, SAMPLES, STEPS, TEMPERATURE, sized, within
 from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
-from app.services.episodes import AskedEpisode, flat
+from app.jobs.kinds.episodes import method_of
+from app.services.episodes import AskedEpisode, defaults, flat
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
 from osfcore.control.events import Matter
+from osfcore.paper.method import METHODS, Method
 
 
 def _between(bounds: tuple[float, float], text: str) -> Any:  # noqa: ANN401  what pydantic's Field returns
@@ -23,6 +25,11 @@ def _between(bounds: tuple[float, float], text: str) -> Any:  # noqa: ANN401  wh
 class SettingsIn(Input):
     """What shall be other than by default, or than before."""
 
+    method: Method | None = Field(
+        None,
+        description='"ours", or "paper": as published, which is slower and knows no goal poses; chosen before an '
+        "episode, with a cost of images, a plan for each action, and no changes on the way.",
+    )
     steps: int | None = _between(STEPS, "Actions at most, of 0.2 s each.")
     replan_every: int | None = _between(STEPS, "Actions executed of each plan.")
     cost: CostKind | None = Field(
@@ -52,12 +59,15 @@ class EpisodeIn(Input):
     def asked(self) -> AskedEpisode:
         """What the service's own modules take."""
         poses = None if self.poses is None else tuple(entry.named_pose() for entry in self.poses)
-        return AskedEpisode(self.scene, self.goal, poses, self.seed, self.settings.given())
+        settings = self.settings.given()
+        method: Method = settings.pop("method", "ours")
+        return AskedEpisode(self.scene, self.goal, poses, self.seed, settings, method)
 
 
 class SettingsOut(BaseModel):
     """How an episode goes."""
 
+    method: Method
     steps: int
     replan_every: int
     cost: CostKind
@@ -86,6 +96,7 @@ class EpisodeSettingsOut(BaseModel):
     """Defaults and bounds of an episode's settings."""
 
     defaults: SettingsOut
+    published: SettingsOut = Field(description="Defaults of the method as published.")
     bounds: SettingBounds
 
 
@@ -104,8 +115,8 @@ class ServiceSettings(BaseModel):
             horizon=list(HORIZON),
             temperature=list(TEMPERATURE),
         )
-        defaults = SettingsOut(**flat(EpisodeSettings()))
-        return ServiceSettings(episode=EpisodeSettingsOut(defaults=defaults, bounds=bounds))
+        ours, published = (SettingsOut(method=method, **defaults(method)) for method in METHODS)
+        return ServiceSettings(episode=EpisodeSettingsOut(defaults=ours, published=published, bounds=bounds))
 
 
 class RenameIn(Input):
@@ -131,8 +142,10 @@ class EpisodeStepOut(BaseModel):
     ssim: float | None = Field(
         None, description="Their structural similarity, 1 for equal images; null in episodes of earlier versions."
     )
-    to_goal_mm: dict[str, float] = Field(description="Of each object, as estimated [mm].")
-    to_goal_deg: dict[str, float] = Field(description="Likewise [deg].")
+    to_goal_mm: dict[str, float] | None = Field(
+        description="Of each object, as estimated [mm]; null where the method looks at images alone."
+    )
+    to_goal_deg: dict[str, float] | None = Field(description="Likewise [deg].")
     estimate_off_mm: dict[str, float] = Field(description="Simulation only: errors of the estimate [mm].")
     light_off_deg: float | None = Field(
         None, description="Simulation only: error of the estimated light [deg]; null in episodes of earlier versions."
@@ -191,7 +204,7 @@ class EpisodeOut(BaseModel):
             goal=job.params["goal"]["id"],
             objects=job.params["names"],
             seed=job.params["seed"],
-            settings=SettingsOut(**flat(settings)),
+            settings=SettingsOut(method=method_of(job.params), **flat(settings)),
             status=job.state,
             position=job.position,
             done=job.done,

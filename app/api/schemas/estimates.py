@@ -13,6 +13,9 @@ from app.jobs.job import Job, State
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked
 from osfcore.io.state_file import EstimateJson
+from osfcore.paper.method import Method
+
+METHOD = '"ours", or "paper": CMA-ES alone with fields as published, which is slower; not for mode "goal".'
 
 
 class EstimateIn(Input):
@@ -28,10 +31,11 @@ class EstimateIn(Input):
         None, **sized(NAME), description="The earlier estimate; null for the latest one of the scene."
     )
     seed: Seed = 0
+    method: Method = Field("ours", description=METHOD)
 
     def asked(self) -> Asked:
         """What the service's own modules take."""
-        return Asked(self.mode, self.seed, self.prior)
+        return Asked(self.mode, self.seed, self.prior, self.method)
 
 
 class ObservedOut(BaseModel):
@@ -74,6 +78,7 @@ class EstimateOut(BaseModel):
 
     id: str
     mode: Mode
+    method: Method
     seed: int
     of: ObservedOut
     objects: list[str] = Field(description="Names, in the order of losses.")
@@ -111,6 +116,7 @@ class EstimateOut(BaseModel):
         return EstimateOut(
             id=job.id,
             mode=job.params["mode"],
+            method=job.params.get("method", "ours"),
             seed=job.params["seed"],
             of=ObservedOut(**job.params["of"]),
             objects=job.params["names"],

@@ -20,6 +20,9 @@ class FieldOut(BaseModel):
     source: Literal["shipped", "trained"] = Field(description="With the program, or trained on this machine.")
     bytes: int = Field(description="Size of the weights.")
     metrics: dict[str, Any] = Field(description="What was measured on unseen views under unseen lights [dB].")
+    published: Literal["shipped", "trained"] | None = Field(
+        description="Where the field as published beside it comes from; null if there is none."
+    )
     has_mesh: bool = Field(description="Whether scenes can simulate it: they need a mesh of the same name.")
     note: str | None = Field(description="What is missing, in words.")
 

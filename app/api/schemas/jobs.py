@@ -21,6 +21,7 @@ from app.api.schemas.limits import (
 from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, Kind, State
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
+from osfcore.paper.method import Method
 
 
 class CollectPushesParams(Input):
@@ -70,7 +71,10 @@ class FieldSource(Input):
 
 
 class TrainFieldParams(Input):
-    """A field to train. It replaces one of this name only if it is no worse on the same held-out images."""
+    """A field to train. It replaces one of this name only if it is no worse on the same held-out images.
+
+    But for one as published: that takes the place of an earlier one as published, and never that of ours.
+    """
 
     name: ObjectName = Field(description="Of the field; scenes need a mesh of the same name.")
     source: FieldSource
@@ -78,6 +82,16 @@ class TrainFieldParams(Input):
     seed: Seed = 0
     images: int = Field(300, **within(IMAGES), description="Images to take of a mesh; a set has its own.")
     hollow: bool = Field(False, description="The object has hollows that no silhouette shows, such as a bowl's.")
+    method: Method = Field(
+        "ours",
+        description='Whose field: "ours", or "paper", a KiloOSF as published, which is kept beside ours, uncompared.',
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> TrainFieldParams:
+        if self.method == "paper" and self.hollow:
+            raise ValueError("hollow is of our method alone; leave it out with the one as published")
+        return self
 
 
 class CollectPushesJob(Input):

@@ -12,6 +12,7 @@ from app.api.schemas.limits import HORIZON, OBJECTS, SEQUENCES, sized
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
+from osfcore.paper.method import Method
 
 _OVERHEAD = (0.0, 0.0, 1.0)
 Sequence = Annotated[list[Velocity], Field(**sized(HORIZON)), FailFast()]
@@ -73,6 +74,9 @@ class PredictionIn(Input):
     )
     before: StateIn | None = Field(
         None, description="The same objects 0.2 s ago, with a state in which something may still be moving."
+    )
+    method: Method = Field(
+        "ours", description='Whose model: "ours", or "paper", the graph network as published, which knows no "before".'
     )
 
 

@@ -2,7 +2,7 @@
 
 Its parameters name the scene, which it drives while it runs: hands may move things while it pauses. A goal image lies
 in its inputs as `goal.png`; goal poses stand in the parameters. Where everything truly is in the image, if that is
-known, is for the report alone. It leaves what `osf episode` leaves.
+known, is for the report alone. It leaves what `osf episode` leaves. The method as published wants a goal image.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import ObjectJson, camera_from_json
+from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from osfcore.control.events import Event
     from osfcore.control.goal import GoalImage
     from osfcore.control.prepared_look import PreparedLooks
+    from osfcore.control.scene_models import SceneModels
+    from osfcore.control.world_protocol import World
     from osfcore.planning.pose_cost import PoseGoal
 
 _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
@@ -41,7 +44,7 @@ class EpisodeProgress:
 
     Attributes:
         done: actions executed.
-        total: actions at most; 0 until the goal is known, for looking tells nothing of how long acting takes.
+        total: actions at most; 0 until acting begins, for looking tells nothing of how long acting takes.
         note: what is being done, for a person.
         share: of the episode that is over, from 0 to 1.
         left_s: time left, estimated [s]; None before it begins.
@@ -90,32 +93,34 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     from app.episodes.time_left import TimeLeft
     from app.jobs.kinds.remote_world import RemoteWorld
     from osfcore.control.closed_loop import Episode
-    from osfcore.control.scene_models import load_scene_models
-    from osfcore.fields.field_library import FieldLibrary
+    from osfcore.control.goal import GoalImage
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
-    settings, names = settings_of(params["settings"]), tuple(params["names"])
+    settings, names, method = settings_of(params["settings"]), tuple(params["names"]), method_of(params)
     yield EpisodeProgress(0, 0, "Loading fields, half a minute the first time")
-    models = load_scene_models(names, FieldLibrary(place.data_dir), place.library, place.data_dir)
+    models = _models(method, names, place)
     world = RemoteWorld(place.orders.ask, params["scene"], place.folder)
     goal, start = params["goal"], world.truth()
     target = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
-    about = About(params["seed"], settings, target, _moved(start, target), models.symmetries)
+    inputs, rng = place.folder / INPUTS, stream_rng(params["seed"], Stream.EPISODE)
+    wanted, prepared = _goal(goal, names, inputs), _prepared(inputs / PREPARED_FILE)
+    image = wanted if method == "paper" else None
+    assert image is None or isinstance(image, GoalImage), "the service renders poses for it"
+    about = About(params["seed"], settings, target, _moved(start, target), models.symmetries, method, image)
     record = EpisodeRecord(place.folder, world, about)
-    rng = stream_rng(params["seed"], Stream.EPISODE)
-    inputs = place.folder / INPUTS
-    prepared = _prepared(inputs / PREPARED_FILE)
-    wanted = _goal(goal, names, inputs)
-    episode = Episode(world, models, wanted, settings, rng, prepared=prepared)
-    progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft()
+    if image is None:
+        loop = Episode(world, models, wanted, settings, rng, prepared=prepared)
+    else:
+        loop = _Published(world, models, image, settings, rng)
+    progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
     pictures = LookPictures(models.appearance.together, wanted)
-    for event in episode.run():
+    for event in loop.run():
         for change in place.orders.changes():
-            episode.settings = settings_of(change["settings"])
+            loop.settings = settings_of(change["settings"])
         record.take(event)
-        share, left_s = timer.take(event, episode.settings.steps)
-        then = _progress_after(progress, pictures.drawn(event), episode.settings.steps)
+        share, left_s = timer.take(event, loop.settings.steps)
+        then = _progress_after(progress, pictures.drawn(event), loop.settings.steps)
         progress = replace(then, share=share, left_s=round(left_s, 1))
         yield progress
         timer.go_on()  # not before a pause is over
@@ -124,6 +129,49 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
     world.close()
     yield replace(progress, note=progress.text or progress.note, view=None)
+
+
+def method_of(params: Mapping[str, Any]) -> Method:
+    """Whose method an episode is, by its parameters; earlier versions had but one."""
+    return params.get("method", "ours")
+
+
+def _models(method: Method, names: tuple[str, ...], place: JobContext) -> SceneModels:
+    from osfcore.control.scene_models import load_scene_models
+    from osfcore.fields.field_library import FieldLibrary
+
+    fields = FieldLibrary(place.data_dir)
+    models = load_scene_models(names, fields, place.library, place.data_dir)
+    if method == "ours":
+        return models
+    from osfcore.paper.stages import STAGES, with_paper_stages
+
+    return with_paper_stages(models, frozenset(STAGES), fields, place.data_dir)
+
+
+@dataclass(slots=True)
+class _Published:
+    """Algorithm 1 of the paper, in the place of an `Episode`.
+
+    Attributes:
+        settings: of which steps, samples, horizon and temperature count; fixed once it runs.
+    """
+
+    world: World
+    models: SceneModels
+    goal: GoalImage
+    settings: EpisodeSettings
+    rng: np.random.Generator
+
+    def run(self) -> Iterator[Event]:
+        from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
+        from osfcore.paper.mppi import GaussianPlanSettings
+        from osfcore.paper.stages import PaperEstimators
+
+        plan = self.settings.plan
+        drawn = GaussianPlanSettings(plan.samples, plan.horizon, temperature=plan.temperature)
+        how = AlgorithmSettings(self.settings.steps, drawn)
+        return run_algorithm(self.world, self.models, self.goal, how, PaperEstimators(), self.rng)
 
 
 def use_one_thread() -> None:
@@ -144,7 +192,7 @@ def _progress_after(before: EpisodeProgress, event: Event, total: int) -> Episod
     from app.processes.plan_summary import sketch_of
     from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed, Planning, Stepped
 
-    is_known = before.total > 0 or isinstance(event, GoalFound)
+    is_known = before.total > 0 or isinstance(event, GoalFound | Stepped)
     total = total if is_known else 0
     then = replace(before, total=total, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
     match event:

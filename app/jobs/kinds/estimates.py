@@ -19,6 +19,7 @@ from app.jobs.job import INPUTS
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import StateJson, state_to_json
+from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from osfcore.geometry.states import Observation, SceneState
 
 Mode = Literal["first", "next", "goal"]
-Method = Literal["ours", "paper"]
 OBSERVATION, PRIOR, TRUTH = "observation", "prior.json", "truth.json"
 STEPS, STATE = "steps.jsonl", "state.json"
 
@@ -74,9 +74,10 @@ def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimati
     observation = read_observation(inputs / OBSERVATION)
     mode: Mode = params["mode"]
     prior = None if mode == "first" else read_estimated(inputs / PRIOR).state
-    models = load_models(place.data_dir, observation.names)
+    method: Method = params.get("method", "ours")  # earlier versions had but one
+    models = load_models(place.data_dir, observation.names, method)
     rng = stream_rng(params["seed"], Stream.FIRST_FRAME)
-    for number, step in enumerate(steps_of(mode, models, observation, prior, rng), 1):
+    for number, step in enumerate(steps_of(mode, models, observation, prior, rng, method), 1):
         progress = _progress_of(number, step)
         _keep(place.folder / STEPS, progress, step.state)
         if step.estimate is not None:
@@ -128,6 +129,7 @@ def steps_of(
     Raises:
         InvalidInput: for a goal as published, which only compares goal images with renderings.
     """
+    check_method(mode, method)
     if method == "paper":
         from osfcore.paper.stages import PaperEstimators as Estimators
     else:
@@ -136,14 +138,22 @@ def steps_of(
     estimators = Estimators()
     if prior is None:
         return estimators.first_frame(models, observation, rng)
-    if mode == "goal" and method == "paper":
-        allowed = "ours for a goal image: the paper compares it with renderings and never estimates it"
-        raise InvalidInput("method", method, allowed)
     if mode == "goal":
         from osfcore.estimation.goal_image import estimate_goal
 
         return estimate_goal(models, observation, prior)
     return estimators.later_frame(models, observation, prior, rng)
+
+
+def check_method(mode: Mode, method: Method) -> None:
+    """Refuse a mode that a method does not have.
+
+    Raises:
+        InvalidInput: for a goal as published, which only compares goal images with renderings.
+    """
+    if mode == "goal" and method == "paper":
+        allowed = "ours for a goal image: the paper compares it with renderings and never estimates it"
+        raise InvalidInput("method", method, allowed)
 
 
 def read_steps(path: Path) -> tuple[dict[str, Any], ...]:

@@ -1,7 +1,8 @@
 """The job that trains a field: take images of the mesh if there is no set, train, put the field in place.
 
 Where there is a field of that name already, both are measured on the same held-out images, and the better one stays.
-The other new one is kept with the job, so that it can be used all the same.
+The other new one is kept with the job, so that it can be used all the same. A field as published goes to a place of its
+own and never takes that of ours; it is in use at once, without such a comparison.
 """
 
 from __future__ import annotations
@@ -13,14 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.storage.field_files import clear_workshop, install, open_workshop
+from app.storage.field_files import clear_workshop, install, install_published, open_workshop
 from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
 from osfcore.io.files import write_atomically
 from osfcore.io.image_file import write_png
+from osfcore.paper.method import Method, own_field_path
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
+    from osfcore.fields.training.kiloosf_training import FieldStep
 
 PREVIEW, COMPARISON = "preview.png", "comparison.png"
 _COMPARING = "Comparing it with the field that is there"
@@ -79,7 +82,8 @@ def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep
     name, mesh, images = params["name"], params["source"]["mesh"], _image_count(params, place)
     collect_s = _START_S + round(_TAKE_S * images) if mesh else _START_S
     train_s = _CARVE_S + max(1, round(60 * params["minutes"])) + round(_MEASURE_S * images)
-    compare_s = round(_COMPARE_S * images) if name in FieldLibrary(place.data_dir).names() else 0
+    method: Method = params.get("method", "ours")
+    compare_s = round(_COMPARE_S * images) if _is_compared(name, method, place) else 0
     step = TrainingStep(0, collect_s + train_s + compare_s, "Starting")
     yield step
     shop = open_workshop(place.data_dir, name, _order(params, place))
@@ -96,17 +100,24 @@ def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep
             yield step
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
     step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
-    if name in FieldLibrary(place.data_dir).names():
+    if _is_compared(name, method, place):
         yield replace(step, note=_COMPARING)
         with contextlib.suppress(CorruptFile):  # a damaged one is replaced
             step = _compared(step, name, data, shop, place)
     in_use = step.before_mask is None or step.psnr_mask is None or step.psnr_mask >= step.before_mask
-    if in_use:
+    if method == "paper":
+        install_published(shop, own_field_path(name, place.data_dir))
+    elif in_use:
         install(shop, place.data_dir / "fields" / name)
     _offer(shop, place.folder, name)
     clear_workshop(place.data_dir, name)
     note = "Done" if in_use else "Done; the field that was there is better and stays"
     yield replace(step, done=step.total, note=note, in_use=in_use)
+
+
+def _is_compared(name: str, method: Method, place: JobContext) -> bool:
+    """Whether a field of ours is there, and one of ours is to come."""
+    return method == "ours" and name in FieldLibrary(place.data_dir).names()
 
 
 def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobContext) -> TrainingStep:
@@ -159,13 +170,9 @@ def _train(
     params: dict[str, Any], files: tuple[Path, Path, Path], begin: TrainingStep, train_s: int
 ) -> Iterator[TrainingStep]:
     """Train for about `train_s`; `files` are the images, the field and a preview of it."""
-    from osfcore.fields.training.kiloosf_training import train_field
-    from osfcore.fields.training.recipes import TrainField
-
     data, out, preview = files
-    config = TrainField(data, out, minutes=params["minutes"], seed=params["seed"], hollow=params["hollow"])
     previews = 0
-    for step in train_field(config):
+    for step in _learning(params, data, out):
         if step.preview is not None:
             write_png(preview, step.preview)
             previews += 1
@@ -178,6 +185,19 @@ def _train(
             psnr_mask=step.psnr_mask,
             previews=previews,
         )
+
+
+def _learning(params: dict[str, Any], data: Path, out: Path) -> Iterator[FieldStep]:
+    """The training of the method that is asked for."""
+    minutes, seed = params["minutes"], params["seed"]
+    if params.get("method") == "paper":
+        from osfcore.paper.fields.training import TrainPaperField, train_paper_field
+
+        return train_paper_field(TrainPaperField(data, out, minutes=minutes, seed=seed))
+    from osfcore.fields.training.kiloosf_training import train_field
+    from osfcore.fields.training.recipes import TrainField
+
+    return train_field(TrainField(data, out, minutes=minutes, seed=seed, hollow=params["hollow"]))
 
 
 def _offer(shop: Path, folder: Path, name: str) -> None:

@@ -12,6 +12,7 @@ from osfcore.estimation.content_verdict import ContentCheck
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
+from osfcore.paper.method import Method
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -111,12 +112,14 @@ class PredictPushes:
         state: objects with fields only, and the pusher.
         actions: velocities of the pusher [m/s].
         before: the same objects one action ago, if something may still be moving.
+        method: whose model predicts.
     """
 
     key: str
     state: SceneState
     actions: Float[np.ndarray, "K T 3"]
     before: SceneState | None = None
+    method: Method = "ours"
 
 
 @dataclass(frozen=True, eq=False, slots=True)

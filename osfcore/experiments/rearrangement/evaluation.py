@@ -36,7 +36,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
-from osfcore.paper.stages import paper_field_names, paper_field_path
+from osfcore.paper.method import paper_field_names, paper_field_path
 from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"

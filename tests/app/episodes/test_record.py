@@ -11,8 +11,10 @@ from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_F
 from app.episodes.frames import HEIGHT, WIDTH, part_of, read_frame
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import SimulatedTable
+from app.episodes.trajectory import read_trajectory
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.goal import GoalImage
 from osfcore.errors import CannotWrite
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
@@ -247,3 +249,28 @@ def test_a_folder_that_cannot_be_written_is_told(told):
     told.out.write_text("")
     with pytest.raises(CannotWrite, match="goal.png"):
         told.begin(told.record(told.goal))
+
+
+def test_a_method_that_looks_at_images_alone_leaves_all_but_the_distances(told):
+    symmetries = {name: asset.info.symmetry for name, asset in told.world.assets.items()}
+    goal = GoalImage(goal_camera(SIDE), told.image)
+    record = EpisodeRecord(
+        told.out, SimulatedTable(told.world), About(5, EpisodeSettings(), None, (), symmetries, "paper", goal)
+    )
+    record.take(Observed(0, told.world.observe()))
+    unknown, estimate = np.zeros(0), sure(told.world.truth())
+    for number in range(2):
+        record.take(Stepped(number, 9, estimate, unknown, unknown, 0.25, told.image, {"estimate": 0.5}))
+        told.act(record, number + 1)
+    report = told.end(record)
+    assert (report["method"], report["goal"], report["steps_done"]) == ("paper", None, 2)
+    step = report["steps"][0]
+    assert (step["to_goal_mm"], step["to_goal_deg"], step["image_cost"]) == (None, None, 0.25)
+    assert step["ssim"] == pytest.approx(1.0)
+    header, *rows = csv.reader((told.out / CSV_FILE).read_text().splitlines())
+    assert len(rows) == 2
+    assert not any("to_goal" in column for column in header)
+    assert f"{BOX} estimate_off_mm" in header
+    assert (told.out / GOAL_FILE).is_file()
+    assert (told.out / VIDEO_FILE).is_file()
+    assert read_trajectory(told.out / TRAJECTORY_FILE).goal is None

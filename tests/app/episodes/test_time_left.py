@@ -84,3 +84,17 @@ def test_a_pause_does_not_count():
     paused.now += 500.0
     paused.timer.go_on()
     assert course.take(stepped(6, 0.14), 1.0) == paused.take(stepped(6, 0.14), 1.0)
+
+
+def test_who_does_not_look_for_goal_poses_needs_no_time_for_it():
+    with_goal, without = (TimeLeft(lambda: 0.0, finds).take(look(0, 10), MOST)[1] for finds in (True, False))
+    assert without < with_goal
+
+
+def test_where_distances_are_not_known_all_pushes_are_still_to_come():
+    course = Course()
+    unknown = np.zeros(0)
+    for number in range(11):
+        course.take(Stepped(number, MOST, None, unknown, unknown, 0.0, np.zeros((1, 1, 3)), {}), 3.0)
+        _, left = course.take(ActionExecuted(number + 1, unknown))
+    assert left == pytest.approx(3.0 * (MOST - 11))

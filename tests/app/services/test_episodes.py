@@ -24,9 +24,10 @@ from app.episodes.file_names import (
     VIDEO_FILE,
 )
 from app.episodes.frames import HEIGHT, TILE_PX, WIDTH, frame, part_of
+from app.processes.messages.scene_messages import ComposedGoal
 from app.services.episode_results import FILES, NoTrajectory
-from app.services.episodes import AskedEpisode, EpisodeGoesOn, Episodes, NoGoal, flat, nested
-from app.services.fields import FieldCatalogue, MissingFields
+from app.services.episodes import AskedEpisode, EpisodeGoesOn, Episodes, GoalUnknown, NoGoal, flat, nested
+from app.services.fields import FieldCatalogue, MissingFields, NoPublishedField
 from app.services.goals.goal_checks import GoalRefused
 from app.services.goals.goals import NoTable
 from app.storage.database import CannotStore
@@ -481,3 +482,64 @@ def test_the_events_of_one_that_is_over_end_at_once(service, done):
     text = service.get(f"/api/episodes/{episode['id']}/events").text
     (data,) = [json.loads(line[6:]) for line in text.splitlines() if line.startswith("data: ")]
     assert (data["id"], data["state"], data["result"]["outcome"]) == (episode["id"], "done", "out of steps")
+
+
+# The method as published
+
+
+@pytest.fixture
+def published(episodes):
+    """An episode of it that waits."""
+    return episodes.start(AskedEpisode(goal="made", method="paper", settings={"steps": 4}))
+
+
+def test_the_method_as_published_begins_with_its_own_settings(published):
+    assert published.params["method"] == "paper"
+    settings = published.params["settings"]
+    assert (settings["steps"], settings["cost"], settings["replan_every"]) == (4, "image", 1)
+    assert settings["plan"] == {"samples": 100, "horizon": 10, "temperature": 0.3}
+
+
+@pytest.mark.parametrize("setting", [{"cost": "pose"}, {"replan_every": 2}, {"planning": False}, {"acting": False}])
+def test_what_the_method_as_published_does_not_have_is_refused(episodes, setting, tmp_path):
+    with pytest.raises(InvalidInput, match="with the method as published"):
+        episodes.start(AskedEpisode(goal="made", method="paper", settings=setting))
+    assert left_over(tmp_path) == []
+
+
+def test_objects_without_a_field_as_published_are_refused_before_the_start(episodes, monkeypatch, tmp_path):
+    monkeypatch.setattr(FieldCatalogue, "published", lambda _: (BOX,))
+    with pytest.raises(NoPublishedField, match=MUSTARD):
+        episodes.start(AskedEpisode(goal="made", method="paper"))
+    assert episodes.start(AskedEpisode(goal="made")).params["method"] == "ours"
+    assert left_over(tmp_path) == []
+
+
+def test_poses_become_the_image_that_the_method_as_published_wants(episodes, runner, monkeypatch):
+    asked = []
+
+    def compose(command):
+        asked.append(command)
+        return ComposedGoal(PNG, POSES)
+
+    monkeypatch.setattr(runner, "compose", compose, raising=False)
+    job = episodes.start(AskedEpisode(scene="s", poses=POSES, method="paper"))
+    assert [(command.id, command.poses) for command in asked] == [("s", POSES)]
+    goal = job.params["goal"]
+    assert (goal["id"], goal["poses"], goal["truth"]) == (None, None, poses_to_json(POSES))
+    assert goal["camera"]["width"] == asked[0].size
+    assert (runner.jobs.inputs(job.id) / GOAL_FILE).read_bytes() == PNG
+
+
+def test_an_episode_keeps_its_method_and_the_one_as_published_all_else(episodes, published):
+    with pytest.raises(InvalidInput, match="goes as it began"):
+        episodes.change(published, {"steps": 5})
+    ours = episodes.start(AskedEpisode(goal="made"))
+    with pytest.raises(InvalidInput, match="method is paper, but it must be ours"):
+        episodes.change(ours, {"method": "paper"})
+    assert episodes.change(ours, {"method": "ours", "steps": 5}).params["settings"]["steps"] == 5
+
+
+def test_what_never_knew_goal_poses_becomes_no_clip(episodes, runner, published):
+    with pytest.raises(GoalUnknown, match="watch the video"):
+        episodes.make_clip(runner.jobs.put(published.id, state="done"))

@@ -3,9 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from app.services.fields import FieldCatalogue, ShippedField
+from app.services.fields import FieldCatalogue, MissingFields, NoPublishedField, ShippedField
 from osfcore.errors import UnknownName
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
+from osfcore.paper.method import own_field_path
 
 
 @pytest.fixture
@@ -40,3 +41,31 @@ def test_what_is_shipped_stays(shelf, monkeypatch):
     monkeypatch.setattr(FieldLibrary, "info", lambda _library, _name: shipped)
     with pytest.raises(ShippedField, match="mug is shipped"):
         shelf.remove("mug")
+
+
+def test_a_method_is_refused_objects_without_its_fields(shelf, tmp_path):
+    put(tmp_path, "mug")
+    shelf.require(("mug",), "ours")
+    with pytest.raises(NoPublishedField, match="no field as published for mug"):
+        shelf.require(("mug", "006_mustard_bottle"), "paper")
+    with pytest.raises(MissingFields, match="no field yet for teapot"):
+        shelf.require(("mug", "teapot"), "paper")
+    own = own_field_path("mug", tmp_path)
+    own.parent.mkdir()
+    own.write_bytes(b"weights")
+    shelf.require(("mug", "006_mustard_bottle"), "paper")
+
+
+def test_a_field_as_published_that_was_trained_here_can_be_deleted_and_a_shipped_one_counts_again(shelf, tmp_path):
+    bottle = "006_mustard_bottle"
+    assert (shelf.origin_of_published(bottle), shelf.origin_of_published("mug")) == ("shipped", None)
+    with pytest.raises(ShippedField):
+        shelf.remove_published(bottle)
+    own = own_field_path(bottle, tmp_path)
+    own.parent.mkdir()
+    for file in (own, own.with_suffix(".json")):
+        file.write_bytes(b"{}")
+    assert shelf.origin_of_published(bottle) == "trained"
+    shelf.remove_published(bottle)
+    assert shelf.origin_of_published(bottle) == "shipped"
+    assert list(own.parent.iterdir()) == []

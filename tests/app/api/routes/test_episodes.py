@@ -207,3 +207,26 @@ def test_its_events_end_with_it(live):
     assert (told[0]["state"], told[-1]["state"], told[-1]["kind"]) == ("queued", "cancelled", "episode")
     live.request("DELETE", f"/api/jobs/{job['id']}")
     live.request("DELETE", f"/api/scenes/{scene['id']}")
+
+
+def test_the_method_as_published_is_a_setting(service, scene, busy):
+    body = {"poses": poses_of(scene), "settings": {"method": "paper", "steps": 2}}
+    episode = service.post("/api/episodes", json=body)
+    assert episode.status_code == 202, episode.text
+    episode = episode.json()
+    settings = episode["settings"]
+    assert (settings["method"], settings["cost"], settings["steps"]) == ("paper", "image", 2)
+    service.delete(f"/api/episodes/{episode['id']}")
+    refused = service.post("/api/episodes", json={**body, "settings": {"method": "paper", "cost": "pose"}})
+    assert is_problem(refused, 422)
+    assert "cost is pose, but it must be image with the method as published" in refused.json()["detail"]
+
+
+def test_an_object_without_a_field_as_published_is_a_conflict_in_words(service, services, scene, monkeypatch):
+    monkeypatch.setattr(type(services.fields), "published", lambda _: ())
+    body = {"poses": poses_of(scene), "settings": {"method": "paper"}}
+    refused = service.post("/api/episodes", json=body)
+    assert is_problem(refused, 409)
+    assert refused.json()["detail"].startswith(
+        "There is no field as published for 003_cracker_box, 006_mustard_bottle;"
+    )

@@ -18,7 +18,7 @@ from osfcore.io.state_file import estimated_from_json, read_estimated
 from osfcore.objects.asset_library import AssetLibrary
 from tests.app.api.routes.test_jobs import finished
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import LONG, running, until
+from tests.app.conftest import LONG, keep_busy, running, until
 from tests.app.services.test_image_sets import zipped
 
 MUSTARD = "006_mustard_bottle"
@@ -251,3 +251,15 @@ def test_a_table_without_objects_has_no_estimate(tmp_path):
 def test_the_estimate_on_disk_is_what_was_told(services, first):
     path = services.runner.jobs.folder(first["id"]) / "state.json"
     assert read_estimated(path).trusted is first["estimate"]["trusted"]
+
+
+def test_the_method_as_published_is_told_and_refused_for_goals(service, scene):
+    busy = keep_busy(service)
+    asked = service.post("/api/estimates", json={"scene": scene["id"], "method": "paper"})
+    assert asked.status_code == 202, asked.text
+    assert asked.json()["method"] == "paper"
+    service.delete(f"/api/estimates/{asked.json()['id']}")
+    refused = service.post("/api/estimates", json={"scene": scene["id"], "method": "paper", "mode": "goal"})
+    service.delete(f"/api/jobs/{busy}")
+    assert is_problem(refused, 422)
+    assert "method is paper, but it must be ours for a goal image" in refused.json()["detail"]

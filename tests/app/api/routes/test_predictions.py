@@ -135,3 +135,15 @@ def test_a_broken_network_is_a_conflict_in_words(library, tmp_path):
         answer = client.post("/api/predictions", json={"actions": PUSH, "state": STATE})
         assert answer.status_code == 409
         assert "pushes.safetensors" in answer.json()["detail"]
+
+
+def test_the_model_as_published_predicts_when_it_is_asked_for(service):
+    body = {"state": STATE, "actions": [[[0.3, 0, 0]] * 4, [[-0.3, 0, 0]] * 4]}
+    ours, theirs = (np.array(ask(service, **body, method=method).json()["positions"]) for method in ("ours", "paper"))
+    assert ours.shape == theirs.shape == (2, 5, 1, 3)
+    np.testing.assert_allclose(theirs[:, 0], ours[:, 0], atol=1e-9)
+    assert not np.allclose(theirs[0, -1], ours[0, -1], atol=1e-4)
+    assert theirs[0, -1, 0, 0] > 0.01  # it was pushed
+    refused = ask(service, **body, before=STATE, method="paper")
+    assert refused.status_code == 422
+    assert "left out with the method as published" in refused.json()["detail"]

@@ -8,6 +8,7 @@ from app.jobs.job import Job
 from app.jobs.kinds.episodes import settings_of
 from app.services.episodes import nested
 from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.paper.mppi import GaussianPlanSettings
 
 PARAMS = {"scene": "s", "names": ["box"], "seed": 3, "settings": nested({"steps": 5}), "goal": {"id": "g"}}
 STEP = {
@@ -87,5 +88,28 @@ def test_one_that_is_over_tells_how_it_ended(state):
 
 def test_the_defaults_are_those_of_an_episode_without_settings():
     defaults = ServiceSettings.now().episode.defaults
-    assert nested(defaults.model_dump()) == nested({})
+    assert defaults.method == "ours"
+    assert nested(defaults.model_dump(exclude={"method"})) == nested({})
     assert defaults.model_dump()["steps"] == EpisodeSettings().steps
+
+
+def test_the_method_as_published_has_defaults_of_its_own():
+    published = ServiceSettings.now().episode.published
+    assert (published.method, published.cost, published.replan_every) == ("paper", "image", 1)
+    own = GaussianPlanSettings()
+    assert (published.samples, published.horizon, published.temperature) == (own.samples, own.horizon, own.temperature)
+    assert nested(published.model_dump(exclude={"method"}), "paper") == nested({}, "paper")
+
+
+def test_the_method_is_asked_for_among_the_settings():
+    asked = EpisodeIn.model_validate({"scene": "s", "goal": "g", "settings": {"method": "paper", "steps": 4}}).asked()
+    assert (asked.method, asked.settings) == ("paper", {"steps": 4})
+    assert EpisodeIn.model_validate({"scene": "s", "goal": "g"}).asked().method == "ours"
+
+
+def test_steps_of_a_method_that_looks_at_images_alone_know_no_distances():
+    step = {"step": 0, "seconds": {}, "image_cost": 0.1, "to_goal_mm": None, "to_goal_deg": None, "estimate_off_mm": {}}
+    job = Job("a", "episode", {**PARAMS, "method": "paper"})
+    out = EpisodeOut.of_job(job, "A", EpisodeSettings(), {"steps": [step]}, ())
+    assert out.settings.method == "paper"
+    assert (out.steps[0].to_goal_mm, out.steps[0].to_goal_deg) == (None, None)

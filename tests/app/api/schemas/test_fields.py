@@ -9,6 +9,13 @@ def test_a_set_says_what_the_store_says():
 
 def test_metrics_that_are_no_numbers_go_out_as_null():
     out = FieldOut(
-        name="a", label="A", source="trained", bytes=1, metrics={"psnr_full": float("nan")}, has_mesh=True, note=None
+        name="a",
+        label="A",
+        source="trained",
+        bytes=1,
+        metrics={"psnr_full": float("nan")},
+        published=None,
+        has_mesh=True,
+        note=None,
     )
     assert '"psnr_full":null' in out.model_dump_json()

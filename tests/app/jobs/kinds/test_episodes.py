@@ -30,6 +30,8 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.scene_file import camera_to_json
+from osfcore.paper import stages
+from osfcore.paper.estimation import PaperEstimationConfig, estimate_first
 from osfcore.progress import Progress
 from tests.app.jobs.kinds.test_remote_world import NAMES, Stage, stage  # noqa: F401  a fixture
 from tests.core.control.scenes import sure
@@ -228,3 +230,49 @@ def test_rounds_end_where_a_step_of_the_loop_does():
     assert not EpisodeProgress(1, 3, "Pushing", view=ActionExecuted(1, np.zeros(3))).ends_round
     assert not EpisodeProgress(0, 3, "Loading").ends_round
     assert not EpisodeProgress(0, 3, "Loading").must_be_told
+
+
+# The method as published
+
+FEW = {"steps": 1, "cost": "image", "plan": {"samples": 8, "horizon": 1, "temperature": 0.3}}
+
+
+def seen_by_the_goal_camera(place, stage, side=16):  # noqa: F811
+    """The parameters of a goal image of the table as it is."""
+    camera = goal_camera(side)
+    inputs = place.folder / INPUTS
+    inputs.mkdir()
+    write_png(inputs / GOAL_FILE, to_uint8(stage.world.render((camera,), with_pusher=False).images[0]))
+    return {"poses": None, "camera": camera_to_json(camera)}
+
+
+def test_the_method_as_published_goes_through_the_same_job(place, stage, monkeypatch):  # noqa: F811
+    def found(*_, **__):
+        state = stage.world.truth()
+        yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
+
+    for name in ("estimate_first", "estimate_next"):
+        monkeypatch.setattr(stages, name, found)
+    goal = seen_by_the_goal_camera(place, stage)
+    told = list(episode_job(params(stage, settings=FEW, **goal) | {"method": "paper"}, place))
+    assert list(dict.fromkeys(step.stage for step in told)) == [None, "first", "plan", "act", "next"]
+    assert (told[-1].outcome, told[-1].done, told[-1].steps, told[-1].total) == ("out of steps", 1, 2, 1)
+    assert sum(isinstance(step.view, PlanSketch) for step in told) == 1
+    assert sum(step.ends_round for step in told) == 2
+    report = report_of(place)
+    assert (report["method"], report["goal"], report["steps"][0]["to_goal_mm"]) == ("paper", None, None)
+    assert report["steps"][0]["truly_to_goal_mm"][NAMES[1]] == pytest.approx(60, abs=1)
+    files = {path.name for path in place.folder.iterdir()}
+    assert {REPORT_FILE, CSV_FILE, GOAL_FILE, TRAJECTORY_FILE, VIDEO_FILE, RECORDING_FILE, FRAMES_FOLDER} <= files
+
+
+@pytest.mark.slow
+def test_the_method_as_published_runs_on_its_own(place, stage, monkeypatch):  # noqa: F811
+    little = PaperEstimationConfig(masked_iterations=1, masked_population=8, joint_iterations=2, joint_population=8)
+    monkeypatch.setattr(stages, "estimate_first", lambda *given: estimate_first(*given[:3], little))
+    goal = seen_by_the_goal_camera(place, stage)
+    *_, last = list(episode_job(params(stage, settings=FEW, truth=None, **goal) | {"method": "paper"}, place))
+    assert (last.outcome, last.done) == ("out of steps", 1)
+    report = report_of(place)
+    assert {"first", "estimate", "plan"} <= set().union(*(step["seconds"] for step in report["steps"]))
+    assert all(np.isfinite(step["image_cost"]) for step in report["steps"])

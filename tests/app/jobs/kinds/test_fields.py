@@ -8,12 +8,14 @@ import pytest
 from PIL import Image
 
 import osfcore.fields.training.kiloosf_training as training
+import osfcore.paper.fields.training as paper_training
 from app.jobs.context import JobContext
 from app.jobs.kinds.fields import COMPARISON, PREVIEW, train_field_job
 from app.storage.field_files import workshop
 from osfcore.errors import MissingAssets
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.field_weights import field_bytes
+from osfcore.paper.method import own_field_path, paper_field_path
 from osfcore.progress import Progress
 from tests.app.processes.fields import write_box
 
@@ -154,3 +156,23 @@ def test_a_mesh_that_is_gone_is_told(place, trained):
     with pytest.raises(MissingAssets):
         list(train_field_job({**ORDER, "source": {"mesh": "025_mug", "set": None}}, place))
     assert trained == []
+
+
+def test_a_field_as_published_is_kept_beside_ours(place, monkeypatch, weights):
+    def fake(config):
+        config.out.write_bytes(weights)
+        config.out.with_suffix(".json").write_text(json.dumps({"psnr_full": 20.5, "psnr_mask": 15.5}))
+        yield training.FieldStep(Progress(30, 30, "Done"), 20.5, 15.5, None)
+
+    monkeypatch.setattr(paper_training, "train_paper_field", fake)
+    (place.data_dir / "sets" / "s1" / "images").mkdir(parents=True)
+    ours = FieldLibrary(place.data_dir).stamp(GELATIN)
+    order = {**ORDER, "name": GELATIN, "source": {"mesh": None, "set": "s1"}, "method": "paper"}
+    *_, last = train_field_job(order, place)
+    assert (last.in_use, last.before_mask, last.psnr_mask) == (True, None, 15.5)
+    assert paper_field_path(GELATIN, place.data_dir) == own_field_path(GELATIN, place.data_dir)
+    assert own_field_path(GELATIN, place.data_dir).read_bytes() == weights
+    assert json.loads(own_field_path(GELATIN, place.data_dir).with_suffix(".json").read_text())["psnr_full"] == 20.5
+    assert FieldLibrary(place.data_dir).stamp(GELATIN) == ours
+    assert not (place.folder / COMPARISON).exists()
+    assert (place.folder / f"{GELATIN}.safetensors").read_bytes() == weights
