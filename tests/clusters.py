@@ -1,7 +1,8 @@
-"""A Dask cluster of this machine, and pieces of work for it."""
+"""A Dask cluster of this machine, and pieces of work and trainings for it."""
 
 import os
 import signal
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,7 +10,10 @@ import numpy as np
 from distributed import LocalCluster
 
 from osfcore.experiments.task_cache import TaskResult
+from osfcore.fields.training.kiloosf_training import FieldStep, train_field
+from osfcore.fields.training.recipes import TrainField
 from osfcore.inspection.contact_sheet import Comparison
+from tests.core.fields.rendered_sets import QUICK
 
 
 @contextmanager
@@ -39,3 +43,13 @@ def deadly(_: int) -> TaskResult:
     """Every worker dies of it."""
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError("dead")
+
+
+def training_that_dies(settings: TrainField, name: str, mark: Path) -> Iterator[FieldStep]:
+    """A quick training whose process dies of one object the first time, when it has begun."""
+    steps = train_field(settings, QUICK)
+    yield next(steps)
+    if settings.out.stem == name and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    yield from steps

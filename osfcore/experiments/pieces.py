@@ -15,6 +15,7 @@ from typing import Any
 
 from osfcore.errors import WorkerDied
 from osfcore.experiments.task_cache import TaskCache, TaskResult
+from osfcore.fields.devices import computing_threads
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +84,8 @@ def _shared_out(
 
 
 def _in_one_thread(work: Callable[[], TaskResult]) -> TaskResult:
-    import numba
-
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        with torch_in_one_thread():
-            return work()
-    finally:
-        numba.set_num_threads(before)
+    with computing_threads(1):
+        return work()
 
 
 @contextmanager

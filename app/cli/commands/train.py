@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json as json_text
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,24 +12,28 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from app.cli.progress_bar import follow
+from app.cli.workers import worker_pool
 from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
+from osfcore.io.output_paths import SUFFIX
 
 if TYPE_CHECKING:
     from osfcore.fields.training.kiloosf_training import FieldStep
+    from osfcore.fields.training.several import FieldSettings, TrainOne
     from osfcore.progress import Progress
 
 
 @dataclass(frozen=True)
 class TrainFieldCommand:
-    """An object's field from an image set in the OSF format. A killed training goes on when started again."""
+    """Fields of objects from image sets in the OSF format. A killed training goes on when started again."""
 
-    data: Path
-    """Folder with train/anno.json and test/anno.json."""
+    data: tuple[Path, ...]
+    """Folder with train/anno.json and test/anno.json; several such folders for as many objects."""
     out: Path
-    """File to write, such as 006_mustard_bottle.safetensors; its metrics go beside it as .json."""
+    """File to write, such as 006_mustard_bottle.safetensors; its metrics go beside it as .json. Of several sets: a
+    folder for files that are named after those of the sets."""
     minutes: float = 30.0
-    """How long to train [min]."""
+    """How long to train each [min]."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     seed: int = 0
@@ -45,33 +50,68 @@ class TrainFieldCommand:
     """Units of each layer of the teacher."""
     teacher_depth: int = 4
     """Layers of the teacher."""
+    workers: int = 1
+    """Processes that train several objects side by side, each in its share of the threads."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers train instead; they need the same image sets at the same place."""
     json: bool = False
     """Print the result as one JSON object in the last line."""
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
-        follow(_progress(self._train_paper() if self.method == "paper" else self._train_ours()))
-        metrics = _metrics(self.out)
+        places = self._places()
+        outs = [out for _, out in places]
+        settings, train = self._paper(places) if self.method == "paper" else self._ours(places)
+        workers = min(self.workers, len(places))
+        with worker_pool(workers, self.cluster) as executor:
+            if len(places) == 1 and executor is None:
+                follow(_progress(train(settings[0])))
+            else:
+                follow(self._several(settings, train, executor, workers))
+        found = {out.stem: _metrics(out) for out in outs}
         if not self.json:
-            full, mask = metrics["psnr_full"], metrics["psnr_mask"]
-            quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
-            print(f"Wrote {self.out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
-        return {"out": str(self.out), **metrics}
+            for out, metrics in zip(outs, found.values(), strict=True):
+                full, mask = metrics["psnr_full"], metrics["psnr_mask"]
+                quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
+                print(f"Wrote {out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
+        return {"out": str(self.out), **(found[self.out.stem] if len(outs) == 1 else {"fields": found})}
 
-    def _train_ours(self) -> Iterator[FieldStep]:
+    def _places(self) -> list[tuple[Path, Path]]:
+        """Each image set with the file to write."""
+        if len(self.data) == 1:
+            return [(self.data[0], self.out)]
+        names = [data.absolute().name for data in self.data]
+        if not names or len(set(names)) < len(names):
+            allowed = "one folder or more, no two of one name, which becomes that of the field"
+            raise InvalidInput("choice of image sets", ", ".join(names) or "none", allowed)
+        if self.out.suffix == SUFFIX:
+            raise InvalidInput("output of several image sets", self.out, "a folder")
+        return [(data, self.out / f"{name}{SUFFIX}") for data, name in zip(self.data, names, strict=True)]
+
+    def _several(
+        self, settings: Sequence[FieldSettings], train: TrainOne, executor: Executor | None, workers: int
+    ) -> Iterator[Progress]:
+        from torch import get_num_threads
+
+        from osfcore.fields.training.several import train_several
+
+        threads = 1 if self.cluster is not None else max(1, get_num_threads() // workers)
+        return train_several(settings, train, executor, threads=threads, shares_disk=self.cluster is None)
+
+    def _ours(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
         from osfcore.fields.training.kiloosf_training import train_field
         from osfcore.fields.training.recipes import TrainField
 
-        given = {"hollow": self.hollow, "recipe": self.recipe, "lit": self.method != "nerf"}
-        return train_field(TrainField(self.data, self.out, **given, **self._common()))
+        given = {"hollow": self.hollow, "recipe": self.recipe, "lit": self.method != "nerf", **self._common()}
+        return [TrainField(data, out, **given) for data, out in places], train_field
 
-    def _train_paper(self) -> Iterator[FieldStep]:
+    def _paper(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
         from osfcore.paper.fields.training import TrainPaperField, train_paper_field
 
         for option, is_given in (("--hollow", self.hollow), ("--recipe", self.recipe != "direct")):
             if is_given:
                 raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
-        return train_paper_field(TrainPaperField(self.data, self.out, **self._common()))
+        return [TrainPaperField(data, out, **self._common()) for data, out in places], train_paper_field
 
     def _common(self) -> dict[str, Any]:
         names = ("minutes", "device", "seed", "iterations", "teacher_width", "teacher_depth")

@@ -29,7 +29,7 @@ from osfcore.fields.training.distillation import Distillation, first_student
 from osfcore.fields.training.network_stage import NetworkHoldout, NetworkStage
 from osfcore.fields.training.optimization import Stage
 from osfcore.fields.training.osf_training import TeacherRecipe, first_teacher, restored_teacher
-from osfcore.fields.training.recipes import Recipe, TrainField
+from osfcore.fields.training.recipes import Pace, Recipe, TrainField
 from osfcore.fields.training.validation import Holdout
 from osfcore.fields.training.visual_hull import silhouette_box
 from osfcore.fields.voxel_shell import first_shell, refine, trim
@@ -38,11 +38,9 @@ from osfcore.io.image_set import ImageSet, read_splits
 from osfcore.io.output_paths import check_weights_place
 from osfcore.progress import Progress
 
-_REPORT_S = 1.0
 _AIMED_BYTES = 2_000_000
 _NEEDED_WEIGHTS = (0.02, 0.05, 0.1, 0.2)  # of samples that a view must show, tried until the file is small enough
 _OWN_METRICS = ("psnr_full", "psnr_mask")  # by which a file of metrics is known
-_CHECKPOINT_S = 20.0
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MIN_LOOK_S = 5.0
 _TRANSITIONS = {"distil": "Baking the teacher into a shell", "fine": "Refining the shell"}
@@ -66,7 +64,7 @@ class FieldStep:
     preview: UInt8[np.ndarray, "h w3 3"] | None
 
 
-def train_field(config: TrainField, recipe: Recipe | None = None) -> Iterator[FieldStep]:
+def train_field(config: TrainField, recipe: Recipe | None = None, pace: Pace | None = None) -> Iterator[FieldStep]:
     """Train a field from an image set and write it.
 
     Raises:
@@ -85,7 +83,7 @@ def train_field(config: TrainField, recipe: Recipe | None = None) -> Iterator[Fi
         raise CorruptFile(config.data, f"its images are opaque all over; {expected}")
     if not config.lit:  # l = 0 leaves n . l and the networks' weights for l without a gradient
         train, test = (replace(part, light_directions=np.zeros_like(part.light_directions)) for part in (train, test))
-    yield from _Run(config, recipe, device, train, test).steps()
+    yield from _Run(config, recipe, pace or Pace(), device, train, test).steps()
 
 
 def _check(config: TrainField) -> None:
@@ -110,9 +108,9 @@ class _Run:
     """The state of one training run between its steps."""
 
     def __init__(
-        self, config: TrainField, recipe: Recipe, device: torch.device, train: ImageSet, test: ImageSet
+        self, config: TrainField, recipe: Recipe, pace: Pace, device: torch.device, train: ImageSet, test: ImageSet
     ) -> None:
-        self._config, self._recipe, self._device = config, recipe, device
+        self._config, self._recipe, self._pace, self._device = config, recipe, pace, device
         self._images, self._source = train, RaySource(train)
         self._pixels = self._source.silhouette_pixels()
         self._test, self._holdout = test, Holdout(test)
@@ -193,11 +191,11 @@ class _Run:
             self._done_steps += 1
             now = time.monotonic()
             self._done_s = already + now - began
-            if now - reported > _REPORT_S:
+            if now - reported > self._pace.report_s:
                 reported = now
                 yield self._look(stage)
                 began += time.monotonic() - now  # looking costs nobody's budget
-            if now - saved > _CHECKPOINT_S:
+            if now - saved > self._pace.checkpoint_s:
                 saved = now
                 self._save(name, stage)
                 began += time.monotonic() - now

@@ -50,6 +50,19 @@ class Recipe:
 
 
 @dataclass(frozen=True, slots=True)
+class Pace:
+    """How often a training that runs is heard of; no matter to what it learns.
+
+    Attributes:
+        report_s: between two steps that are told [s].
+        checkpoint_s: between two checkpoints [s].
+    """
+
+    report_s: float = 1.0
+    checkpoint_s: float = 20.0
+
+
+@dataclass(frozen=True, slots=True)
 class TrainField:
     """A training run.
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
-from osfcore.errors import CorruptFile, check_seed
+from osfcore.errors import CorruptFile, InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.fields.ray_sampling import RayBatch, RaySource
 from osfcore.fields.table_field import TableField, table_bytes, table_from_bytes
@@ -23,8 +23,6 @@ from osfcore.io.image_set import ImageSet, read_splits
 from osfcore.io.output_paths import check_weights_place
 from osfcore.progress import Progress
 
-_ITERATIONS = 3000
-_RAYS = 8192
 _HIDDEN = 16
 _GRID = 16
 _RATES = (2e-2, 2e-4)
@@ -42,12 +40,16 @@ class TrainTable:
         out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
         device: "auto", "cpu" or "cuda".
         seed: of everything random.
+        iterations: steps of descent.
+        rays: pixels per step.
     """
 
     data: Path
     out: Path
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
+    iterations: int = 3000
+    rays: int = 8192
 
 
 class _Model(nn.Module):
@@ -79,15 +81,18 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
     """Train a table from an image set and write it.
 
     Raises:
-        InvalidInput: if the seed is out of range, cuda is asked for and not there, the output file has another suffix,
+        InvalidInput: if a number is out of range, cuda is asked for and not there, the output file has another suffix,
             or a file of somebody else lies where the metrics belong.
         CorruptFile: if the image set is not sound or shows an object.
         CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
     check_seed(config.seed)
+    for what, number in (("iterations", config.iterations), ("rays", config.rays)):
+        if not 1 <= number <= 10_000_000:
+            raise InvalidInput(what, number, "between 1 and 10,000,000")
     check_weights_place(config.out, _OWN_METRICS)
-    yield Progress(0, _ITERATIONS, "Reading the images")
+    yield Progress(0, config.iterations, "Reading the images")
     train, test = read_splits(config.data)
     if not train.is_opaque:
         raise CorruptFile(config.data, "its images have transparent parts; the bare table is opaque")
@@ -97,10 +102,10 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
     optimiser = torch.optim.Adam(model.parameters(), fused=True)
     source = RaySource(train)
     pixels = train.rgba[..., 0].size
-    for done in range(_ITERATIONS):
+    for done in range(config.iterations):
         for group in optimiser.param_groups:
-            group["lr"] = _RATES[0] * (_RATES[1] / _RATES[0]) ** (done / _ITERATIONS)
-        places, lights, truth, where = _batch(source, rng.integers(pixels, size=_RAYS), device)
+            group["lr"] = _RATES[0] * (_RATES[1] / _RATES[0]) ** (done / config.iterations)
+        places, lights, truth, where = _batch(source, rng.integers(pixels, size=config.rays), device)
         on_table, beyond = where
         loss = functional.mse_loss(model(places[on_table], lights[on_table]), truth[on_table])
         if beyond.any():
@@ -110,7 +115,7 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
         optimiser.step()
         if done % _REPORT_EVERY == 0:
             yield Progress(
-                done, _ITERATIONS, f"{-10 * np.log10(float(loss.detach()) + 1e-10):.1f} dB on its own images"
+                done, config.iterations, f"{-10 * np.log10(float(loss.detach()) + 1e-10):.1f} dB on its own images"
             )
     yield _finish(config, model, train, test, device)
 
@@ -120,11 +125,11 @@ def _finish(config: TrainTable, model: _Model, train: ImageSet, test: ImageSet, 
     psnr = _measure(table_from_bytes(data, "The trained table"), test)
     size = len(data)
     metrics = {"psnr": round(psnr, 3), "test_images": len(test.cameras), "train_images": len(train.cameras),
-               "bytes": size, "iterations": _ITERATIONS, "seed": config.seed, "device": str(device),
+               "bytes": size, "iterations": config.iterations, "seed": config.seed, "device": str(device),
                "data": config.data.name}  # fmt: skip
     write_atomically(config.out, data)
     write_json(config.out.with_suffix(".json"), metrics)
-    return Progress(_ITERATIONS, _ITERATIONS, f"{psnr:.2f} dB held out, {size / 1000:.0f} kB")
+    return Progress(config.iterations, config.iterations, f"{psnr:.2f} dB held out, {size / 1000:.0f} kB")
 
 
 def _batch(source: RaySource, pixels: np.ndarray, device: torch.device):  # noqa: ANN202

@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -9,13 +10,20 @@ import numpy as np
 import pytest
 
 from app.cli import workers
+from app.cli.commands.train import TrainFieldCommand
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
 from osfcore.experiments.pieces import Piece, results_of
 from osfcore.experiments.task_cache import TaskCache
+from osfcore.fields.devices import computing_threads
+from osfcore.fields.field_weights import read_field
+from osfcore.fields.training.kiloosf_training import train_field
+from osfcore.fields.training.recipes import TrainField
+from osfcore.fields.training.several import train_several
 from osfcore.io.push_file import read_pushes
 from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
-from tests.clusters import deadly, local_cluster, number_of, number_that_kills
+from tests.clusters import deadly, local_cluster, number_of, number_that_kills, training_that_dies
+from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set
 
 
 def test_one_worker_is_this_process():
@@ -97,12 +105,6 @@ def test_a_worker_of_a_cluster_that_is_killed_costs_no_result(cluster, tmp_path)
 
 
 @pytest.mark.slow
-def test_work_that_kills_every_worker_is_told(cluster, tmp_path):
-    with pytest.raises(WorkerDied, match="worker process died"):
-        results(worker_pool(1, cluster), pieces_of(tmp_path, [partial(deadly, 0)]))
-
-
-@pytest.mark.slow
 def test_pushes_from_a_cluster_are_the_same_to_the_last_bit(cluster, library, tmp_path):
     for name, pool in (("alone", worker_pool(1)), ("cluster", worker_pool(1, cluster))):
         config = CollectPushes(tmp_path / f"{name}.h5", episodes=4, steps=5, objects=2, policy="directed")
@@ -114,6 +116,62 @@ def test_pushes_from_a_cluster_are_the_same_to_the_last_bit(cluster, library, tm
         assert one.names == other.names
         np.testing.assert_array_equal(one.positions, other.positions)
         np.testing.assert_array_equal(one.actions, other.actions)
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sets")
+    solids = {"ball": painted_ball(), "block": painted_block()}
+    return tuple(write_object_set(folder / name, solid, train=12, test=2) for name, solid in solids.items())
+
+
+def trainings(sets, folder):
+    return [TrainField(one, folder / f"{one.name}.safetensors", iterations=10, device="cpu") for one in sets]
+
+
+@pytest.mark.slow
+def test_fields_from_a_cluster_are_those_of_one_process(cluster, sets, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # workers have a place of their own
+    here, there = trainings(sets, Path("here")), trainings([Path(os.path.relpath(one)) for one in sets], Path("there"))
+    train = partial(train_field, recipe=QUICK)
+    with computing_threads(1):
+        list(train_several(here, train))
+    with worker_pool(1, cluster) as executor:
+        list(train_several(there, train, executor, shares_disk=False))
+    for one, other in zip(here, there, strict=True):
+        a, b = (json.loads(settings.out.with_suffix(".json").read_text()) for settings in (one, other))
+        assert (a["iterations"], a["threads"]) == (b["iterations"], b["threads"]) == (10, 1)
+        assert a["psnr_full"] == pytest.approx(b["psnr_full"], abs=0.1)
+        np.testing.assert_allclose(read_field(one.out).networks, read_field(other.out).networks, atol=0.02)
+    assert sorted(path.name for path in Path("there").iterdir()) == [
+        "ball.json", "ball.safetensors", "block.json", "block.safetensors",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_no_field(cluster, sets, tmp_path):
+    train = partial(training_that_dies, name="ball", mark=tmp_path / "mark")
+    settings = trainings(sets, tmp_path)
+    with worker_pool(1, cluster) as executor:
+        *_, last = train_several(settings, train, executor, shares_disk=False)
+    assert (tmp_path / "mark").exists()
+    assert (last.done, last.total) == (2, 2)
+    assert all(read_field(one.out).hidden == QUICK.hidden for one in settings)
+
+
+@pytest.mark.slow
+def test_a_field_is_ordered_from_a_cluster(cluster, sets, tmp_path, capsys):
+    command = TrainFieldCommand(sets[:1], tmp_path / "mine.safetensors", iterations=10, device="cpu", cluster=cluster)
+    result = command.run()
+    assert result == {"out": str(command.out), **json.loads(command.out.with_suffix(".json").read_text())}
+    assert f"{result['psnr_mask']:.1f} dB in the mask" in capsys.readouterr().out
+    assert command.run() == result  # it is there: minutes would differ
+
+
+@pytest.mark.slow  # after all others: Dask does not replace a worker that dies while it is being started
+def test_work_that_kills_every_worker_is_told(cluster, tmp_path):
+    with pytest.raises(WorkerDied, match="worker process died"):
+        results(worker_pool(1, cluster), pieces_of(tmp_path, [partial(deadly, 0)]))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "tcp://127.0.0.1:99999999"])

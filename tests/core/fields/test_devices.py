@@ -1,8 +1,9 @@
+import numba
 import pytest
 import torch
 
 from osfcore.errors import InvalidInput
-from osfcore.fields.devices import pick_device
+from osfcore.fields.devices import computing_threads, pick_device
 
 
 def test_the_processor_is_always_there():
@@ -23,3 +24,13 @@ def test_a_missing_gpu_is_told_in_words(monkeypatch):
         pick_device("cuda")
     with pytest.raises(InvalidInput, match="auto, cpu or cuda"):
         pick_device("tpu")
+
+
+def test_threads_are_limited_and_given_back():
+    before = torch.get_num_threads(), numba.get_num_threads()
+    with computing_threads(1):
+        assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
+        with computing_threads(3):
+            assert torch.get_num_threads() == 3
+            assert 1 <= numba.get_num_threads() <= before[1]
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before

@@ -5,6 +5,7 @@ import sys
 import time
 
 import pytest
+import torch
 
 from app.cli.commands.train import TrainFieldCommand, TrainTableCommand
 from app.cli.main import main
@@ -26,7 +27,7 @@ def image_set(tmp_path_factory):
 @pytest.mark.slow
 def test_a_field_is_written_with_what_it_reaches(image_set, tmp_path, capsys):
     out = tmp_path / "egg.safetensors"
-    result = TrainFieldCommand(image_set, out, minutes=0.05, device="cpu").run()
+    result = TrainFieldCommand((image_set,), out, minutes=0.05, device="cpu").run()
     assert read_field(out).hidden > 0
     assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
     assert 15 < result["psnr_mask"] <= result["psnr_full"] < 60
@@ -60,6 +61,28 @@ def test_a_killed_training_goes_on_when_the_same_command_is_run_again(image_set,
 
 
 @pytest.mark.slow
+def test_several_sets_become_a_folder_of_fields(image_set, tmp_path, capsys):
+    sets = [image_set, write_set(tmp_path / "pebble", train=24, size=48, seed=1)]
+    arguments = ["train", "field", "--data", *map(str, sets), "--out", str(tmp_path / "fields")]
+    arguments += ["--iterations", "10", "--device", "cpu", "--workers", "2"]
+    assert main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    found = json.loads(told.out.splitlines()[-1])["fields"]
+    assert set(found) == {"egg", "pebble"}
+    for name, metrics in found.items():
+        assert metrics == json.loads((tmp_path / "fields" / f"{name}.json").read_text())
+        assert read_field(tmp_path / "fields" / f"{name}.safetensors").hidden > 0
+    assert {metrics["threads"] for metrics in found.values()} == {max(1, torch.get_num_threads() // 2)}
+    assert "2 of 2 trained, " in told.err
+    assert main(arguments) == 0
+    told = capsys.readouterr()
+    assert "1 of 2" not in told.err  # they are there
+    assert [line.split(":")[0] for line in told.out.splitlines()] == [
+        f"Wrote {tmp_path / 'fields' / name}.safetensors" for name in ("egg", "pebble")
+    ]
+
+
+@pytest.mark.slow
 def test_the_table_has_a_training_of_its_own(tmp_path, capsys):
     from osfcore.world.collection.collect_images import CollectTable, collect_table
 
@@ -73,11 +96,19 @@ def test_the_table_has_a_training_of_its_own(tmp_path, capsys):
 
 def test_mistakes_are_told_before_anything_is_trained(image_set, tmp_path):
     with pytest.raises(InvalidInput, match=r"\.safetensors"):
-        TrainFieldCommand(image_set, tmp_path / "egg.npz").run()
+        TrainFieldCommand((image_set,), tmp_path / "egg.npz").run()
     with pytest.raises(InvalidInput, match="minutes"):
-        TrainFieldCommand(image_set, tmp_path / "egg.safetensors", minutes=0).run()
+        TrainFieldCommand((image_set,), tmp_path / "egg.safetensors", minutes=0).run()
     with pytest.raises(CorruptFile, match="anno.json"):
-        TrainFieldCommand(tmp_path, tmp_path / "egg.safetensors").run()
+        TrainFieldCommand((tmp_path,), tmp_path / "egg.safetensors").run()
+    with pytest.raises(InvalidInput, match=r"egg.safetensors, but it must be a folder"):
+        TrainFieldCommand((image_set, tmp_path), tmp_path / "egg.safetensors").run()
+    with pytest.raises(InvalidInput, match="no two of one name"):
+        TrainFieldCommand((image_set, tmp_path / "egg"), tmp_path / "fields").run()
+    with pytest.raises(InvalidInput, match="image sets is none"):
+        TrainFieldCommand((), tmp_path / "egg.safetensors").run()
+    with pytest.raises(InvalidInput, match="number of workers"):
+        TrainFieldCommand((image_set,), tmp_path / "egg.safetensors", workers=0).run()
     assert not (tmp_path / "egg.safetensors").exists()
 
 

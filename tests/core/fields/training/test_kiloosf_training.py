@@ -14,7 +14,7 @@ from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.fields.field_weights import read_field
 from osfcore.fields.training import kiloosf_training as training
 from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.recipes import TrainField
+from osfcore.fields.training.recipes import Pace, TrainField
 from osfcore.io.image_set import read_image_set
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
@@ -32,8 +32,11 @@ def ball_set(tmp_path_factory):
     return write_object_set(tmp_path_factory.mktemp("sets") / "ball", painted_ball(), seed=1)
 
 
-def run(config: TrainField, recipe=QUICK):
-    return list(train_field(config, recipe))
+OFTEN = Pace(0.0, 0.0)
+
+
+def run(config: TrainField, pace: Pace | None = None):
+    return list(train_field(config, QUICK, pace))
 
 
 def metrics(config: TrainField) -> dict:
@@ -110,20 +113,17 @@ def test_a_time_budget_is_kept(block_set, tmp_path):
 _KILLED = """
 import sys
 from pathlib import Path
-from osfcore.fields.training import kiloosf_training as training
-from osfcore.io.image_set import read_image_set
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.types import SceneBatch
+from osfcore.fields.training.kiloosf_training import train_field
+from osfcore.fields.training.recipes import Pace, TrainField
 from tests.core.fields.rendered_sets import QUICK
-training._CHECKPOINT_S = training._REPORT_S = 0.2
-config = training.TrainField(Path(sys.argv[1]), Path(sys.argv[2]), iterations=240, device="cpu")
-for step in training.train_field(config, QUICK):
+config = TrainField(Path(sys.argv[1]), Path(sys.argv[2]), iterations=240, device="cpu")
+for step in train_field(config, QUICK, Pace(0.2, 0.2)):
     print(step.progress.done, flush=True)
 """
 
 
 @pytest.mark.slow
-def test_killed_training_goes_on_where_it_was(block_set, tmp_path, monkeypatch):
+def test_killed_training_goes_on_where_it_was(block_set, tmp_path):
     """SIGKILL in the middle: the same command takes up the checkpoint and ends as an undisturbed run does."""
     config = TrainField(block_set, tmp_path / "a.safetensors", iterations=240, device="cpu")
     command = [sys.executable, "-c", _KILLED, str(block_set), str(config.out)]
@@ -140,8 +140,7 @@ def test_killed_training_goes_on_where_it_was(block_set, tmp_path, monkeypatch):
     assert 80 <= done < 240
     assert not config.out.exists()
     began = time.monotonic()
-    monkeypatch.setattr(training, "_REPORT_S", 0.0)
-    steps = run(config)
+    steps = run(config, pace=OFTEN)
     assert steps[1].progress.note == "Going on from a checkpoint"
     assert 20 < steps[1].progress.done <= done + 100
     assert not partial.exists()
@@ -151,26 +150,22 @@ def test_killed_training_goes_on_where_it_was(block_set, tmp_path, monkeypatch):
     assert time.monotonic() - began < 300
 
 
-def test_a_checkpoint_of_other_settings_is_not_gone_on_from(block_set, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "_CHECKPOINT_S", 0.0)
-    monkeypatch.setattr(training, "_REPORT_S", 0.0)
+def test_a_checkpoint_of_other_settings_is_not_gone_on_from(block_set, tmp_path):
     config = TrainField(block_set, tmp_path / "a.safetensors", iterations=40, device="cpu")
-    for step in train_field(config, QUICK):
+    for step in train_field(config, QUICK, OFTEN):
         if step.progress.done >= 3:
             break
     assert config.out.with_suffix(".partial").exists()
-    steps = run(replace(config, seed=9))
+    steps = run(replace(config, seed=9), OFTEN)
     assert steps[1].progress.note == "Carving the silhouettes"
 
 
-def test_a_checkpoint_of_other_images_in_the_same_place_is_not_gone_on_from(block_set, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "_CHECKPOINT_S", 0.0)
-    monkeypatch.setattr(training, "_REPORT_S", 0.0)
+def test_a_checkpoint_of_other_images_in_the_same_place_is_not_gone_on_from(block_set, tmp_path):
     data = shutil.copytree(block_set, tmp_path / "set")
     config = TrainField(data, tmp_path / "a.safetensors", iterations=40, device="cpu")
 
     def begin():
-        for step in train_field(config, QUICK):
+        for step in train_field(config, QUICK, OFTEN):
             if step.progress.done >= 3:
                 return
             if step.progress.note in ("Going on from a checkpoint", "Carving the silhouettes"):

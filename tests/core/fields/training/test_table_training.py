@@ -30,10 +30,7 @@ def table_set(tmp_path_factory):
 def trained(table_set, tmp_path_factory):
     """A table, its progress and its metrics; fewer steps than for the shipped one."""
     out = tmp_path_factory.mktemp("out") / "table.safetensors"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_table, "_ITERATIONS", 800)
-        patch.setattr(training_table, "_RAYS", 2048)
-        steps = list(train_table(TrainTable(table_set, out, device="cpu")))
+    steps = list(train_table(TrainTable(table_set, out, device="cpu", iterations=800, rays=2048)))
     return read_table(out), steps, json.loads(out.with_suffix(".json").read_text()), out
 
 
@@ -82,11 +79,10 @@ def test_sets_of_objects_and_bad_settings_are_told(tmp_path):
         next(train_table(TrainTable(objects, tmp_path / "a.safetensors", device="tpu")))
 
 
-def test_a_place_that_cannot_be_written_is_told(table_set, tmp_path, monkeypatch):
-    monkeypatch.setattr(training_table, "_ITERATIONS", 2)
+def test_a_place_that_cannot_be_written_is_told(table_set, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(CannotWrite, match="file"):
-        list(train_table(TrainTable(table_set, tmp_path / "file" / "a.safetensors", device="cpu")))
+        list(train_table(TrainTable(table_set, tmp_path / "file" / "a.safetensors", device="cpu", iterations=2)))
 
 
 def test_seeds_and_places_are_tried_before_anything_is_read(tmp_path):
@@ -95,6 +91,8 @@ def test_seeds_and_places_are_tried_before_anything_is_read(tmp_path):
     for config, error, words in (
         (TrainTable(tmp_path, tmp_path / "a.safetensors", seed=-1), InvalidInput, "seed is -1"),
         (TrainTable(tmp_path, tmp_path / "a.safetensors", seed=2**64), InvalidInput, "seed"),
+        (TrainTable(tmp_path, tmp_path / "a.safetensors", iterations=0), InvalidInput, "iterations is 0"),
+        (TrainTable(tmp_path, tmp_path / "a.safetensors", rays=0), InvalidInput, "rays is 0"),
         (TrainTable(tmp_path, tmp_path / "folder.safetensors"), CannotWrite, "it is a folder"),
         (TrainTable(tmp_path, tmp_path / "mine.safetensors"), InvalidInput, "mine.json beside it"),
     ):
@@ -104,10 +102,9 @@ def test_seeds_and_places_are_tried_before_anything_is_read(tmp_path):
 
 
 def test_a_table_that_cannot_be_read_back_leaves_the_older_one(table_set, tmp_path, monkeypatch):
-    monkeypatch.setattr(training_table, "_ITERATIONS", 2)
     monkeypatch.setattr(training_table, "table_bytes", lambda table: b"broken")
     out = tmp_path / "a.safetensors"
     out.write_bytes(b"older")
     with pytest.raises(CorruptFile, match="The trained table cannot be used"):
-        list(train_table(TrainTable(table_set, out, device="cpu")))
+        list(train_table(TrainTable(table_set, out, device="cpu", iterations=2)))
     assert out.read_bytes() == b"older"
