@@ -18,7 +18,8 @@ from osfcore.experiments.rivals.nerf import load_nerf_appearance, nerf_library
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.paper.stages import load_paper_appearance, paper_field_names, paper_field_path
+from osfcore.paper.method import paper_field_names, paper_field_path
+from osfcore.paper.stages import load_paper_appearance
 
 FIELD_METHODS = ("ours", "paper", "nerf")
 TITLES: Mapping[str, str] = MappingProxyType(
