@@ -26,8 +26,8 @@ def scenes(names=(NAME,)):
 def test_every_light_shows_the_same():
     models = load_nerf_appearance((NAME,), FieldLibrary(None), None)
     seen = models.together.render(scenes(), (goal_camera(48),)).rgb
-    np.testing.assert_array_equal(seen[0], seen[1])
-    np.testing.assert_array_equal(seen[0], seen[2])
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-6)
+    np.testing.assert_allclose(seen[2], seen[0], atol=1e-6)
     lit = SceneRenderer({NAME: FieldLibrary(None).load(NAME)}, FieldLibrary(None).load_table())
     relit = lit.render(scenes(), (goal_camera(48),)).rgb
     assert np.abs(relit[0] - relit[1]).mean() > 0.05
@@ -40,7 +40,7 @@ def test_a_field_without_light_has_the_density_that_it_had():
     seen = SceneRenderer({NAME: unlit}, None).render(scenes(), (goal_camera(32),), outputs={"rgb", "depth"})
     true = SceneRenderer({NAME: field}, None).render(scenes(), (goal_camera(32),), outputs={"rgb", "depth"})
     np.testing.assert_allclose(seen.depth, true.depth, atol=1e-5)
-    np.testing.assert_array_equal(seen.rgb[0], seen.rgb[1])
+    np.testing.assert_allclose(seen.rgb[1], seen.rgb[0], atol=1e-6)
 
 
 def test_nothing_casts_a_shadow():
@@ -48,7 +48,7 @@ def test_nothing_casts_a_shadow():
     bare = UnlitRenderer(fields, table).render(scenes(()), (goal_camera(48),)).rgb
     seen = UnlitRenderer(fields, table).render(scenes(), (goal_camera(48),), outputs={"rgb", "opacity"})
     free = seen.opacity.sum(axis=2) == 0
-    np.testing.assert_array_equal(seen.rgb[free], bare[free])
+    np.testing.assert_allclose(seen.rgb[free], bare[free], atol=1e-6)
 
 
 def test_the_mean_table_is_the_mean_over_lights():
