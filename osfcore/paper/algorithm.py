@@ -33,10 +33,12 @@ class AlgorithmSettings:
     Attributes:
         steps: actions (T).
         plan: how they are sampled.
+        has_masks: whether there are masks at every step, as in the paper's evaluation; else in the first frame alone.
     """
 
     steps: int = 30
     plan: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
+    has_masks: bool = False
 
 
 def run_algorithm(
@@ -78,7 +80,7 @@ def run_algorithm(
         world.act(round_.actions[0])
         planner.shift()
         yield ActionExecuted(number + 1, round_.actions[0])
-        observation = world.observe()
+        observation = world.observe(masks=settings.has_masks)
         yield Observed(number + 1, observation)
         later = estimators.later_frame(models.appearance, observation, estimate.state, rng)
         estimate = yield from _look(number + 1, _timed("estimate", later, seconds))

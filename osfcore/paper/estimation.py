@@ -3,8 +3,9 @@
 The first frame has masks. For some iterations the light is held overhead and each object's pose is optimised by its own
 CMA-ES within its masks (eq. 5); then one CMA-ES optimises all poses and the light together (eq. 5 and 6). Later frames
 have no masks: one CMA-ES begins at the last estimate, with a smaller initial standard deviation, and compares whole
-images (eq. 6). Poses are position and quaternion, s in R^7; the light is a position L^p in R^3 of which the direction
-counts. There are no resting orientations, no gradients, no rivals, no predictions, no doubts.
+images (eq. 6; with masks after all, as the paper's own evaluation has them, eq. 5 is added as before). Poses are
+position and quaternion, s in R^7; the light is a position L^p in R^3 of which the direction counts. There are no
+resting orientations, no gradients, no rivals, no predictions, no doubts.
 
 Readings of what the paper leaves open: positions begin at the masks' centroids, triangulated, and orientations upright;
 the first five iterations have a population large enough to find an orientation; populations, iterations and standard
@@ -118,7 +119,7 @@ def estimate_next(
 
     Args:
         models: fields of the objects and the table.
-        observation: one or more views; masks play no part.
+        observation: one or more views, with masks or without.
         before: the last estimate.
         rng: of the search.
         config: how much work to do.
@@ -134,7 +135,7 @@ def estimate_next(
     params = SceneParameters.of(before.reordered(observation.names), observation.pusher)
     search = _Search(params, config.later_spread, config.later_population, rng)
     reporter = StepReporter(config.later_iterations + 1)
-    yield from _descend(models, views, search, config.later_iterations, reporter, has_masks=False)
+    yield from _descend(models, views, search, config.later_iterations, reporter, has_masks=views.masks is not None)
 
 
 def masked_error(models: ObjectModels, views: ObservedViews, number: int, batch: SceneBatch) -> Float[np.ndarray, "B"]:

@@ -105,6 +105,8 @@ class EvaluateMpcCommand(ParallelEvaluation):
     """With --method ours: stages that are replaced by the truth."""
     views: int = 4
     """Cameras that look, 1 to 4."""
+    masks: bool = False
+    """With --method paper: masks at every step, not in the first frame alone."""
     samples: int = 160
     """Sequences of actions in each round of our plans (K)."""
     horizon: int = 30
@@ -124,7 +126,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
         from osfcore.experiments.rearrangement.methods import Variant
         from osfcore.planning.mppi import PlanSettings
 
-        variant = Variant(self.method, frozenset(self.ours), frozenset(self.truths), self.views)
+        variant = Variant(self.method, frozenset(self.ours), frozenset(self.truths), self.views, self.masks)
         settings = EpisodeSettings(plan=PlanSettings(samples=self.samples, horizon=self.horizon))
         config = EvaluateMpc(
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,

@@ -152,7 +152,7 @@ def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
     """The figures of a report with what was measured, as plain JSON."""
     about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "cost")}
     variant = config.variant
-    about |= {"method": variant.method, "views": variant.views}
+    about |= {"method": variant.method, "views": variant.views, "masks": variant.has_masks}
     about |= {"ours": sorted(variant.replaced), "truths": sorted(variant.truths)}
     return {**report.to_json(), **about}
 

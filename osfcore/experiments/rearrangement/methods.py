@@ -57,12 +57,14 @@ class Variant:
         replaced: stages of the paper's method that are ours.
         truths: stages of ours that are replaced by the truth.
         views: cameras that it looks through.
+        has_masks: whether the paper's method gets masks at every step, as in the paper's evaluation.
     """
 
     method: Method = "ours"
     replaced: frozenset[StageName] = frozenset()
     truths: frozenset[TruthName] = frozenset()
     views: int = 4
+    has_masks: bool = False
 
     def published(self, stage: StageName) -> bool:
         """Whether a stage is the paper's."""
@@ -72,7 +74,8 @@ class Variant:
         """Of its files: the method, then what differs from it."""
         views = f"{self.views}views" if self.views != Variant().views else ""
         true = (f"true_{truth}" for truth in sorted(self.truths))
-        return "-".join(part for part in (self.method, *sorted(self.replaced), *true, views) if part)
+        masks = "masks" if self.has_masks else ""
+        return "-".join(part for part in (self.method, *sorted(self.replaced), *true, views, masks) if part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +152,10 @@ def check_variant(variant: Variant) -> None:
     if len(variant.replaced) == len(STAGES):
         raise InvalidInput("stages of ours", "all of them", "some; method ours is what replaces all")
     _check_choice("stages replaced by the truth", variant.truths, TRUTHS, variant.method, "ours")
+    if variant.has_masks and not (variant.published("estimation") and variant.published("planning")):
+        raise InvalidInput(
+            "masks at every step", "given", "left out: only the paper's estimation and planning use them"
+        )
     most = Variant().views
     if not 1 <= variant.views <= most:
         raise InvalidInput("number of views", variant.views, f"between 1 and {most}")

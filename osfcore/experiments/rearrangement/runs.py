@@ -82,7 +82,7 @@ def run_from_images(
         world.restore(task.start)
         parts = told_truths(parts, variant.truths, world.truth, assets)
         if variant.published("planning"):
-            how = AlgorithmSettings(settings.steps)
+            how = AlgorithmSettings(settings.steps, has_masks=variant.has_masks)
             events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
         else:
             target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal

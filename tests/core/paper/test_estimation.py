@@ -77,6 +77,15 @@ def test_a_later_frame_begins_at_the_last_estimate(plain, truth, seen):
     assert np.rad2deg(light) < 10
 
 
+def test_masks_count_in_a_later_frame_where_there_are_any(plain, truth, seen):
+    config = PaperEstimationConfig(later_iterations=2)
+    sure, blind, empty = (
+        list(estimate_next(plain, replace(seen, masks=masks), truth, np.random.default_rng(0), config))[-1].loss
+        for masks in (seen.masks, None, np.zeros_like(seen.masks))
+    )
+    assert blind < sure < empty  # eq. 5 adds little where masks are right
+
+
 def test_the_same_seed_finds_the_same(plain, seen):
     config = PaperEstimationConfig(masked_iterations=1, joint_iterations=1)
     ends = [list(estimate_first(plain, seen, np.random.default_rng(s), config))[-1].state for s in (1, 1, 2)]

@@ -26,6 +26,8 @@ NAME = "009_gelatin_box"
         (Variant("ours", truths=frozenset({"luck"})), "poses, goal, dynamics"),
         (Variant(views=0), "number of views is 0"),
         (Variant(views=5), "between 1 and 4"),
+        (Variant(has_masks=True), "masks at every step is given"),
+        (Variant("paper", frozenset({"planning"}), has_masks=True), "left out"),
         (Variant("foresight", views=2), "which has the goal's view"),
     ],
 )
@@ -39,6 +41,7 @@ def test_variants_that_differ_have_names_that_differ():
     variants += [Variant("paper", frozenset({stage})) for stage in STAGES]
     variants += [Variant(truths=frozenset({truth})) for truth in TRUTHS]
     variants += [Variant(views=views) for views in (1, 2, 3)]
+    variants.append(Variant("paper", has_masks=True))
     for variant in variants:
         check_variant(variant)
     assert len({variant.name() for variant in variants}) == len(variants)
