@@ -113,6 +113,7 @@ def test_a_dying_simulation_is_told_and_the_scenes_live_on(open_runner):
     os.kill(pid, signal.SIGKILL)
     until(lambda: simulation_pid() not in (0, pid))
     until(lambda: any(isinstance(event, Notice) and event.level == "error" for event in runner.events))
+    until(lambda: runner.simulation_status == "ready")
     assert runner.act(scene.id, [(0.1, 0, 0)]).revision > scene.revision
 
 
