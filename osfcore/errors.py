@@ -147,6 +147,20 @@ def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "siz
     return vector
 
 
+def check_ranges(*limits: tuple[str, float, float, float]) -> None:
+    """Refuse numbers outside their ranges; NaN is in none.
+
+    Args:
+        limits: of each number what it is, its value, and the least and the largest that is allowed.
+
+    Raises:
+        InvalidInput: naming the first that is out of range.
+    """
+    for what, value, low, high in limits:
+        if not low <= value <= high:
+            raise InvalidInput(what, value, f"between {low} and {high}")
+
+
 def check_seed(value: int) -> int:
     """A seed that every random generator takes.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, check_ranges
 from osfcore.planning.mppi import PlanSettings
 
 CostKind = Literal["pose", "image"]
@@ -44,13 +44,11 @@ class EpisodeSettings:
         Raises:
             InvalidInput: naming what is out of range.
         """
-        for what, value, low, high in (
+        check_ranges(
             ("number of steps", self.steps, 1, MAX_STEPS),
             ("actions of each plan", self.replan_every, 1, MAX_STEPS),
             ("distance that counts as arrived [m]", self.reached_m, 0.0, 0.1),
             ("angle that counts as arrived [rad]", self.reached_rad, 0.0, 3.2),
-        ):
-            if not low <= value <= high:
-                raise InvalidInput(what, value, f"between {low} and {high}")
+        )
         if self.cost not in ("pose", "image"):
             raise InvalidInput("cost", repr(self.cost), '"pose" or "image"')

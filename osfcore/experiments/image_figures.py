@@ -4,42 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.experiments.charts import Axis, Chart, Curve
+from osfcore.experiments.charts import Axis, Chart, Curve, write_charts
 from osfcore.experiments.image_methods import TITLES
-from osfcore.experiments.pieces import Piece, results_of
+from osfcore.experiments.pieces import EvaluationStep, Piece, finished
 from osfcore.experiments.statistics import compare_means, mean_interval
 from osfcore.experiments.task_cache import TaskResult
+from osfcore.io.files import write_json
 
 OURS = "ours"  # what others are compared with
 Tables = Mapping[str, Mapping[str, Float[np.ndarray, "tasks x"]]]  # by method and measure; NaN where there is no figure
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class ImageComparisonStep:
-    """How far a comparison is.
-
-    Attributes:
-        done: scenes of single methods that are finished.
-        total: in all.
-        note: what is being done.
-        report: plain JSON, with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: dict[str, Any] | None = None
-
-
 def measured(
     pieces: Mapping[str, Sequence[Piece]], executor: Executor | None
-) -> Generator[ImageComparisonStep, None, dict[str, list[TaskResult]]]:
+) -> Generator[EvaluationStep, None, dict[str, list[TaskResult]]]:
     """Work on all pieces, telling how far it is.
 
     Args:
@@ -53,14 +37,9 @@ def measured(
         WorkerDied: if a worker process ended.
         CannotWrite: if the disk refuses.
     """
-    every = [piece for part in pieces.values() for piece in part]
-    results: list[TaskResult | None] = []
-    for results in results_of(every, executor):
-        done = sum(result is not None for result in results)
-        if done < len(every):
-            yield ImageComparisonStep(done, len(every), f"{done} of {len(every)} scenes")
-    finished = iter([result for result in results if result is not None])
-    return {method: [next(finished) for _ in part] for method, part in pieces.items()}
+    results = yield from finished([piece for part in pieces.values() for piece in part], executor, "scenes")
+    left = iter(results)
+    return {method: [next(left) for _ in part] for method, part in pieces.items()}
 
 
 def tables_of(results: Mapping[str, Sequence[TaskResult]], measures: Sequence[str]) -> Tables:
@@ -121,6 +100,26 @@ def chart_of(tables: Tables, key: str, x: Axis, places: Sequence[float], label: 
     low = tick * np.floor(lowest / tick) if np.isfinite(lowest) else 0.0
     curves = [Curve(TITLES[method], np.asarray(places, float), values, dots=True) for method, values in means.items()]
     return Chart("", x, Axis(label, low), curves)
+
+
+def write_comparison(
+    files: tuple[Path, Path], report: Mapping[str, Any], tables: Tables, x: Axis, places: Sequence[float]
+) -> None:
+    """Write a report as JSON, and as PNG a chart of PSNR and SSIM along x.
+
+    Args:
+        files: of the report and of the chart.
+        report: what was found.
+        tables: of the methods.
+        x: axis along which it was measured.
+        places: on it.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    axes = (("psnr", "PSNR [dB]", 5.0), ("ssim", "SSIM", 0.1))
+    write_charts(files[1], [chart_of(tables, key, x, places, label, tick) for key, label, tick in axes])
+    write_json(files[0], report)
 
 
 def _task_means(table: Float[np.ndarray, "tasks x"], at: Sequence[int]) -> Float[np.ndarray, "tasks"]:

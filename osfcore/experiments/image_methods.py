@@ -65,9 +65,7 @@ def common_names(
     if not 1 <= count <= MAX_OBJECTS:
         raise InvalidInput("objects in a scene", count, f"between 1 and {MAX_OBJECTS}")
     if names is None:
-        libraries = [paper_field_names(data_dir)] if "paper" in methods else []
-        libraries += [nerf_library(data_dir).names()] if "nerf" in methods else []
-        known = set(fields.names()).intersection(*libraries)
+        known = set(fields.names()).intersection(*(known_names(method, fields, data_dir) for method in methods))
         chosen = tuple(name for name in sorted(known) if assets.has(name))
     else:
         chosen = tuple(dict.fromkeys(names))
@@ -80,6 +78,17 @@ def common_names(
         what = "number of objects with a mesh and a field of every method"
         raise InvalidInput(what, len(chosen), f"at least {count}, as a scene has")
     return chosen
+
+
+def known_names(method: str, fields: FieldLibrary, data_dir: Path | None) -> tuple[str, ...]:
+    """Objects that a method has a field of; ours for methods that have no own ones."""
+    match method:
+        case "paper":
+            return paper_field_names(data_dir)
+        case "nerf":
+            return nerf_library(data_dir).names()
+        case _:
+            return fields.names()
 
 
 def field_path(method: str, name: str, fields: FieldLibrary, data_dir: Path | None) -> Path:

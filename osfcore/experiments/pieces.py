@@ -6,7 +6,7 @@ other machines, and a piece whose worker dies is done again by an executor that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -16,6 +16,23 @@ from typing import Any
 from osfcore.errors import WorkerDied
 from osfcore.experiments.task_cache import TaskCache, TaskResult
 from osfcore.fields.devices import computing_threads
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EvaluationStep:
+    """How far an evaluation is.
+
+    Attributes:
+        done: pieces finished.
+        total: pieces in all.
+        note: what is being done.
+        report: all figures as plain JSON, with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    report: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +75,30 @@ def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Ite
         pieces[n].cache.write(pieces[n].name, pieces[n].circumstances, result)
         results[n] = result
         yield list(results)
+
+
+def finished(
+    pieces: Sequence[Piece], executor: Executor | None, what: str
+) -> Generator[EvaluationStep, None, list[TaskResult]]:
+    """Do what is not done yet, telling how far it is.
+
+    Args:
+        pieces: no two of one name and cache.
+        executor: does them side by side, if given.
+        what: they are, in the plural.
+
+    Returns:
+        All results, in the order of the pieces.
+
+    Raises:
+        WorkerDied, CannotWrite: as `results_of` does.
+    """
+    results: list[TaskResult | None] = []
+    for results in results_of(pieces, executor):
+        done = sum(result is not None for result in results)
+        if done < len(pieces):
+            yield EvaluationStep(done, len(pieces), f"{done} of {len(pieces)} {what}")
+    return [result for result in results if result is not None]
 
 
 def _alone(pieces: Sequence[Piece], missing: Sequence[int]) -> Iterator[tuple[int, TaskResult]]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import check_ranges
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S
@@ -43,14 +43,12 @@ class GaussianPlanSettings:
         Raises:
             InvalidInput: naming what is out of range.
         """
-        for what, value, low, high in (
+        check_ranges(
             ("number of samples", self.samples, 2, MAX_SEQUENCES),
             ("horizon [actions]", self.horizon, 1, MAX_HORIZON),
             ("noise [m/s]", self.noise_m_s, 0.0, MAX_SPEED_M_S),
             ("temperature", self.temperature, 1e-6, 1e6),
-        ):
-            if not low <= value <= high:
-                raise InvalidInput(what, value, f"between {low} and {high}")
+        )
 
 
 class GaussianMPPI:

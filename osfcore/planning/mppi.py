@@ -23,7 +23,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import check_ranges
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
@@ -78,16 +78,14 @@ class PlanSettings:
         Raises:
             InvalidInput: naming what is out of range.
         """
-        for what, value, low, high in (
+        check_ranges(
             ("number of samples", self.samples, 8, MAX_SEQUENCES),
             ("horizon [actions]", self.horizon, 1, MAX_HORIZON),
             ("temperature", self.temperature, 1e-6, 1e6),
             ("noise [m]", self.noise_m, 0.0, PUSHER_REACH_M),
             ("actions between knots", self.knot_every, 1, MAX_HORIZON),
             ("refined actions", self.refined, 1, MAX_HORIZON),
-        ):
-            if not low <= value <= high:
-                raise InvalidInput(what, value, f"between {low} and {high}")
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

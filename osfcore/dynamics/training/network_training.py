@@ -31,7 +31,7 @@ from osfcore.dynamics.training.optimizers import Optimizers
 from osfcore.dynamics.training.samples import Sample, disturbed_substeps, samples
 from osfcore.dynamics.training.validation import _ARM_M, MEASURED_WINDOW, Validation, distance, validate
 from osfcore.dynamics.training.windows import Batch, Recording, batch, record
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
@@ -124,7 +124,7 @@ def train_dynamics(config: TrainDynamics, shapes: Mapping[str, ObjectShape]) -> 
 
 def _check(config: TrainDynamics) -> None:
     check_seed(config.seed)
-    for what, value, low, high in (
+    check_ranges(
         ("number of iterations", config.iterations, 1, 10_000_000),
         ("number of iterations on windows", config.long_iterations, 0, 10_000_000),
         ("batch", config.batch, 1, 100_000),
@@ -132,9 +132,7 @@ def _check(config: TrainDynamics) -> None:
         ("width of the network", config.hidden, 1, 1024),
         ("patience", config.patience, 1, 1_000_000),
         ("rate of learning", config.rate, 1e-9, 1),
-    ):
-        if not low <= value <= high:
-            raise InvalidInput(what, value, f"between {low} and {high}")
+    )
 
 
 class _Run:

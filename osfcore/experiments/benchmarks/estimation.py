@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.steps import EstimateStep
@@ -173,13 +173,11 @@ def _costs(config: BenchEstimate, first: list[float], later: list[float], goal: 
 
 
 def _checked(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    for what, value, most in (
-        ("number of scenes", config.scenes, _MOST_SCENES),
-        ("later frames of each scene", config.steps, _MOST_SCENES),
-        ("objects in a scene", config.objects, MAX_OBJECTS),
-    ):
-        if not 1 <= value <= most:
-            raise InvalidInput(what, value, f"between 1 and {most}")
+    check_ranges(
+        ("number of scenes", config.scenes, 1, _MOST_SCENES),
+        ("later frames of each scene", config.steps, 1, _MOST_SCENES),
+        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
+    )
     check_seed(config.seed)
     there = measurable(fields, assets)
     names = tuple(name for name in there if name in DEFAULT_NAMES)

@@ -20,16 +20,16 @@ from jaxtyping import UInt8
 from osfcore import control, dynamics, estimation, metrics, paper, render, world
 from osfcore import fields as fields_room
 from osfcore.dynamics.push_models import network_path
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.experiments import rivals
-from osfcore.experiments.charts import Axis, write_charts
+from osfcore.experiments.charts import Axis
 from osfcore.experiments.dynamics import video_episodes
 from osfcore.experiments.dynamics.video_episodes import MEASURES, VIDEO_METHODS, VideoEpisodes
 from osfcore.experiments.estimation import tasks
 from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY, Draw, draw_scene
-from osfcore.experiments.image_figures import ImageComparisonStep, chart_of, measured, summary, tables_of
+from osfcore.experiments.image_figures import measured, summary, tables_of, write_comparison
 from osfcore.experiments.image_methods import TITLES, check_methods, common_names, field_path
-from osfcore.experiments.pieces import Piece
+from osfcore.experiments.pieces import EvaluationStep, Piece
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path, read_fitvid
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
 from osfcore.fields.field_library import FieldLibrary
@@ -37,7 +37,6 @@ from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.geometry.rollouts import MAX_HORIZON
 from osfcore.inspection.contact_sheet import image_grid
-from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
@@ -78,7 +77,7 @@ class CompareVideos:
 
 def compare_videos(
     config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[ImageComparisonStep]:
+) -> Iterator[EvaluationStep]:
     """Predict all episodes by all methods; the chart, images of the first episode and video.json go to `config.folder`.
 
     Args:
@@ -102,23 +101,16 @@ def compare_videos(
     about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "steps", "size")}
     report = {**about, "names": list(config.names or ()), **summary(tables, spans)}
     x, places = Axis("predicted steps of 0.2 s", 0, config.steps), range(1, config.steps + 1)
-    axes = (("psnr", "PSNR [dB]", 5.0), ("ssim", "SSIM", 0.1))
-    charts = [chart_of(tables, key, x, places, label, tick) for key, label, tick in axes]
-    write_charts(config.folder / CHART_FILE, charts)
+    files = config.folder / REPORT_FILE, config.folder / CHART_FILE
+    write_comparison(files, report, tables, x, places)
     write_png(config.folder / IMAGES_FILE, _first_episode(results))
-    write_json(config.folder / REPORT_FILE, report)
     total = config.tasks * len(config.methods)
-    yield ImageComparisonStep(total, total, "Everything is measured", report)
+    yield EvaluationStep(total, total, "Everything is measured", report)
 
 
 def _checked(config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary) -> CompareVideos:
     """The same with methods and names in order."""
-    for what, value, high in (
-        ("number of tasks", config.tasks, MAX_TASKS),
-        ("predicted steps", config.steps, MAX_HORIZON),
-    ):
-        if not 1 <= value <= high:
-            raise InvalidInput(what, value, f"between 1 and {high}")
+    check_ranges(("number of tasks", config.tasks, 1, MAX_TASKS), ("predicted steps", config.steps, 1, MAX_HORIZON))
     check_seed(config.seed)
     image_side(config.size)
     methods = check_methods(config.methods, VIDEO_METHODS)

@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from osfcore.errors import InvalidInput, MissingAssets
+from osfcore.errors import InvalidInput, MissingAssets, check_ranges, check_seed
 from osfcore.experiments.estimation.parts import PARTS, VIEWS, EvaluateEstimate, TaskRunner
 from osfcore.experiments.estimation.plots import bad_failure, frame_failure, track_failure, write_gallery, write_plots
 from osfcore.experiments.estimation.report import EstimateReport
 from osfcore.experiments.estimation.scores import FrameScore, TrackScore
 from osfcore.experiments.estimation.spoiled_inputs import BadScore
-from osfcore.experiments.fields.evaluation import MAX_SEED, MAX_TASKS
+from osfcore.experiments.fields.evaluation import MAX_TASKS
 from osfcore.experiments.pieces import Piece, results_of
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.fields.field_library import FieldLibrary
@@ -110,15 +110,12 @@ def _few_views(runner: TaskRunner, views: int) -> Callable[[int], Piece]:
 
 def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
     """The objects to draw from, after everything asked for was found possible."""
-    limits = {
-        "number of tasks": (config.tasks, 1, MAX_TASKS),
-        "number of bad cases": (config.bad, 0, MAX_TASKS),
-        "objects in a scene": (config.objects, 1, MAX_OBJECTS),
-        "seed": (config.seed, 0, MAX_SEED),
-    }
-    for what, (value, low, high) in limits.items():
-        if not low <= value <= high:
-            raise InvalidInput(what, value, f"between {low} and {high}")
+    check_ranges(
+        ("number of tasks", config.tasks, 1, MAX_TASKS),
+        ("number of bad cases", config.bad, 0, MAX_TASKS),
+        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
+    )
+    check_seed(config.seed)
     for part in config.parts:
         if part not in PARTS:
             raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")

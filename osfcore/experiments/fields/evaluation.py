@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from osfcore.errors import CorruptFile, InvalidInput, MissingAssets
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, check_ranges, check_seed
 from osfcore.experiments.fields.composite_scenes import (
     SCENE_QUALITY,
     compare_scene,
@@ -167,14 +167,10 @@ def measurable(fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
 
 def _checked(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
     """The objects to measure, after everything asked for was found possible."""
-    limits = {
-        "number of scenes": (config.tasks, 0, MAX_TASKS),
-        "objects in a scene": (config.objects, 1, MAX_OBJECTS),
-        "seed": (config.seed, 0, MAX_SEED),
-    }
-    for what, (value, low, high) in limits.items():
-        if not low <= value <= high:
-            raise InvalidInput(what, value, f"between {low} and {high}")
+    check_ranges(
+        ("number of scenes", config.tasks, 0, MAX_TASKS), ("objects in a scene", config.objects, 1, MAX_OBJECTS)
+    )  # fmt: skip
+    check_seed(config.seed)
     image_side(config.size)
     if config.names is None:
         return measurable(fields, assets)

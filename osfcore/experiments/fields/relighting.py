@@ -19,22 +19,21 @@ from jaxtyping import UInt8
 
 from osfcore import fields as fields_room
 from osfcore import metrics, paper, render, world
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.experiments import image_methods
-from osfcore.experiments.charts import Axis, write_charts
+from osfcore.experiments.charts import Axis
 from osfcore.experiments.fields import composite_scenes, relit_scenes
 from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY, Draw, draw_scene
 from osfcore.experiments.fields.relit_scenes import MEASURES, RelitScenes
-from osfcore.experiments.image_figures import ImageComparisonStep, chart_of, measured, summary, tables_of
+from osfcore.experiments.image_figures import measured, summary, tables_of, write_comparison
 from osfcore.experiments.image_methods import FIELD_METHODS, TITLES, check_methods, common_names, field_path
-from osfcore.experiments.pieces import Piece
+from osfcore.experiments.pieces import EvaluationStep, Piece
 from osfcore.experiments.rivals import nerf
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.inspection.contact_sheet import image_grid
-from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream
@@ -75,7 +74,7 @@ class CompareRelighting:
 
 def compare_relighting(
     config: CompareRelighting, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[ImageComparisonStep]:
+) -> Iterator[EvaluationStep]:
     """Show all scenes by all methods; the chart, images of the first scene and relighting.json go to `config.folder`.
 
     Args:
@@ -101,19 +100,16 @@ def compare_relighting(
     drawn_from = {"names": list(config.names or ()), "elevations_deg": list(config.elevations_deg)}
     report = {**about, **drawn_from, **summary(tables, spans)}
     x = Axis("light above the table [deg]", 0, 90)
-    axes = (("psnr", "PSNR [dB]", 5.0), ("ssim", "SSIM", 0.1))
-    charts = [chart_of(tables, key, x, config.elevations_deg, label, tick) for key, label, tick in axes]
-    write_charts(config.folder / CHART_FILE, charts)
+    files = config.folder / REPORT_FILE, config.folder / CHART_FILE
+    write_comparison(files, report, tables, x, config.elevations_deg)
     write_png(config.folder / IMAGES_FILE, _first_scene(results))
-    write_json(config.folder / REPORT_FILE, report)
     total = config.tasks * len(config.methods)
-    yield ImageComparisonStep(total, total, "Everything is measured", report)
+    yield EvaluationStep(total, total, "Everything is measured", report)
 
 
 def _checked(config: CompareRelighting, fields: FieldLibrary, assets: AssetLibrary) -> CompareRelighting:
     """The same with methods, names and elevations in order."""
-    if not 1 <= config.tasks <= MAX_TASKS:
-        raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
+    check_ranges(("number of tasks", config.tasks, 1, MAX_TASKS))
     check_seed(config.seed)
     image_side(config.size)
     elevations = tuple(sorted(set(config.elevations_deg)))

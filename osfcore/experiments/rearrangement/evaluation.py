@@ -18,25 +18,24 @@ from typing import Any
 
 from osfcore import control, dynamics, estimation, paper, planning, render, world
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
-from osfcore.dynamics.push_models import network_path
-from osfcore.errors import InvalidInput, MissingAssets, check_seed
+from osfcore.dynamics.push_models import network_path, shipped
+from osfcore.errors import MissingAssets, check_ranges, check_seed
 from osfcore.experiments import rivals
-from osfcore.experiments.pieces import Piece, results_of
+from osfcore.experiments.image_methods import field_path, known_names
+from osfcore.experiments.pieces import EvaluationStep, Piece, finished
 from osfcore.experiments.rearrangement import factors, measured_episodes, methods, own_pushes, runs, sensor, tasks
-from osfcore.experiments.rearrangement.factors import factor_named
+from osfcore.experiments.rearrangement.factors import UNSEEN_NETWORK, factor_named
 from osfcore.experiments.rearrangement.measured_episodes import MeasuredEpisodes
 from osfcore.experiments.rearrangement.methods import Variant, check_variant
 from osfcore.experiments.rearrangement.report import MpcReport, write_pictures
 from osfcore.experiments.rearrangement.tasks import Family, TaskSet, check_tasks
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path
-from osfcore.experiments.rivals.nerf import nerf_library
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
-from osfcore.paper.method import paper_field_names, paper_field_path
 from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"
@@ -94,26 +93,9 @@ class EvaluateMpc:
     foresight: ForesightSettings = field(default_factory=lambda: _FORESIGHT)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class MpcEvaluationStep:
-    """How far an evaluation is.
-
-    Attributes:
-        done: tasks finished, ours and the oracle's.
-        total: in all.
-        note: what is being done.
-        report: with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: dict[str, Any] | None = None
-
-
 def evaluate_mpc(
     config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[MpcEvaluationStep]:
+) -> Iterator[EvaluationStep]:
     """Run all tasks; pictures and mpc.json go to `config.folder`.
 
     Args:
@@ -130,17 +112,12 @@ def evaluate_mpc(
         CorruptFile, CannotWrite: as files are.
     """
     pieces = episode_pieces(config, fields, assets)
-    total = len(pieces)
-    results: list[TaskResult | None] = []
-    for results in results_of(pieces, executor):
-        done = sum(result is not None for result in results)
-        if done < total:
-            yield MpcEvaluationStep(done, total, f"{done} of {total} episodes")
-    report = episodes_report(config, [result for result in results if result is not None])
+    results = yield from finished(pieces, executor, "episodes")
+    report = episodes_report(config, results)
     write_pictures(config.folder, report)
     figures = figures_of(config, report)
     write_json(config.folder / REPORT_FILE, figures)
-    yield MpcEvaluationStep(total, total, "Everything is measured", figures)
+    yield EvaluationStep(len(pieces), len(pieces), "Everything is measured", figures)
 
 
 def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcReport:
@@ -158,41 +135,23 @@ def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
 
 
 def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    if not 1 <= config.tasks <= MAX_TASKS:
-        raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
+    check_ranges(("number of tasks", config.tasks, 1, MAX_TASKS))
     check_variant(config.variant)
     if config.factor:
         factor_named(config.factor)
     check_seed(config.seed)
     if config.names is None:
-        names = tuple(name for name in _known(config, fields) if fields.has(name) and assets.has(name))
+        known = known_names(config.variant.fields, fields, config.data_dir)
+        names = tuple(name for name in known if fields.has(name) and assets.has(name))
     else:
         names = tuple(dict.fromkeys(config.names))
         for name in names:
             fields.info(name)
             if not assets.has(name):
                 raise MissingAssets([name])
-            _own_field(config, name)
+            field_path(config.variant.fields, name, fields, config.data_dir)
     check_tasks(_tasks(replace(config, names=names)))
     return names
-
-
-def _known(config: EvaluateMpc, fields: FieldLibrary) -> tuple[str, ...]:
-    """Objects that the method has a field of."""
-    if config.variant.published("fields"):
-        return paper_field_names(config.data_dir)
-    return nerf_library(config.data_dir).names() if config.variant.method == "nerf" else fields.names()
-
-
-def _own_field(config: EvaluateMpc, name: str) -> Path | None:
-    """The method's field of an object, if that is not ours.
-
-    Raises:
-        UnknownName: if there is none.
-    """
-    if config.variant.published("fields"):
-        return paper_field_path(name, config.data_dir)
-    return nerf_library(config.data_dir).info(name).path if config.variant.method == "nerf" else None
 
 
 def _tasks(config: EvaluateMpc) -> TaskSet:
@@ -255,10 +214,13 @@ def _circumstances(
         "code": code_sha256(*_CODE),
     }
     own: dict[str, Any] = {}
-    if any(_own_field(config, name) for name in names):
-        own["own_fields"] = [file_sha256(path) for name in names if (path := _own_field(config, name))]
+    if config.variant.fields != "ours":
+        paths = [field_path(config.variant.fields, name, fields, config.data_dir) for name in names]
+        own["own_fields"] = [file_sha256(path) for path in paths]
     if config.variant.published("dynamics"):
         own["own_network"] = file_sha256(weights_path(config.data_dir))
     if config.variant.method == "foresight":
         own["own_network"] = file_sha256(fitvid_path(config.data_dir))
+    if config.factor and factor_named(config.factor).has_unseen_objects:
+        own["own_network"] = file_sha256(shipped(UNSEEN_NETWORK))
     return given, own

@@ -29,6 +29,7 @@ from osfcore.world.imaging.wood import wooden_texture
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
+UNSEEN_NETWORK = "pushes_without_two"  # of the dynamics, trained without mustard bottle and tuna can
 _SAME_RAD = 1e-6
 
 

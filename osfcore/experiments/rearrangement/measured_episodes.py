@@ -17,7 +17,7 @@ from osfcore.control.scene_models import load_scene_models
 from osfcore.dynamics.network_weights import read_network
 from osfcore.dynamics.push_models import shipped
 from osfcore.dynamics.rollout import PushModel
-from osfcore.experiments.rearrangement.factors import Factor, factor_named
+from osfcore.experiments.rearrangement.factors import UNSEEN_NETWORK, Factor, factor_named
 from osfcore.experiments.rearrangement.methods import Variant, loop_parts
 from osfcore.experiments.rearrangement.own_pushes import Course, prediction_errors
 from osfcore.experiments.rearrangement.runs import Ended, TrueState, run_from_images, run_told_the_truth
@@ -63,7 +63,7 @@ class MeasuredEpisodes:
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
         if self._factor().has_unseen_objects:
-            models = replace(models, dynamics=PushModel(read_network(shipped("pushes_without_two")), models.shapes))
+            models = replace(models, dynamics=PushModel(read_network(shipped(UNSEEN_NETWORK)), models.shapes))
         parts = loop_parts(self.variant, models, drawn.task, self.fields, self.data_dir)
         settings, rng = replace(settings, despite_doubts=True), stream_rng(self.tasks.seed, Stream.EPISODE, number)
         log = _Log(drawn.task, models.symmetries)

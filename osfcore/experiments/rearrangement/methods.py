@@ -66,6 +66,11 @@ class Variant:
     views: int = 4
     has_masks: bool = False
 
+    @property
+    def fields(self) -> str:
+        """Whose fields it has: one of `image_methods.FIELD_METHODS`."""
+        return "paper" if self.published("fields") else "nerf" if self.method == "nerf" else "ours"
+
     def published(self, stage: StageName) -> bool:
         """Whether a stage is the paper's."""
         return self.method == "paper" and stage not in self.replaced

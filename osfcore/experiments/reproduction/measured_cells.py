@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
-from osfcore.experiments.pieces import Piece, results_of
+from osfcore.experiments.pieces import EvaluationStep, Piece, finished
 from osfcore.experiments.rearrangement.evaluation import episode_pieces, episodes_report, figures_of
 from osfcore.experiments.rearrangement.report import MpcReport, paired
 from osfcore.experiments.reproduction.sections import Cell, Section
@@ -46,24 +46,9 @@ class MeasuredSection:
     cells: tuple[MeasuredCell, ...]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class CellsStep:
-    """How far the episodes are.
-
-    Attributes:
-        done: episodes finished.
-        total: in all.
-        sections: with the last step only.
-    """
-
-    done: int
-    total: int
-    sections: tuple[MeasuredSection, ...] | None = None
-
-
 def measure_cells(
     sections: Sequence[Section], fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[CellsStep]:
+) -> Generator[EvaluationStep, None, tuple[MeasuredSection, ...]]:
     """Run the episodes of all sections, each once.
 
     Args:
@@ -72,22 +57,20 @@ def measure_cells(
         assets: meshes for the simulator.
         executor: runs episodes side by side, if given.
 
+    Returns:
+        What was found, in the order of the sections.
+
     Raises:
         UnknownName, MissingAssets, InvalidInput, NoRoom, WorkerDied, CorruptFile, CannotWrite: as `evaluate_mpc` does.
     """
     keys = {id(cell): _piece_keys(cell, fields, assets) for section in sections for cell in section.cells}
     pieces: dict[tuple[str, str], Piece] = {key: piece for found in keys.values() for key, piece in found}
-    order, results = list(pieces), list[TaskResult | None]()
-    for results in results_of(list(pieces.values()), executor):
-        done = sum(result is not None for result in results)
-        if done < len(order):
-            yield CellsStep(done, len(order))
-    found = {key: result for key, result in zip(order, results, strict=True) if result is not None}
-    measured = tuple(
+    results = yield from finished(list(pieces.values()), executor, "episodes")
+    found = dict(zip(pieces, results, strict=True))
+    return tuple(
         _measured(section, [[found[key] for key, _ in keys[id(cell)]] for cell in section.cells])
         for section in sections
     )
-    yield CellsStep(len(order), len(order), measured)
 
 
 def _piece_keys(cell: Cell, fields: FieldLibrary, assets: AssetLibrary) -> list[tuple[tuple[str, str], Piece]]:

@@ -10,13 +10,14 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.experiments.dynamics.video_episodes import VIDEO_METHODS
 from osfcore.experiments.dynamics.video_prediction import CompareVideos, compare_videos
 from osfcore.experiments.fields.relighting import CompareRelighting, compare_relighting
 from osfcore.experiments.image_methods import FIELD_METHODS, common_names
+from osfcore.experiments.pieces import EvaluationStep
 from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
 from osfcore.experiments.reproduction.charts_of_sections import write_success_bars, write_success_curves
 from osfcore.experiments.reproduction.findings import findings, rows_of
@@ -31,8 +32,8 @@ from osfcore.objects.asset_library import AssetLibrary
 
 PAGE_FILE, FIGURES_FILE = "report.html", "reproduction.json"
 _CURVES = "success.png"
-PartName = Literal["relighting", "video", "methods", "families", "ablations", "ladder", "factors", "attribution"]
-PARTS: tuple[PartName, ...] = get_args(PartName)
+PartName = Literal["relighting", "video"] | SectionName
+PARTS: tuple[PartName, ...] = ("relighting", "video", *SECTIONS)
 _TITLES = {"relighting": "Scenes under any light", "video": "Predicted futures"}
 _IMAGE_PARTS = {"relighting": relighting_part, "video": video_part}
 _HEADS = (
@@ -68,26 +69,9 @@ class Reproduce:
     names: tuple[str, ...] | None = None
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class ReproduceStep:
-    """How far a reproduction is.
-
-    Attributes:
-        done: pieces of the present part that are finished.
-        total: pieces of it in all.
-        note: what is being done.
-        report: all figures, with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: dict[str, Any] | None = None
-
-
 def reproduce(
     config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[ReproduceStep]:
+) -> Iterator[EvaluationStep]:
     """Measure what is not measured yet, and write the report.
 
     Args:
@@ -116,12 +100,12 @@ def reproduce(
     parts = [_IMAGE_PARTS[name](config.folder, figures) for name, figures in images.items()]
     parts += _section_parts(config.folder, measured)
     write_page(config.folder / PAGE_FILE, config.about, _warnings(config), findings(measured), parts)
-    yield ReproduceStep(1, 1, "The report is written", report)
+    yield EvaluationStep(1, 1, "The report is written", report)
 
 
 def _images(
     config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
-) -> Generator[ReproduceStep, None, dict[str, dict[str, Any]]]:
+) -> Generator[EvaluationStep, None, dict[str, dict[str, Any]]]:
     """The reports of parts that compare images, by name."""
     scale, about = config.scale, config.about
     given = {"names": about.names, "seed": about.seed, "objects": scale.objects}
@@ -135,23 +119,19 @@ def _images(
     reports: dict[str, dict[str, Any]] = {}
     for name in (part for part in comparisons if part in config.parts):
         for step in comparisons[name]():
-            yield ReproduceStep(step.done, step.total, f"{_TITLES[name]}: {step.note}")
+            yield EvaluationStep(step.done, step.total, f"{_TITLES[name]}: {step.note}")
             reports[name] = step.report or {}
     return reports
 
 
 def _episodes(
     config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
-) -> Generator[ReproduceStep, None, tuple[MeasuredSection, ...]]:
+) -> Generator[EvaluationStep, None, tuple[MeasuredSection, ...]]:
     """Episodes of all sections."""
     base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=config.about.names)
     chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
     sections = sections_of(base, config.scale, chosen, has_foresight=is_trained(config.data_dir))
-    measured: tuple[MeasuredSection, ...] = ()
-    for step in measure_cells(sections, fields, assets, executor):
-        yield ReproduceStep(step.done, step.total, f"{step.done} of {step.total} episodes")
-        measured = step.sections or ()
-    return measured
+    return (yield from measure_cells(sections, fields, assets, executor))
 
 
 def _figures(config: Reproduce, images: Mapping[str, Any], measured: Sequence[MeasuredSection]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from osfcore.control.goal import GoalImage
 from osfcore.control.world_protocol import World
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, check_ranges
 from osfcore.experiments.rearrangement.factors import Factor, VariedWorld
 from osfcore.experiments.rearrangement.runs import Ended
 from osfcore.geometry.cameras import goal_camera
@@ -87,7 +87,7 @@ class ForesightSettings:
         Raises:
             InvalidInput: naming what is out of range.
         """
-        for what, value, low, high in (
+        check_ranges(
             ("number of samples", self.samples, 2, MAX_SEQUENCES),
             ("horizon [actions]", self.horizon, 1, MAX_HORIZON),
             ("rounds of a plan", self.rounds, 1, 10_000),
@@ -95,9 +95,7 @@ class ForesightSettings:
             ("temperature", self.temperature, 1e-6, 1e6),
             ("noise [m/s]", self.noise_m_s, 1e-6, MAX_SPEED_M_S),
             ("correlation of the noise", self.smoothing, 0.0, 0.999),
-        ):
-            if not low <= value <= high:
-                raise InvalidInput(what, value, f"between {low} and {high}")
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

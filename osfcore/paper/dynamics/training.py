@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from osfcore.dynamics.training.holdout import is_for_validation
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.output_paths import check_weights_place
@@ -113,15 +113,13 @@ def train_paper_dynamics(config: TrainPaperDynamics, kappas: Mapping[str, float]
 
 def _check(config: TrainPaperDynamics) -> None:
     check_seed(config.seed)
-    for what, value, low, high in (
+    check_ranges(
         ("number of iterations", config.iterations, 1, 10_000_000),
         ("batch", config.batch, 1, 100_000),
         ("width of the network", config.hidden, 1, 1024),
         ("patience", config.patience, 1, 1_000_000),
         ("rate of learning", config.rate, 1e-9, 1),
-    ):
-        if not low <= value <= high:
-            raise InvalidInput(what, value, f"between {low} and {high}")
+    )
 
 
 class _Run:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import check_ranges, check_seed
 from osfcore.experiments.benchmarks.pusht.environment import PushT, Simulation, drift
 from osfcore.experiments.benchmarks.pusht.planners import PLANNERS, Planner, Problem
 from osfcore.experiments.benchmarks.pusht.report import PlannerReport, PushTEpisode
@@ -51,14 +51,12 @@ class BenchPlanner:
         Raises:
             InvalidInput: naming what is out of range.
         """
-        for what, value, least, most in (
+        check_ranges(
             ("number of tasks", self.tasks, 1, _MOST),
             ("number of samples", self.samples, _FEWEST_SAMPLES, _MOST),
             ("horizon [actions]", self.horizon, 1, MAX_HORIZON),
             ("number of steps", self.steps, 1, _MOST),
-        ):
-            if not least <= value <= most:
-                raise InvalidInput(what, value, f"between {least} and {most}")
+        )
         check_seed(self.seed)
 
 

@@ -29,7 +29,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, check_ranges
 from osfcore.experiments.rivals.fitvid.coders import COARSEST_SIDE, Decoder, Encoder, Skips
 from osfcore.experiments.rivals.fitvid.recurrence import FrameLSTM, LatentLSTM, kl_divergence
 from osfcore.geometry.workspace import MAX_SPEED_M_S
@@ -66,14 +66,12 @@ class FitVidSettings:
         """
         if self.side not in [COARSEST_SIDE * 2**n for n in range(1, _MOST_STAGES)]:
             raise InvalidInput("side of the frames [px]", self.side, "16, 32, 64, 128, 256, 512 or 1024")
-        for what, value, most in (
-            ("width of the network", self.width, 256),
-            ("features of a frame", self.features, 4096),
-            ("units of the LSTMs", self.hidden, 4096),
-            ("components of the latent", self.latent, 1024),
-        ):
-            if not 1 <= value <= most:
-                raise InvalidInput(what, value, f"between 1 and {most}")
+        check_ranges(
+            ("width of the network", self.width, 1, 256),
+            ("features of a frame", self.features, 1, 4096),
+            ("units of the LSTMs", self.hidden, 1, 4096),
+            ("components of the latent", self.latent, 1, 1024),
+        )
 
     @property
     def stages(self) -> int:

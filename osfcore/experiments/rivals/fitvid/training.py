@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import torch
 
-from osfcore.errors import InvalidInput, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.experiments.rivals.fitvid.augmentation import augmented
 from osfcore.experiments.rivals.fitvid.frame_windows import VideoFiles
 from osfcore.experiments.rivals.fitvid.measurement import as_frames, measure
@@ -118,7 +118,7 @@ def _check(config: TrainFitVid) -> None:
     check_seed(config.seed)
     if config.precision not in ("bfloat16", "float32"):
         raise InvalidInput("precision", repr(config.precision), '"bfloat16" or "float32"')
-    for what, value, low, high in (
+    check_ranges(
         ("minutes", config.minutes, 0.01, 7 * 24 * 60),
         ("iterations", 1 if config.iterations is None else config.iterations, 1, 10_000_000),
         ("width of the network", config.width, 1, 256),
@@ -128,9 +128,7 @@ def _check(config: TrainFitVid) -> None:
         ("beta", config.beta, 0, 1e6),
         ("steps between checkpoints", config.save_every, 1, 1_000_000),
         ("held-out videos", config.measured, 1, 1_000_000),
-    ):
-        if not low <= value <= high:
-            raise InvalidInput(what, value, f"between {low} and {high}")
+    )
 
 
 class _Run:
