@@ -1,9 +1,15 @@
-"""FitVid's encoder of a frame, and the decoder that mirrors it and takes its features over skip connections."""
+"""FitVid's encoder of a frame, and the decoder that mirrors it and takes its features over skip connections.
+
+Deviation: the decoder's last layer, which begins at zero, changes the logits of a known frame, where the original's
+makes all of a frame. A network begins at copying that way, and what it learns are the changes; to draw the standing
+background anew took ours hours, in which it stayed worse than a copied frame.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -11,6 +17,7 @@ from osfcore.experiments.rivals.fitvid.cells import DecoderCell, EncoderCell
 
 COARSEST_SIDE = 8  # of the feature maps between encoder and decoder, as in the original [px]
 _CELLS = 2  # of a stage
+_LEAST = 1 / 256  # of a colour whose logit is taken
 
 Skips = Sequence[Float[Tensor, "_ _ _ _"]]  # features after each of the encoder's cells, the finest first
 
@@ -69,14 +76,17 @@ class Decoder(nn.Module):
         self.cells = nn.ModuleList(cells)
         self.colours = nn.Conv2d(before, 3, 3, padding=1, bias=False)
 
-    def forward(self, vectors: Float[Tensor, "B g"], skips: Skips) -> Float[Tensor, "B 3 h w"]:
+    def forward(
+        self, vectors: Float[Tensor, "B g"], skips: Skips, known: Float[Tensor, "_ 3 h w"]
+    ) -> Float[Tensor, "B 3 h w"]:
         """Frames in [0, 1].
 
         Args:
             vectors: of frames.
             skips: of the encoder, for each of the vectors or of one frame for all of them.
+            known: the frames of which those are.
         """
         x = self.ground(vectors).view(len(vectors), self._channels, COARSEST_SIDE, COARSEST_SIDE)
         for cell, skip in zip(self.cells, reversed(skips), strict=True):
             x = cell(x) + skip
-        return self.colours(x).float().sigmoid()
+        return (torch.logit(known, _LEAST) + self.colours(x).float()).sigmoid()

@@ -4,18 +4,20 @@ A frame x_t becomes a vector h_t and feature maps in the encoder. From there on 
 
     posterior   q(z_t | x_1..t)     from h_t
     prior       p(z_t | x_1..t-1)   from h_t-1
-    next frame  h'_t = sigmoid(LSTM(h_t-1, a_t-1, z_t)),    x'_t = decoder(h'_t, feature maps of the last context frame)
+    next frame  h'_t = sigmoid(LSTM(h_t-1, a_t-1, z_t)),    x'_t = decoder(h'_t, c, feature maps of c)
 
-and what is minimised is sum_t |x_t - x'_t|^2 (a mean over pixels) + beta * KL(q || p), with z_t from the posterior and
-true frames behind h_t-1. To predict, z_t comes from the prior, and behind the context h_t-1 from the predicted frame.
+with the last context frame c, and what is minimised is sum_t |x_t - x'_t|^2 (a mean over pixels) + beta * KL(q || p),
+with z_t from the posterior and true frames behind h_t-1. To predict, z_t comes from the prior, and behind the context
+h_t-1 from the predicted frame.
 
 Deviations from the published program: images are of 128 pixels instead of 64, as in the paper that is reproduced here,
 by one more stage in front, so that the coarsest maps stay 8 x 8 pixels; channels start with 4 at full size and double
 per stage, so that at 64 pixels there are 8 where the original has 64 (7.4 instead of 302 million parameters). Batch
 norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no variance,
-which the original computes and never uses. Encoder and decoder may compute in bfloat16. Predictions take the skip
-connections from the last context frame, as training does; the original takes those of the first one there. Actions are
-in units of the highest speed.
+which the original computes and never uses. The decoder changes the last context frame, where the original's draws a
+new one (`coders`). Encoder and decoder may compute in bfloat16. Predictions take the skip connections from the last
+context frame, as training does; the original takes those of the first one there. Actions are in units of the highest
+speed.
 """
 
 from __future__ import annotations
@@ -113,6 +115,7 @@ class FitVidModel(nn.Module):
                 nn.init.normal_(module.weight, std=module.weight[0].numel() ** -0.5)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
+        nn.init.zeros_(self.decoder.colours.weight)
 
     @property
     def parameter_count(self) -> int:
@@ -124,9 +127,9 @@ class FitVidModel(nn.Module):
             vectors, skips = self.encoder(frames)
         return vectors.float(), skips
 
-    def _decoded(self, vectors: Float[Tensor, "B g"], skips: Skips) -> Float[Tensor, "B 3 h w"]:
+    def _decoded(self, vectors: Float[Tensor, "B g"], skips: Skips, known: Tensor) -> Float[Tensor, "B 3 h w"]:
         with torch.autocast(vectors.device.type, self.precision, enabled=self.precision != torch.float32):
-            return self.decoder(vectors, skips)
+            return self.decoder(vectors, skips, known)
 
     def losses(
         self,
@@ -150,7 +153,8 @@ class FitVidModel(nn.Module):
         following, _ = self.frame_predictor(torch.cat(inputs, dim=-1))
         seen = [min(step, CONTEXT - 1) for step in range(length - 1)]  # frames whose maps are handed over
         skips = [skip.unflatten(0, (count, length))[:, seen].flatten(0, 1) for skip in skips]
-        predicted = self._decoded(following.flatten(0, 1), skips).unflatten(0, (count, length - 1))
+        predicted = self._decoded(following.flatten(0, 1), skips, frames[:, seen].flatten(0, 1))
+        predicted = predicted.unflatten(0, (count, length - 1))
         squared_error = (predicted - frames[:, 1:]).square().mean(dim=(0, 2, 3, 4)).sum()
         return Losses(squared_error, kl_divergence(posterior, prior).sum(dim=1).mean())
 
@@ -168,7 +172,7 @@ class FitVidModel(nn.Module):
             generator: draws latents from the prior; its mean is taken if None.
         """
         vectors, skips = self._context(context)
-        yield from self._continued(vectors, skips, actions, generator)
+        yield from self._continued(vectors, skips, context[:, -1], actions, generator)
 
     @torch.inference_mode()
     def _context(self, context: Float[Tensor, "B 2 3 side side"]) -> tuple[Float[Tensor, "B 2 g"], list[Tensor]]:
@@ -177,7 +181,12 @@ class FitVidModel(nn.Module):
         return vectors.unflatten(0, (-1, CONTEXT)), [skip[CONTEXT - 1 :: CONTEXT] for skip in skips]
 
     def _continued(
-        self, vectors: Tensor, skips: list[Tensor], actions: Tensor, generator: torch.Generator | None
+        self,
+        vectors: Float[Tensor, "B 2 g"],
+        skips: list[Tensor],
+        known: Float[Tensor, "_ 3 side side"],
+        actions: Float[Tensor, "B T1 3"],
+        generator: torch.Generator | None,
     ) -> Iterator[Tensor]:
         prior_state = frame_state = frame = None
         for step in range(actions.shape[1]):
@@ -187,7 +196,7 @@ class FitVidModel(nn.Module):
                 latent = prior.mean if generator is None else prior.sample(generator)
                 inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, latent]
                 following, frame_state = self.frame_predictor(torch.cat(inputs, dim=-1), frame_state)
-                frame = self._decoded(following[:, 0], skips) if step + 1 >= CONTEXT else None
+                frame = self._decoded(following[:, 0], skips, known) if step + 1 >= CONTEXT else None
             if frame is not None:
                 yield frame
 
@@ -222,6 +231,6 @@ class FitVidModel(nn.Module):
         vectors, skips = self._context(context[None])  # once for all sequences
         parts = []
         for part in given.split(_AT_ONCE):
-            futures = self._continued(vectors.expand(len(part), -1, -1), skips, part, generator)
+            futures = self._continued(vectors.expand(len(part), -1, -1), skips, context[None, -1], part, generator)
             parts.append(torch.stack(list(futures), dim=1))
         return torch.cat(parts).movedim(2, -1).contiguous().cpu().numpy()

@@ -14,7 +14,7 @@ from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.io.files import write_atomically
 from osfcore.io.network_file import read_parameters
 
-FORMAT = "fitvid-1"
+FORMAT = "fitvid-2"
 _FILE = "fitvid.safetensors"
 _SIZES = ("side", "width", "features", "hidden", "latent")
 

@@ -13,8 +13,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def model(settings=TINY, seed=0, **more) -> FitVidModel:
+    """A network as it begins, but for its last layer, whose zeros would hide what is before it."""
     torch.manual_seed(seed)
-    return FitVidModel(settings, **more)
+    network = FitVidModel(settings, **more)
+    with torch.no_grad():
+        network.decoder.colours.weight.normal_(std=0.1)
+    return network
 
 
 def scene(side=16, steps=4, seed=0):
@@ -63,6 +67,12 @@ def test_predictions_have_the_stated_shape_and_are_images(side):
         assert frames.shape == (5, 3, side, side, 3)
         assert frames.dtype == np.float32
         assert 0 <= frames.min() <= frames.max() <= 1
+
+
+def test_a_new_network_copies_the_last_frame():
+    context = np.random.default_rng(0).random((2, 16, 16, 3))
+    frames = FitVidModel(TINY).eval().predict(context, np.full((2, 3, 3), 0.1))
+    np.testing.assert_allclose(frames, np.broadcast_to(context[1], frames.shape), atol=1 / 255)
 
 
 def test_frames_of_another_size_are_refused():
