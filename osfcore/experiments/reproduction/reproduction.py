@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from osfcore.errors import InvalidInput, check_seed
-from osfcore.experiments.dynamics.video_episodes import VIDEO_METHODS
 from osfcore.experiments.dynamics.video_prediction import CompareVideos, compare_videos
 from osfcore.experiments.fields.relighting import CompareRelighting, compare_relighting
 from osfcore.experiments.image_methods import FIELD_METHODS, common_names
@@ -25,7 +24,6 @@ from osfcore.experiments.reproduction.image_parts import relighting_part, video_
 from osfcore.experiments.reproduction.measured_cells import MeasuredSection, measure_cells
 from osfcore.experiments.reproduction.page import About, PagePart, check_jinja, write_page
 from osfcore.experiments.reproduction.sections import SECTIONS, Scale, SectionName, sections_of
-from osfcore.experiments.rivals.fitvid.weights import is_trained
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
@@ -109,9 +107,8 @@ def _images(
     """The reports of parts that compare images, by name."""
     scale, about = config.scale, config.about
     given = {"names": about.names, "seed": about.seed, "objects": scale.objects}
-    video_methods = tuple(m for m in VIDEO_METHODS if m != "fitvid" or is_trained(config.data_dir))
     relit = CompareRelighting(config.folder, config.data_dir, tasks=scale.scenes, **given)
-    videos = CompareVideos(config.folder, config.data_dir, tasks=scale.videos, methods=video_methods, **given)
+    videos = CompareVideos(config.folder, config.data_dir, tasks=scale.videos, **given)
     comparisons = {
         "relighting": lambda: compare_relighting(relit, fields, assets, executor),
         "video": lambda: compare_videos(videos, fields, assets, executor),
@@ -130,7 +127,7 @@ def _episodes(
     """Episodes of all sections."""
     base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=config.about.names)
     chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
-    sections = sections_of(base, config.scale, chosen, has_foresight=is_trained(config.data_dir))
+    sections = sections_of(base, config.scale, chosen)
     return (yield from measure_cells(sections, fields, assets, executor))
 
 
@@ -166,8 +163,6 @@ def _warnings(config: Reproduce) -> list[str]:
     left_out = [part for part in PARTS if part not in config.parts]
     if left_out:
         told.append(f"Parts left out: {', '.join(left_out)}.")
-    if not is_trained(config.data_dir):
-        told.append("FitVid and visual foresight are left out, for no network of theirs is trained on this machine.")
     return told
 
 

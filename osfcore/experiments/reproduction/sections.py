@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -106,24 +105,20 @@ class Section:
     cells: tuple[Cell, ...]
 
 
-def sections_of(
-    base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS, *, has_foresight: bool = True
-) -> tuple[Section, ...]:
+def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS) -> tuple[Section, ...]:
     """All sections with cells, in their order.
 
     Args:
         base: where results are kept, the objects to draw from, and the seed.
         scale: how much is measured.
         chosen: sections that are shown.
-        has_foresight: whether its network is there.
     """
     settings = scale.settings
     base = replace(
         base, tasks=scale.tasks, objects=scale.objects, settings=settings, actions=settings.steps, oracle=False
     )
-    methods = {label: one for label, one in _METHODS.items() if has_foresight or one.method != "foresight"}
     makers = {
-        "methods": partial(_methods, methods=methods),
+        "methods": _methods,
         "families": _families,
         "ablations": _ablations,
         "ladder": _ladder,
@@ -134,14 +129,14 @@ def sections_of(
     return tuple(section for section in sections if len(section.cells) > 1)
 
 
-def _methods(base: EvaluateMpc, scale: Scale, methods: Mapping[str, Variant]) -> list[Section]:
+def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
     sections = []
     for count in scale.counts:
         tasks = scale.headline if count == scale.objects else scale.tasks
         given = replace(base, objects=count, tasks=tasks, oracle=count == scale.objects)
         cells = [
             Cell(label, replace(given, variant=variant, oracle=given.oracle and label == "ours"))
-            for label, variant in methods.items()
+            for label, variant in _METHODS.items()
         ]
         title = f"Success by threshold, {count} objects (Fig. 7)"
         text = (

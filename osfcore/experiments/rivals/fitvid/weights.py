@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from osfcore.errors import CorruptFile, OsfError, shown
+from osfcore.errors import CorruptFile, shown
 from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.io.files import write_atomically
 from osfcore.io.network_file import read_parameters
@@ -19,35 +19,11 @@ _FILE = "fitvid.safetensors"
 _SIZES = ("side", "width", "features", "hidden", "latent")
 
 
-class UntrainedFitVid(OsfError):
-    """No network predicts video here."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(
-            f"Visual foresight needs a trained FitVid; 'osf train fitvid' makes {path} (see docs/evaluation.md)."
-        )
-
-
 def fitvid_path(data_dir: Path | None) -> Path:
-    """Where the network lies: DATA_DIR/fitvid.safetensors, else the package's.
-
-    Raises:
-        UntrainedFitVid: if there is none.
-    """
-    own = () if data_dir is None else (data_dir / _FILE,)
-    for path in (*own, Path(str(files("osfcore.experiments.rivals") / "shipped" / _FILE))):
-        if path.is_file():
-            return path
-    raise UntrainedFitVid(own[0] if own else Path(_FILE))
-
-
-def is_trained(data_dir: Path | None) -> bool:
-    """Whether there is a network."""
-    try:
-        fitvid_path(data_dir)
-    except UntrainedFitVid:
-        return False
-    return True
+    """Where the network lies: DATA_DIR/fitvid.safetensors, else the package's."""
+    own = None if data_dir is None else data_dir / _FILE
+    shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / _FILE))
+    return own if own is not None and own.is_file() else shipped
 
 
 def fitvid_bytes(model: FitVidModel) -> bytes:
