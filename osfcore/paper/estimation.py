@@ -1,15 +1,17 @@
 """Inverse parameter estimation as published (paper section 4.2): CMA-ES alone, for poses and light.
 
 The first frame has masks. For some iterations the light is held overhead and each object's pose is optimised by its own
-CMA-ES within its masks (eq. 5); then one CMA-ES optimises all poses and the light together (eq. 5 and 6). Later frames
-have no masks: one CMA-ES begins at the last estimate, with a smaller initial standard deviation, and compares whole
-images (eq. 6; with masks after all, as the paper's own evaluation has them, eq. 5 is added as before). Poses are
-position and quaternion, s in R^7; the light is a position L^p in R^3 of which the direction counts. There are no
-resting orientations, no gradients, no rivals, no predictions, no doubts.
+CMA-ES within its masks (eq. 5); then one CMA-ES optimises all poses and the light together (the sum of eq. 5, whose
+light stays overhead, and eq. 6). Later frames have no masks: the light is that of the first frame, and one CMA-ES over
+the poses begins at the last estimate, with a smaller initial standard deviation, and compares whole images (eq. 6; with
+masks after all, as the paper's own evaluation has them, eq. 5 is added as before). Poses are position and quaternion,
+s in R^7; the light is a position L^p in R^3 of which the direction counts. There are no resting orientations, no
+gradients, no rivals, no predictions, no doubts.
 
-Readings of what the paper leaves open: positions begin at the masks' centroids, triangulated, and orientations upright;
+Choices where the paper says nothing: positions begin at the masks' centroids, triangulated, and orientations upright;
 the first five iterations have a population large enough to find an orientation; populations, iterations and standard
-deviations are chosen so that an estimate takes about as long as ours; images are compared at half their resolution.
+deviations are chosen so that an estimate takes about as long as ours; images are compared at half their resolution,
+rendered as coarsely as our estimation renders them.
 """
 
 from __future__ import annotations
@@ -49,8 +51,9 @@ class PaperEstimationConfig:
         joint_population: candidates in each.
         later_iterations: of a later frame.
         later_population: candidates in each.
-        first_spread: initial standard deviations in the first frame: positions [m], quaternions' numbers, light [m].
-        later_spread: likewise in later ones.
+        masked_spread: initial standard deviations in the masks: positions [m], quaternions' numbers.
+        joint_spread: of positions [m], quaternions' numbers, light [m] when these poses are refined together.
+        later_spread: of positions and quaternions' numbers in later frames, where the light is held.
     """
 
     masked_iterations: int = 5
@@ -59,8 +62,9 @@ class PaperEstimationConfig:
     joint_population: int = 24
     later_iterations: int = 8
     later_population: int = 20
-    first_spread: tuple[float, float, float] = (0.01, 1.0, 0.5)
-    later_spread: tuple[float, float, float] = (0.01, 0.1, 0.05)
+    masked_spread: tuple[float, float] = (0.02, 1.0)
+    joint_spread: tuple[float, float, float] = (0.01, 0.15, 0.5)
+    later_spread: tuple[float, float] = (0.01, 0.1)
 
 
 def estimate_first(
@@ -88,8 +92,8 @@ def estimate_first(
         observation.names, np.array(starts).reshape(-1, 3), upright, np.array(OVERHEAD), observation.pusher
     )
     reporter = StepReporter(config.masked_iterations + config.joint_iterations + 1)
-    shift, turn, light = config.first_spread
-    searches = [_Search(_one(params, n), (shift, turn, 0.0), config.masked_population, rng) for n in range(len(starts))]
+    spread = (*config.masked_spread, 0.0)
+    searches = [_Search(_one(params, n), spread, config.masked_population, rng) for n in range(len(starts))]
     for _ in range(config.masked_iterations):
         tried, losses = [], []
         for n, search in enumerate(searches):
@@ -103,8 +107,7 @@ def estimate_first(
         )
         sigma = searches[0].sigma if searches else 1.0
         yield reporter.step("objects", "Each object in its masks", params, tried, losses, sigma)
-    share = float(np.mean([search.sigma for search in searches])) if searches else 1.0
-    search = _Search(params, (shift * share, turn * share, light), config.joint_population, rng)
+    search = _Search(params, config.joint_spread, config.joint_population, rng)
     yield from _descend(models, views, search, config.joint_iterations, reporter, has_masks=True)
 
 
@@ -115,7 +118,7 @@ def estimate_next(
     rng: np.random.Generator,
     config: PaperEstimationConfig,
 ) -> Iterator[EstimateStep]:
-    """Find poses and light again; the last step holds the estimate.
+    """Find the poses again, under the light that is known; the last step holds the estimate.
 
     Args:
         models: fields of the objects and the table.
@@ -133,7 +136,7 @@ def estimate_next(
         raise InvalidInput("objects of the last estimate", ", ".join(before.names), ", ".join(observation.names))
     views = views_of(observation, FINE_SIDE // 2)
     params = SceneParameters.of(before.reordered(observation.names), observation.pusher)
-    search = _Search(params, config.later_spread, config.later_population, rng)
+    search = _Search(params, (*config.later_spread, 0.0), config.later_population, rng)
     reporter = StepReporter(config.later_iterations + 1)
     yield from _descend(models, views, search, config.later_iterations, reporter, has_masks=views.masks is not None)
 
@@ -145,11 +148,12 @@ def masked_error(models: ObjectModels, views: ObservedViews, number: int, batch:
         models: fields.
         views: with masks.
         number: of the object in the views.
-        batch: B scenes of this object alone; their light is the one to render under.
+        batch: B scenes of this object alone, whose light does not count: L_init is overhead.
     """
     assert views.masks is not None
     wanted = views.images * views.masks[:, number, ..., None]
-    alone = SceneBatch(batch.names, batch.positions, batch.quaternions, batch.lights, None)
+    overhead = np.broadcast_to(OVERHEAD, batch.lights.shape)
+    alone = SceneBatch(batch.names, batch.positions, batch.quaternions, overhead, None)
     return _mean_square(models.alone.render(alone, views.cameras, quality=views.quality).rgb, wanted)
 
 
@@ -186,9 +190,8 @@ def _descend(
         loss = search.tell(errors)
         tried = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(names))]
         stage: Stage = "together"
-        yield reporter.step(
-            stage, "All objects and the light", search.best, tried, [], search.sigma, batch.lights, loss
-        )
+        light = " and the light" if search.scales[2] else ""
+        yield reporter.step(stage, f"All objects{light}", search.best, tried, [], search.sigma, batch.lights, loss)
     shift, turn, light = (scale * search.sigma for scale in search.scales)
     deviations = np.full(len(names), shift), np.full(len(names), 2 * turn)
     estimate = EstimatedState(search.best.state(), *deviations, light, ("",) * len(names), "")

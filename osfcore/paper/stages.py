@@ -51,7 +51,7 @@ class PaperEstimators(Estimators):
         rng: np.random.Generator,
         usual: Float[np.ndarray, "N"] | None = None,
     ) -> Iterator[EstimateStep]:
-        """Poses and light of a frame without masks."""
+        """Poses in a later frame, under the light of the last estimate."""
         return estimate_next(models, observation, expected, rng, self.cma)
 
 

@@ -107,10 +107,10 @@ class EvaluateMpcCommand(ParallelEvaluation):
     """Cameras that look, 1 to 4."""
     masks: bool = False
     """With --method paper: masks at every step, not in the first frame alone."""
-    samples: int = 160
-    """Sequences of actions in each round of our plans (K)."""
-    horizon: int = 30
-    """Actions in each (T)."""
+    samples: int | None = None
+    """Sequences of actions in each round of a plan (K): 160 by default, SAMPLES_PAPER as published, 16 of foresight."""
+    horizon: int | None = None
+    """Actions in each (T): 30 by default, HORIZON_PAPER as published, 10 of foresight."""
     factor: str = ""
     """One thing in which the world differs from what the method takes for granted, such as table_wood."""
     cost: Literal["pose", "image"] = "pose"
@@ -124,13 +124,17 @@ class EvaluateMpcCommand(ParallelEvaluation):
         from osfcore.control.episode_settings import EpisodeSettings
         from osfcore.experiments.rearrangement.evaluation import EvaluateMpc, evaluate_mpc
         from osfcore.experiments.rearrangement.methods import Variant
+        from osfcore.experiments.rivals.visual_foresight import ForesightSettings
+        from osfcore.paper.mppi import GaussianPlanSettings
         from osfcore.planning.mppi import PlanSettings
 
         variant = Variant(self.method, frozenset(self.ours), frozenset(self.truths), self.views, self.masks)
-        settings = EpisodeSettings(plan=PlanSettings(samples=self.samples, horizon=self.horizon))
+        asked = {"samples": self.samples, "horizon": self.horizon}
+        plan = {key: value for key, value in asked.items() if value is not None}
         config = EvaluateMpc(
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,
-            self.factor, self.cost, self.names, self.oracle, settings, PlanSettings(samples=self.oracle_samples),
+            self.factor, self.cost, self.names, self.oracle, EpisodeSettings(plan=PlanSettings(**plan)),
+            PlanSettings(samples=self.oracle_samples), GaussianPlanSettings(**plan), ForesightSettings(**plan),
         )  # fmt: skip
         return evaluate_mpc(config, fields, assets, executor)
 

@@ -4,7 +4,7 @@ The loop sees four cameras, masks in the first frame, and the goal image; it has
 for. The same tasks are given to the same planner with true poses and the simulator as its dynamics (an oracle: an upper
 bound), and to nobody. A goal that is refused counts as a failure, for nothing is moved then; beside it stands what
 happens if the doubt is overruled. Results of finished tasks are kept in the output folder: a killed evaluation goes on
-where it was.
+where it was. Methods other than ours refuse no goal.
 """
 
 from __future__ import annotations
@@ -16,11 +16,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from osfcore import control, dynamics, estimation, paper, planning, render, world
+from osfcore import (
+    control,
+    dynamics,
+    estimation,
+    geometry,
+    metrics,
+    objects,
+    paper,
+    planning,
+    random_streams,
+    render,
+    world,
+)
+from osfcore import fields as fields_room
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
 from osfcore.dynamics.push_models import network_path, shipped
-from osfcore.errors import MissingAssets, check_ranges, check_seed
+from osfcore.errors import InvalidInput, MissingAssets, check_ranges, check_seed
 from osfcore.experiments import rivals
+from osfcore.experiments.estimation import tasks as estimation_tasks
+from osfcore.experiments.fields import composite_scenes
 from osfcore.experiments.image_methods import field_path, known_names
 from osfcore.experiments.pieces import EvaluationStep, Piece, finished
 from osfcore.experiments.rearrangement import factors, measured_episodes, methods, own_pushes, runs, sensor, tasks
@@ -31,11 +46,12 @@ from osfcore.experiments.rearrangement.report import MpcReport, write_pictures
 from osfcore.experiments.rearrangement.tasks import Family, TaskSet, check_tasks
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
-from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256
+from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
+from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"
@@ -44,13 +60,13 @@ _ORACLE_PLAN = PlanSettings(samples=96)
 _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
 _ORACLE_REPLANS_EVERY = 2
 
-_FORESIGHT = ForesightSettings(budget_s=3.0)  # what one of our looks and plans takes together, on one core
-
 _CODE = (
-    control, dynamics, estimation, paper, planning, render, rivals, world,
-    factors, measured_episodes, methods, own_pushes, runs, sensor, tasks,
+    control, dynamics, estimation, fields_room, geometry, metrics, objects, paper, planning, random_streams, render,
+    rivals, world, composite_scenes, estimation_tasks, factors, measured_episodes, methods, own_pushes, runs, sensor,
+    tasks,
 )  # fmt: skip
 
+Plan = PlanSettings | GaussianPlanSettings | ForesightSettings
 _Work = Callable[[int], TaskResult]
 
 
@@ -73,6 +89,7 @@ class EvaluateMpc:
         oracle: also run the planner that is told the truth.
         settings: of the episodes but for their cost and number of actions.
         oracle_plan: how the oracle plans.
+        published: how planning as published samples.
         foresight: how visual foresight plans.
     """
 
@@ -90,7 +107,15 @@ class EvaluateMpc:
     oracle: bool = True
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     oracle_plan: PlanSettings = _ORACLE_PLAN
-    foresight: ForesightSettings = field(default_factory=lambda: _FORESIGHT)
+    published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
+    foresight: ForesightSettings = field(default_factory=ForesightSettings)
+
+    @property
+    def plan(self) -> Plan:
+        """How the method plans."""
+        if self.variant.method == "foresight":
+            return self.foresight
+        return self.published if self.variant.published("planning") else self.settings.plan
 
 
 def evaluate_mpc(
@@ -122,13 +147,16 @@ def evaluate_mpc(
 
 def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcReport:
     """What the results of `episode_pieces` tell, in their order."""
-    return MpcReport(tuple(results[: config.tasks]), tuple(results[config.tasks :]))
+    is_ours = config.variant.method == "ours"
+    return MpcReport(tuple(results[: config.tasks]), tuple(results[config.tasks :]), may_refuse=is_ours)
 
 
 def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
     """The figures of a report with what was measured, as plain JSON."""
-    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "cost")}
+    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "names")}
     variant = config.variant
+    about["cost"] = "image" if variant.method == "foresight" or variant.published("planning") else config.cost
+    about |= {"samples": config.plan.samples, "horizon": config.plan.horizon}
     about |= {"method": variant.method, "views": variant.views, "masks": variant.has_masks}
     about |= {"ours": sorted(variant.replaced), "truths": sorted(variant.truths)}
     return {**report.to_json(), **about}
@@ -137,8 +165,9 @@ def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
 def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
     check_ranges(("number of tasks", config.tasks, 1, MAX_TASKS))
     check_variant(config.variant)
-    if config.factor:
-        factor_named(config.factor)
+    if config.factor and factor_named(config.factor).has_unseen_objects and config.variant.published("dynamics"):
+        allowed = "left out with the paper's dynamics: they are of objects that have a name"
+        raise InvalidInput("factor of variation", config.factor, allowed)
     check_seed(config.seed)
     if config.names is None:
         known = known_names(config.variant.fields, fields, config.data_dir)
@@ -178,16 +207,15 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
     episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
     given, own = _circumstances(config, fields, assets)
     folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
-    parts = (config.variant.name(), config.cost, _plan_name(config.settings.plan, PlanSettings()), config.factor)
+    usual = type(config.plan)()
+    parts = (config.variant.name(), config.cost, _plan_name(config.plan, usual), config.factor)
     method = "-".join(part for part in parts if part)
     kinds: list[tuple[str, dict[str, Any], _Work]]
     if config.variant.method == "foresight":
-        plan = config.foresight
-        work: _Work = partial(episodes.by_foresight, settings=plan, actions=settings.steps)
-        kinds = [(method, {**own, "settings": asdict(plan)}, work)]
+        work: _Work = partial(episodes.by_foresight, settings=config.foresight, actions=settings.steps)
     else:
-        work = partial(episodes.from_images, settings=settings)
-        kinds = [(method, {**own, "settings": asdict(settings)}, work)]
+        work = partial(episodes.from_images, settings=settings, published=config.published)
+    kinds = [(method, {**own, "settings": asdict(settings), "plan": asdict(config.plan)}, work)]
     if config.oracle:
         told = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, _ORACLE_PLAN)) if part)
         kinds.append((told, {"settings": asdict(told_truth)}, partial(episodes.oracle, settings=told_truth)))
@@ -198,7 +226,7 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
     ]
 
 
-def _plan_name(plan: PlanSettings, usual: PlanSettings) -> str:
+def _plan_name(plan: Plan, usual: Plan) -> str:
     """What tells results of unusual plans from others."""
     return "" if plan == usual else f"K{plan.samples}T{plan.horizon}"
 
@@ -211,6 +239,7 @@ def _circumstances(
     given = {
         "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in names},
         "network": file_sha256(network_path(config.data_dir)),
+        "table": table_sha256(fields.load_table()),
         "code": code_sha256(*_CODE),
     }
     own: dict[str, Any] = {}

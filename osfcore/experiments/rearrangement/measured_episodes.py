@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import torch
 
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Stepped
@@ -33,6 +34,7 @@ from osfcore.io.image_file import to_uint8
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.random_streams import Stream, stream_rng
 
 _NO_ERRORS: Mapping[str, list[float]] = MappingProxyType({"mm": [], "deg": []})  # of who predicts no poses
@@ -58,7 +60,9 @@ class MeasuredEpisodes:
     factor: str = ""
     variant: Variant = field(default_factory=Variant)
 
-    def from_images(self, number: int, settings: EpisodeSettings) -> TaskResult:
+    def from_images(
+        self, number: int, settings: EpisodeSettings, published: GaussianPlanSettings | None = None
+    ) -> TaskResult:
         """A task for a method that sees images alone; doubts about its goal are noted and overruled."""
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
@@ -67,7 +71,7 @@ class MeasuredEpisodes:
         parts = loop_parts(self.variant, models, drawn.task, self.fields, self.data_dir)
         settings, rng = replace(settings, despite_doubts=True), stream_rng(self.tasks.seed, Stream.EPISODE, number)
         log = _Log(drawn.task, models.symmetries)
-        given = drawn.task, self.assets, parts, settings, rng, self._factor(), self.variant
+        given = drawn.task, self.assets, parts, settings, rng, self._factor(), self.variant, published
         ended = log.follow(run_from_images(*given))
         return self._scored(drawn, ended, {**log.summary(), "predicted": prediction_errors(log.course, parts.models)})
 
@@ -75,7 +79,7 @@ class MeasuredEpisodes:
         """A task for visual foresight, which pushes until all actions are done."""
         drawn = self._drawn(number)
         rng = stream_rng(self.tasks.seed, Stream.EPISODE, number)
-        log, predictor = _Log(drawn.task, {}), read_fitvid(fitvid_path(self.data_dir))
+        log, predictor = _Log(drawn.task, {}), read_fitvid(fitvid_path(self.data_dir), torch.bfloat16)
         given = drawn.task, self.assets, predictor, settings, actions, rng, self._factor(), predictor.settings.side
         ended = log.follow(run_visual_foresight(*given))
         return self._scored(drawn, ended, {**log.summary(), "predicted": dict(_NO_ERRORS)})

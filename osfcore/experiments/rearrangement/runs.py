@@ -21,6 +21,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
+from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import MPPIPlanner
 from osfcore.planning.pose_cost import PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
@@ -62,6 +63,7 @@ def run_from_images(
     rng: np.random.Generator,
     factor: Factor | None = None,
     variant: Variant | None = None,
+    published: GaussianPlanSettings | None = None,
 ) -> Iterator[Event | TrueState | Ended]:
     """The whole loop, with the truth before each `Stepped`; the last step is how it ended.
 
@@ -69,10 +71,11 @@ def run_from_images(
         task: what is told of it is the goal image alone.
         assets: meshes, for the simulator.
         parts: what the loop is made of.
-        settings: how the loop goes; of planning as published, the number of steps counts.
+        settings: how the loop goes; of planning as published, the number of steps alone.
         rng: of estimates and plans.
         factor: how the world differs from what is taken for granted.
         variant: tells who plans, what is replaced by the truth, and how many cameras there are.
+        published: how planning as published samples.
     """
     variant = variant or Variant()
     cameras = default_cameras()[: variant.views]
@@ -82,7 +85,7 @@ def run_from_images(
         world.restore(task.start)
         parts = told_truths(parts, variant.truths, world.truth, assets)
         if variant.published("planning"):
-            how = AlgorithmSettings(settings.steps, has_masks=variant.has_masks)
+            how = AlgorithmSettings(settings.steps, published or GaussianPlanSettings(), variant.has_masks)
             events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
         else:
             target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal

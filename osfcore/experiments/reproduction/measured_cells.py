@@ -94,6 +94,7 @@ def _measured(section: Section, results: Sequence[Sequence[TaskResult]]) -> Meas
 
 
 def _same_tasks(section: Section, number: int) -> bool:
-    """Whether a cell has the first one's tasks; another family has others."""
+    """Whether a cell has the first one's tasks: another family has others, but for another light of the goal image."""
     one, other = section.cells[0].config, section.cells[number].config
-    return (one.family, one.objects, one.tasks) == (other.family, other.objects, other.tasks)
+    places = {config.family.replace("relit", "shifted") for config in (one, other)}
+    return len(places) == 1 and (one.objects, one.tasks) == (other.objects, other.tasks)

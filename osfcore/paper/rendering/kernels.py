@@ -178,7 +178,7 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
     _start_ray(
         pack, fields, scene, cameras, b, view, dx, dy, dz, boxes, row, column, min(table_t, pusher_t), step, work
     )
-    left = _ONE
+    left, coloured = _ONE, _ZERO
     while left > rules[2]:
         k = np.int64(1) << 40
         for n in range(count):
@@ -209,6 +209,11 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
         result[3] += weight * t
         result[4] += weight
         left -= weight
+        if weight > rules[1]:
+            coloured += weight
+    if coloured > _ZERO:  # what was too faint to be coloured looks like the rest
+        for c in range(3):
+            result[c] *= result[4] / coloured
     _add_behind(table, scene, maps, directs, cameras, b, view, dx, dy, dz, table_t, pusher_t, is_cap, left, work)
 
 

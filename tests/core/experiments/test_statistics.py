@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.experiments.statistics import compare_means, compare_shares, mean_interval, share_interval
+from osfcore.experiments.statistics import compare_means, compare_shares, holm, mean_interval, share_interval
 
 OUTCOMES = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=30)
 
@@ -38,6 +38,37 @@ def test_mcnemar_counts_tasks_in_which_one_alone_succeeds(only_one, p):
     found = compare_shares(ours, others)
     assert found["p"] == pytest.approx(p)
     assert found["difference"] == pytest.approx(only_one / len(ours))
+
+
+@given(outcomes=OUTCOMES)
+def test_the_interval_of_a_difference_holds_it_and_is_never_without_width(outcomes):
+    ours, others = zip(*outcomes, strict=True)
+    found = compare_shares(ours, others)
+    low, high = found["interval"]
+    assert -1 <= low <= found["difference"] <= high <= 1
+    assert high - low > 0.05
+
+
+def test_without_correlation_the_interval_of_a_difference_adds_the_squares_of_both():
+    """Newcombe (1998), method 10, where one method always succeeds."""
+    ours, others = [True] * 20, [True] * 15 + [False] * 5
+    (low, _), (other_low, other_high) = share_interval(20, 20), share_interval(15, 20)
+    found = compare_shares(ours, others)["interval"]
+    assert found[0] == pytest.approx(0.25 - np.hypot(1 - low, other_high - 0.75))
+    assert found[1] == pytest.approx(0.25 + 0.75 - other_low)
+
+
+def test_tasks_that_are_hard_for_both_narrow_the_interval_of_their_difference():
+    ours = [True] * 10 + [False] * 10
+    alike, unlike = ours, [*ours[5:], *ours[:5]]
+    widths = [np.ptp(compare_shares(ours, others)["interval"]) for others in (alike, unlike)]
+    assert widths[0] < 0.7 * widths[1]
+
+
+def test_holm_corrects_for_the_number_of_tests():
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([0.5, 0.9]) == [1.0, 1.0]
+    assert holm([]) == []
 
 
 @given(outcomes=OUTCOMES)

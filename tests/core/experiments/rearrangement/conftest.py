@@ -28,12 +28,12 @@ def runs(monkeypatch):
     """
     made = []
 
-    def ours(task, _assets, parts, settings, _rng, factor, variant):
+    def ours(task, _assets, parts, settings, _rng, factor, variant, published):
         held = parts.estimators.first.held_light
         assert (held is None) == (parts.estimators.goal.held_light is None)
         assert (held == (0, 0, 1)) == (variant.method in ("overhead", "nerf"))
         assert isinstance(factor, Factor)
-        made.append((variant.method, task.number, settings.cost))
+        made.append((variant.method, task.number, published.samples if variant.method == "paper" else settings.cost))
         assert settings.despite_doubts
         one, doubt = np.full(len(task.start.names), 1e-3), "hidden" if task.number % 2 else ""
         estimate = EstimatedState(task.goal, one, one, 1e-3, ("",) * len(one), doubt)
@@ -49,7 +49,7 @@ def runs(monkeypatch):
 
     def foresight(task, _assets, _predictor, settings, steps, _rng, _factor, _size):
         made.append(("foresight", task.number, steps))
-        plan = ForesightPlan(np.zeros((1, 3)), np.zeros(2), 1, 2.5)
+        plan = ForesightPlan(np.zeros((1, 3)), np.zeros(2), 2.5)
         yield from (Foreseen(number, np.zeros(3), plan, PAPER) for number in range(steps))
         yield Ended(task.start, PAPER, PAPER)
 
