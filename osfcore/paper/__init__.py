@@ -1,1 +1,1 @@
-"""The method as published, module by module; docs/paper.md tells every reading of the text and every deviation."""
+"""The method as published, module by module; docs/paper.md tells the choices and deviations, each module its own."""

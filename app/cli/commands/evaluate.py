@@ -108,9 +108,9 @@ class EvaluateMpcCommand(ParallelEvaluation):
     masks: bool = False
     """With --method paper: masks at every step, not in the first frame alone."""
     samples: int | None = None
-    """Sequences of actions in each round of a plan (K): 160 by default, SAMPLES_PAPER as published, 16 of foresight."""
+    """Sequences of actions in each round of a plan (K): 160 by default, 200 as published, 16 of foresight."""
     horizon: int | None = None
-    """Actions in each (T): 30 by default, HORIZON_PAPER as published, 10 of foresight."""
+    """Actions in each (T): 30 by default, 15 as published, 10 of foresight."""
     factor: str = ""
     """One thing in which the world differs from what the method takes for granted, such as table_wood."""
     cost: Literal["pose", "image"] = "pose"

@@ -45,7 +45,7 @@ class PaperFieldRecipe:
     """How a KiloOSF is trained.
 
     Attributes:
-        teacher: of the first step; the paper's has 8 layers of 256 units.
+        teacher: of the first step; NeRF's networks have 8 layers of 256 units.
         across: cells along the longest side; fewer where the file would pass 2 MB.
         width: units of the tiny networks (KiloNeRF's 32).
         rays: pixels per step of fine-tuning.

@@ -2,7 +2,9 @@
 
 As in the published program: windows of two context frames and ten more, beta 1e-4, Adam at a rate of 1e-3, gradients
 clipped at a norm of 100. Deviations: batches are of 8 instead of 128 windows, and the rate falls over the last fifth of
-the budget, for there are minutes where the original has ten million steps.
+the budget, for there are minutes where the original has ten million steps. The package's network learned at a rate of
+5e-3 in batches of 4 without augmentation, from pushes that seek contact, of which videos show four times as much motion
+as of the paper's random ones; as for our dynamics, episodes with a held-out pair of objects are left out.
 """
 
 from __future__ import annotations
