@@ -44,7 +44,7 @@ def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float)
     better = "ours is better" if gap["difference"] < 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
-        f"{ours.figures['objects']} objects, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
+        f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
         f"{_percent(other, key)}, a difference of {-100 * gap['difference']:.0f} points (95 %: {low:.0f} to "
         f"{high:.0f}; McNemar p = {gap['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
@@ -54,7 +54,7 @@ def _distance(ours: MeasuredCell) -> str:
     mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
     verdict = "at most" if mean <= _HALF * nothing else "more than"
     return (
-        f"{ours.figures['objects']} objects: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
+        f"{_objects(ours)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
         f"{nothing:.3f}: {verdict} half."
     )
 
@@ -68,6 +68,11 @@ def _costly(section: MeasuredSection) -> Iterator[str]:
                 f"Under {cell.label} {-100 * gap['difference']:.0f} points of success are lost (95 %: {low:.0f} to "
                 f"{high:.0f}), more than {100 * MOST_LOST:.0f}."
             )
+
+
+def _objects(cell: MeasuredCell) -> str:
+    count = cell.figures["objects"]
+    return f"{count} object{'s' * (count > 1)}"
 
 
 def _percent(cell: MeasuredCell, key: str) -> str:

@@ -37,9 +37,9 @@ class ReproduceCommand:
     tasks: int | None = None
     """Tasks of each cell; 3 with --quick, else 100 of the methods with three objects and 50 of all others."""
     objects: int | None = None
-    """In a scene; 2 with --quick, else 2, 3 and 4 for the methods and 3 for everything else."""
+    """In a scene; 1 with --quick, else 2, 3 and 4 for the methods and 3 for everything else."""
     actions: int | None = None
-    """That an episode may have; 12 with --quick, else 30."""
+    """That an episode may have; 8 with --quick, else 30."""
     seed: int = 0
     """Of everything random."""
     names: tuple[str, ...] | None = None
