@@ -74,7 +74,7 @@ class Scale:
     has_short_plans: bool = True
 
 
-_FEW = EpisodeSettings(steps=8, plan=PlanSettings(samples=32, horizon=10))
+_FEW = EpisodeSettings(steps=5, plan=PlanSettings(samples=32, horizon=10))
 QUICK = Scale(
     tasks=3, headline=3, counts=(1,), objects=1, settings=_FEW, published=GaussianPlanSettings(48, 8),
     foresight=ForesightSettings(8, 6), factors=("light_low", "table_wood"), families=(), scenes=3,
