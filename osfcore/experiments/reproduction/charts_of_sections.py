@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def _success_chart(section: MeasuredSection) -> Chart:
     if first.report.oracle:
         kinds["told the truth"] = first.report.told_truth
     curves = [_curve(name, scores) for name, scores in kinds.items()]
-    return Chart(f"{first.figures['objects']} objects", _DISTANCE, _SHARE, curves)
+    return Chart(objects_of(first.figures), _DISTANCE, _SHARE, curves)
 
 
 def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
@@ -65,3 +66,9 @@ def write_success_bars(path: Path, section: MeasuredSection) -> None:
 def _bar(cell: MeasuredCell) -> Bar:
     low, high = cell.figures["success_tight_interval"]
     return Bar(cell.label, cell.figures["success_tight"], low, high)
+
+
+def objects_of(figures: Mapping[str, Any]) -> str:
+    """How many objects a scene has, in words."""
+    count = figures["objects"]
+    return f"{count} object{'s' * (count > 1)}"

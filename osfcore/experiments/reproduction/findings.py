@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+from osfcore.experiments.reproduction.charts_of_sections import objects_of
 from osfcore.experiments.reproduction.measured_cells import MeasuredCell, MeasuredSection
 from osfcore.experiments.statistics import holm
 
@@ -40,13 +41,13 @@ def _gap_of(cell: MeasuredCell, key: str) -> Mapping[str, Any]:
 def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float) -> str:
     """Ours against another method; who is better is said where p, corrected for all comparisons, is below 5 %."""
     gap = _gap_of(other, key)
-    low, high = (-100 * end for end in reversed(gap["interval"]))
+    low, high = (100 * end for end in gap["interval"])
     better = "ours is better" if gap["difference"] < 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
-        f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
-        f"{_percent(other, key)}, a difference of {-100 * gap['difference']:.0f} points (95 %: {low:.0f} to "
-        f"{high:.0f}; McNemar p = {gap['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
+        f"{objects_of(ours.figures)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
+        f"{_percent(other, key)}, which is {100 * gap['difference']:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
+        f"McNemar p = {gap['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
 
 
@@ -54,7 +55,7 @@ def _distance(ours: MeasuredCell) -> str:
     mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
     verdict = "at most" if mean <= _HALF * nothing else "more than"
     return (
-        f"{_objects(ours)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
+        f"{objects_of(ours.figures)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
         f"{nothing:.3f}: {verdict} half."
     )
 
@@ -68,11 +69,6 @@ def _costly(section: MeasuredSection) -> Iterator[str]:
                 f"Under {cell.label} {-100 * gap['difference']:.0f} points of success are lost (95 %: {low:.0f} to "
                 f"{high:.0f}), more than {100 * MOST_LOST:.0f}."
             )
-
-
-def _objects(cell: MeasuredCell) -> str:
-    count = cell.figures["objects"]
-    return f"{count} object{'s' * (count > 1)}"
 
 
 def _percent(cell: MeasuredCell, key: str) -> str:

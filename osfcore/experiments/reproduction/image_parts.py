@@ -9,6 +9,7 @@ from typing import Any
 from osfcore.experiments.dynamics import video_prediction
 from osfcore.experiments.fields import relighting
 from osfcore.experiments.image_methods import TITLES
+from osfcore.experiments.reproduction.charts_of_sections import objects_of
 from osfcore.experiments.reproduction.page import PagePart
 
 
@@ -21,7 +22,7 @@ def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     """
     columns = [(key, relighting.ALL, title) for key, title in _RELIT.items()]
     text = (
-        f"{report['tasks']} scenes of {report['objects']} objects, poses and light given, under lights between "
+        f"{report['tasks']} scenes of {objects_of(report)}, poses and light given, under lights between "
         f"{min(report['elevations_deg']):g} and {max(report['elevations_deg']):g} deg above the table."
     )
     pictures = (
@@ -41,7 +42,7 @@ def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     spans = list(next(iter(report["methods"].values()))["psnr"]["spans"])
     columns = [(key, span, f"{title}, {span} steps") for span in spans for key, title in _VIDEO.items()]
     text = (
-        f"{report['tasks']} episodes of {report['objects']} objects, {report['steps']} actions known in advance, from "
+        f"{report['tasks']} episodes of {objects_of(report)}, {report['steps']} actions known in advance, from "
         "the first frame's estimate; FitVid sees two frames of the goal camera."
     )
     pictures = (

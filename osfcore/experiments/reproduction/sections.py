@@ -57,7 +57,7 @@ class Scale:
         families: beside `shifted`, with three objects.
         scenes: that fields are compared on.
         videos: that predictions are compared on.
-        has_short_plans: also ablate the plans.
+        has_all_ablations: also two views, and shorter plans.
     """
 
     tasks: int = 50
@@ -71,14 +71,14 @@ class Scale:
     families: tuple[Family, ...] = ("turned", "crowded", "relit")
     scenes: int = 20
     videos: int = 20
-    has_short_plans: bool = True
+    has_all_ablations: bool = True
 
 
-_FEW = EpisodeSettings(steps=5, plan=PlanSettings(samples=32, horizon=10))
+_FEW = EpisodeSettings(steps=4, plan=PlanSettings(samples=32, horizon=10))
 QUICK = Scale(
     tasks=3, headline=3, counts=(1,), objects=1, settings=_FEW, published=GaussianPlanSettings(48, 8),
     foresight=ForesightSettings(8, 6), factors=("light_low", "table_wood"), families=(), scenes=3,
-    videos=3, has_short_plans=False,
+    videos=3, has_all_ablations=False,
 )  # fmt: skip
 
 
@@ -168,8 +168,11 @@ def _families(base: EvaluateMpc, scale: Scale) -> list[Section]:
 def _ablations(base: EvaluateMpc, scale: Scale) -> list[Section]:
     plan = base.settings.plan
     cells = [Cell("ours", base)]
-    cells += [Cell(f"{n} view{'s' * (n > 1)}", replace(base, variant=Variant(views=n))) for n in (1, 2)]
-    if scale.has_short_plans:
+    cells += [
+        Cell(f"{n} view{'s' * (n > 1)}", replace(base, variant=Variant(views=n)))
+        for n in (1, 2)[: 1 + scale.has_all_ablations]
+    ]
+    if scale.has_all_ablations:
         for label, change in (
             (f"K = {plan.samples // 4}", {"samples": plan.samples // 4}),
             (f"T = {plan.horizon // 3}", {"horizon": plan.horizon // 3}),

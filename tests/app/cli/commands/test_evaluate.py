@@ -166,7 +166,7 @@ def runs(monkeypatch):
     """Runs that cost nothing: all reach the goal. Tells by what futures were compared."""
     made, image = [], np.full((16, 16, 3), 0.5)
 
-    def ours(task, _assets, _parts, settings, _rng, _factor, _variant):
+    def ours(task, _assets, _parts, settings, _rng, _factor, _variant, _published):
         made.append(settings.cost)
         yield Finished(0, "reached", "The table looks like the goal.", task.goal)
         yield Ended(task.goal, image, image)

@@ -16,6 +16,7 @@ from osfcore.experiments.rearrangement.tasks import TaskSet, draw_task
 from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.experiments.rivals.fitvid.weights import write_fitvid
 from osfcore.fields.field_library import FieldLibrary
+from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
 
 NAME = "005_tomato_soup_can"
@@ -103,6 +104,24 @@ def test_figures_are_those_of_the_events(library, tmp_path, runs):
     assert (report["first_s_median"], report["goal_s_median"], report["steps_median"]) == (8.0, 20.0, 2.0)
     assert (report["seconds_robot_median"], report["goal_mm_median"]) == (0.4, 0)
     assert runs == [("ours", n, "pose") for n in range(3)] + [("oracle", n, 8) for n in range(3)]
+
+
+@pytest.mark.parametrize("method", ["overhead", "nerf", "paper"])
+def test_methods_other_than_ours_refuse_no_goal(library, tmp_path, runs, method):
+    report = last(
+        evaluate_mpc(config(tmp_path, tasks=3, oracle=False, variant=Variant(method)), FieldLibrary(None), library)
+    ).report
+    assert report["refused"] == 1
+    assert report["success_2cm"] == report["success_2cm_overruled"] == 1
+
+
+def test_the_plan_is_that_of_whoever_plans(library, tmp_path, runs):
+    for variant in (Variant("paper"), Variant("paper", frozenset({"planning"}))):
+        asked = config(tmp_path, oracle=False, variant=variant, published=GaussianPlanSettings(9, 5))
+        report = last(evaluate_mpc(asked, FieldLibrary(None), library)).report
+        is_published = not variant.replaced
+        assert (report["samples"], report["horizon"]) == ((9, 5) if is_published else (8, 4))
+        assert report["cost"] == ("image" if is_published else "pose")
 
 
 def test_a_killed_evaluation_goes_on(library, tmp_path, runs):
@@ -207,6 +226,7 @@ def test_an_executor_gets_all_episodes_and_changes_no_figure(library, tmp_path, 
         ({"seed": -1}, InvalidInput, "seed"),
         ({"variant": Variant("magic")}, InvalidInput, "one of ours, overhead, known_light"),
         ({"actions": 0}, InvalidInput, "number of steps is 0"),
+        ({"factor": "objects_unseen", "variant": Variant("paper")}, InvalidInput, "the paper's dynamics"),
         ({"objects": 2}, InvalidInput, "number of objects with a field and a mesh is 1"),
         ({"objects": 2, "names": (NAME, NAME)}, InvalidInput, "at least 2"),
         ({"names": ("teapot",)}, UnknownName, "teapot"),

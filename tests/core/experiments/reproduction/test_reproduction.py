@@ -84,7 +84,7 @@ def test_findings_compare_methods_on_the_same_tasks(reported):
 def test_episodes_that_several_sections_show_are_run_once(library, tmp_path, runs):
     parts = ("factors", "attribution")
     last(reproduce(config(tmp_path, parts=parts), FieldLibrary(None), library))
-    usual, factors, attributed = 2, 3 * 2, 5 * 2
+    usual, factors, attributed = 2, 2 * 2, 5 * 2
     assert len(runs) == usual + factors + attributed
     runs.clear()
     last(reproduce(config(tmp_path, parts=("ladder",)), FieldLibrary(None), library))
