@@ -158,8 +158,8 @@ def _warnings(config: Reproduce) -> list[str]:
         told.append(
             f"A quick look and no measurement: {scale.tasks} tasks a cell, {scale.settings.steps} actions instead of "
             f"30, plans of {scale.settings.plan.samples} sequences, {scale.objects} "
-            f"object{'s' * (scale.objects > 1)}, and only the factors {', '.join(scale.factors)}. Intervals are as "
-            "wide as that makes them."
+            f"object{'s' * (scale.objects > 1)}, and only the factor {', '.join(scale.factors)}. Cells that take "
+            "longest are left out. Intervals are as wide as that makes them."
         )
     left_out = [part for part in PARTS if part not in config.parts]
     if left_out:

@@ -39,7 +39,7 @@ class ReproduceCommand:
     objects: int | None = None
     """In a scene; 1 with --quick, else 2, 3 and 4 for the methods and 3 for everything else."""
     actions: int | None = None
-    """That an episode may have; 4 with --quick, else 30."""
+    """That an episode may have; 12 with --quick, else 30."""
     seed: int = 0
     """Of everything random."""
     names: tuple[str, ...] | None = None
