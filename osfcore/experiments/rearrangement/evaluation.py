@@ -136,6 +136,7 @@ def evaluate_mpc(
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
+    config = replace(config, names=_checked(config, fields, assets))
     pieces = episode_pieces(config, fields, assets)
     results = yield from finished(pieces, executor, "episodes")
     report = episodes_report(config, results)
@@ -153,10 +154,10 @@ def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcRe
 
 def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
     """The figures of a report with what was measured, as plain JSON."""
-    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "names")}
+    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor")}
     variant = config.variant
     about["cost"] = "image" if variant.method == "foresight" or variant.published("planning") else config.cost
-    about |= {"samples": config.plan.samples, "horizon": config.plan.horizon}
+    about |= {"names": list(config.names or ()), "samples": config.plan.samples, "horizon": config.plan.horizon}
     about |= {"method": variant.method, "views": variant.views, "masks": variant.has_masks}
     about |= {"ours": sorted(variant.replaced), "truths": sorted(variant.truths)}
     return {**report.to_json(), **about}

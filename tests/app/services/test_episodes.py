@@ -497,7 +497,7 @@ def test_the_method_as_published_begins_with_its_own_settings(published):
     assert published.params["method"] == "paper"
     settings = published.params["settings"]
     assert (settings["steps"], settings["cost"], settings["replan_every"]) == (4, "image", 1)
-    assert settings["plan"] == {"samples": 100, "horizon": 10, "temperature": 0.3}
+    assert settings["plan"] == {"samples": 200, "horizon": 15, "temperature": 0.3}
 
 
 @pytest.mark.parametrize("setting", [{"cost": "pose"}, {"replan_every": 2}, {"planning": False}, {"acting": False}])
