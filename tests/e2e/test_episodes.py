@@ -277,7 +277,7 @@ def test_the_method_as_published_is_chosen_in_the_settings(page, service):
     page.select_option("#episode-settings select[name=method]", "paper")
     page.wait_for_selector("#episode-settings select[name=cost]", state="hidden")
     assert page.input_value("#setting-samples") == "200"
-    assert page.inner_text("#settings-facts") == "as published, 100 samples, 30 pushes"
+    assert page.inner_text("#settings-facts") == "as published, 200 samples, 30 pushes"
     begin(page, {"steps": 2, "samples": 8})
     settings = service.episode()["settings"]
     assert (settings["method"], settings["cost"], settings["samples"]) == ("paper", "image", 8)
