@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from osfcore.experiments.charts import Axis, Bar, Chart, Curve, write_bars, write_charts
 from osfcore.experiments.reproduction.measured_cells import MeasuredCell, MeasuredSection
+from osfcore.experiments.reproduction.sections import objects_in_words
 from osfcore.experiments.statistics import share_interval
 from osfcore.metrics.success import RearrangementScore
 
@@ -37,7 +37,7 @@ def _success_chart(section: MeasuredSection) -> Chart:
     if first.report.oracle:
         kinds["told the truth"] = first.report.told_truth
     curves = [_curve(name, scores) for name, scores in kinds.items()]
-    return Chart(objects_of(first.figures), _DISTANCE, _SHARE, curves)
+    return Chart(objects_in_words(first.figures["objects"]), _DISTANCE, _SHARE, curves)
 
 
 def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
@@ -66,9 +66,3 @@ def write_success_bars(path: Path, section: MeasuredSection) -> None:
 def _bar(cell: MeasuredCell) -> Bar:
     low, high = cell.figures["success_tight_interval"]
     return Bar(cell.label, cell.figures["success_tight"], low, high)
-
-
-def objects_of(figures: Mapping[str, Any]) -> str:
-    """How many objects a scene has, in words."""
-    count = figures["objects"]
-    return f"{count} object{'s' * (count > 1)}"

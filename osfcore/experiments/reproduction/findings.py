@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from osfcore.experiments.reproduction.charts_of_sections import objects_of
 from osfcore.experiments.reproduction.measured_cells import MeasuredCell, MeasuredSection
+from osfcore.experiments.reproduction.sections import objects_in_words
 from osfcore.experiments.statistics import holm
 
 _COMPARED: Mapping[str, str] = MappingProxyType(
@@ -45,7 +45,7 @@ def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float)
     better = "ours is better" if gap["difference"] < 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
-        f"{objects_of(ours.figures)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
+        f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
         f"{_percent(other, key)}, which is {100 * gap['difference']:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
         f"McNemar p = {gap['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
@@ -55,7 +55,7 @@ def _distance(ours: MeasuredCell) -> str:
     mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
     verdict = "at most" if mean <= _HALF * nothing else "more than"
     return (
-        f"{objects_of(ours.figures)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
+        f"{_objects(ours)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
         f"{nothing:.3f}: {verdict} half."
     )
 
@@ -69,6 +69,10 @@ def _costly(section: MeasuredSection) -> Iterator[str]:
                 f"Under {cell.label} {-100 * gap['difference']:.0f} points of success are lost (95 %: {low:.0f} to "
                 f"{high:.0f}), more than {100 * MOST_LOST:.0f}."
             )
+
+
+def _objects(cell: MeasuredCell) -> str:
+    return objects_in_words(cell.figures["objects"])
 
 
 def _percent(cell: MeasuredCell, key: str) -> str:

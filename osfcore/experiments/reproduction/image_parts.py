@@ -9,8 +9,8 @@ from typing import Any
 from osfcore.experiments.dynamics import video_prediction
 from osfcore.experiments.fields import relighting
 from osfcore.experiments.image_methods import TITLES
-from osfcore.experiments.reproduction.charts_of_sections import objects_of
 from osfcore.experiments.reproduction.page import PagePart
+from osfcore.experiments.reproduction.sections import objects_in_words
 
 
 def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
@@ -22,8 +22,8 @@ def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     """
     columns = [(key, relighting.ALL, title) for key, title in _RELIT.items()]
     text = (
-        f"{report['tasks']} scenes of {objects_of(report)}, poses and light given, under lights between "
-        f"{min(report['elevations_deg']):g} and {max(report['elevations_deg']):g} deg above the table."
+        f"{report['tasks']} scenes of {objects_in_words(report['objects'])}, poses and light given, under lights "
+        f"between {min(report['elevations_deg']):g} and {max(report['elevations_deg']):g} deg above the table."
     )
     pictures = (
         (folder / relighting.CHART_FILE, "PSNR and SSIM by elevation of the light"),
@@ -42,8 +42,8 @@ def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     spans = list(next(iter(report["methods"].values()))["psnr"]["spans"])
     columns = [(key, span, f"{title}, {span} steps") for span in spans for key, title in _VIDEO.items()]
     text = (
-        f"{report['tasks']} episodes of {objects_of(report)}, {report['steps']} actions known in advance, from "
-        "the first frame's estimate; FitVid sees two frames of the goal camera."
+        f"{report['tasks']} episodes of {objects_in_words(report['objects'])}, {report['steps']} actions known in advance, "
+        "from the first frame's estimate; FitVid sees two frames of the goal camera."
     )
     pictures = (
         (folder / video_prediction.CHART_FILE, "PSNR and SSIM by predicted step"),

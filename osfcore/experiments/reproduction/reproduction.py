@@ -23,7 +23,7 @@ from osfcore.experiments.reproduction.findings import findings, rows_of
 from osfcore.experiments.reproduction.image_parts import relighting_part, video_part
 from osfcore.experiments.reproduction.measured_cells import MeasuredSection, measure_cells
 from osfcore.experiments.reproduction.page import About, PagePart, check_jinja, write_page
-from osfcore.experiments.reproduction.sections import SECTIONS, Scale, SectionName, sections_of
+from osfcore.experiments.reproduction.sections import SECTIONS, Scale, SectionName, objects_in_words, sections_of
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
@@ -157,8 +157,8 @@ def _warnings(config: Reproduce) -> list[str]:
     if config.is_quick:
         told.append(
             f"A quick look and no measurement: {scale.tasks} tasks a cell, {scale.settings.steps} actions instead of "
-            f"30, plans of {scale.settings.plan.samples} sequences, {scale.objects} "
-            f"object{'s' * (scale.objects > 1)}, and only the factor {', '.join(scale.factors)}. Cells that take "
+            f"30, plans of {scale.settings.plan.samples} sequences, {objects_in_words(scale.objects)}, "
+            f"and only the factor {', '.join(scale.factors)}. Cells that take "
             "longest are left out. Intervals are as wide as that makes them."
         )
     left_out = [part for part in PARTS if part not in config.parts]

@@ -112,6 +112,11 @@ class Section:
     cells: tuple[Cell, ...]
 
 
+def objects_in_words(count: int) -> str:
+    """Such as "1 object"."""
+    return f"{count} object{'s' * (count > 1)}"
+
+
 def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS) -> tuple[Section, ...]:
     """All sections with cells, in their order.
 
@@ -147,7 +152,7 @@ def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
             for label, variant in _METHODS.items()
             if scale.has_slow_cells or variant.method != "overhead"
         ]
-        title = f"Success by threshold, {count} object{'s' * (count > 1)} (Fig. 7)"
+        title = f"Success by threshold, {objects_in_words(count)} (Fig. 7)"
         text = (
             "Closed loops toward a goal image. All methods get the same tasks, and masks in the first frame alone, "
             "also the one as published, whose own evaluation has them at every step (below, under ablations). "

@@ -50,7 +50,7 @@ class Scenes(NamedTuple):
 def longest_axes(fields: FieldLibrary, names: Iterable[str]) -> dict[str, float]:
     """Thresholds kappa of some objects [m]: the longest side of the box, along the object's axes, around what is dense.
 
-    Deviation: dense in our field, any density; the box of the KiloOSF as published differs by a voxel or two.
+    Deviation: dense in our field, at any density, whichever fields are shown.
 
     Raises:
         UnknownName: if an object has no field.
