@@ -42,8 +42,8 @@ def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     spans = list(next(iter(report["methods"].values()))["psnr"]["spans"])
     columns = [(key, span, f"{title}, {span} steps") for span in spans for key, title in _VIDEO.items()]
     text = (
-        f"{report['tasks']} episodes of {objects_in_words(report['objects'])}, {report['steps']} actions known in advance, "
-        "from the first frame's estimate; FitVid sees two frames of the goal camera."
+        f"{report['tasks']} episodes of {objects_in_words(report['objects'])}, {report['steps']} actions known "
+        "in advance, from the first frame's estimate; FitVid sees two frames of the goal camera."
     )
     pictures = (
         (folder / video_prediction.CHART_FILE, "PSNR and SSIM by predicted step"),
