@@ -45,6 +45,8 @@ class Stream(IntEnum):
     RELIT_SCENE = 80  # scenes that are shown under many lights, and the lights' azimuths
     VIDEO_SCENE = 81  # scenes that predicted videos begin with
     VIDEO_ESTIMATE = 82  # what is taken of them from images
+    PHOTO_SEARCH = 90  # poses in photographs, and starts that are measured
+    PHOTO_PLANE = 91  # of the table, from measured depth
 
 
 def _sequence(seed: int, stream: Stream, numbers: tuple[int, ...]) -> np.random.SeedSequence:

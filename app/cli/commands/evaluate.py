@@ -12,6 +12,7 @@ import tyro
 
 from app.cli.commands.evaluations.evaluation import Evaluation, ParallelEvaluation
 from app.cli.commands.evaluations.images import EvaluateRelightingCommand, EvaluateVideoCommand
+from app.cli.commands.evaluations.photos import EvaluatePhotosCommand
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -148,7 +149,8 @@ Evaluate = Annotated[
     | Annotated[EvaluateDynamicsCommand, tyro.conf.subcommand("dynamics")]
     | Annotated[EvaluateMpcCommand, tyro.conf.subcommand("mpc")]
     | Annotated[EvaluateRelightingCommand, tyro.conf.subcommand("relighting")]
-    | Annotated[EvaluateVideoCommand, tyro.conf.subcommand("video")],
+    | Annotated[EvaluateVideoCommand, tyro.conf.subcommand("video")]
+    | Annotated[EvaluatePhotosCommand, tyro.conf.subcommand("photos")],
     tyro.conf.OmitSubcommandPrefixes,
 ]
 

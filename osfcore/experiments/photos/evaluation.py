@@ -1,0 +1,204 @@
+"""Poses in real photographs: how well objects fit their masks, measured depth and reference poses; and lamps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from osfcore.errors import InvalidInput, check_ranges, check_seed
+from osfcore.experiments.photos.folders import (
+    GROUND_TRUTH,
+    PhotoFolder,
+    lamp_folders,
+    read_lamps,
+    read_scene,
+    scene_folders,
+)
+from osfcore.experiments.photos.lamp_errors import lamp_errors_deg
+from osfcore.experiments.photos.report import PhotoReport, PhotoScore, report_of
+from osfcore.experiments.photos.sheets import write_sheet
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.io.files import write_json
+from osfcore.metrics.pose_errors import rotation_error
+from osfcore.objects.catalogue import CATALOGUE
+from osfcore.photo.photograph import Photograph
+from osfcore.photo.poses.estimate_photo import PhotoConfig, PhotoModels, find_object
+from osfcore.photo.poses.object_window import object_windows
+from osfcore.photo.poses.photo_steps import PhotoObject
+from osfcore.photo.poses.pose_loss import LossKind
+from osfcore.photo.poses.table_plane import table_from_points
+from osfcore.random_streams import Stream, stream_rng
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import SceneBatch
+
+NONE, PERTURBED = "none", "perturbed"
+_SHIFT_M, _TURN_DEG = 0.03, 20.0
+_MOST_MASK_PX = 10
+_MOST_REPEATS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatePhotos:
+    """What to measure.
+
+    Attributes:
+        folder: for report.json and contact sheets.
+        data: folder of folders of photographs, see `folders`.
+        start: "none"; "perturbed": 3 cm and 20 deg off the ground truth, in random directions; or the name of a source
+            of poses. Scenes that lack it are left out.
+        plane: "known": fitted to the measured depth around the objects; "free".
+        mask_error_px: masks are grown and shrunk by that much in turn.
+        repeats: random starts of each object.
+        loss: of the search.
+        seed: of everything random.
+    """
+
+    folder: Path
+    data: Path
+    start: str = NONE
+    plane: Literal["known", "free"] = "free"
+    mask_error_px: int = 0
+    repeats: int = 1
+    loss: LossKind = "all"
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PhotosStep:
+    """How far an evaluation is; the last step brings the report."""
+
+    done: int
+    total: int
+    note: str
+    report: PhotoReport | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Case:
+    """One search: an object of a scene, and which of several starts."""
+
+    scene: PhotoFolder
+    name: str
+    number: int
+
+
+def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[PhotosStep]:
+    """Look for every object of every folder, then for the lamps; report.json and sheets go to `config.folder`.
+
+    Args:
+        config: what to measure.
+        fields: of the objects; those without one are left out and counted.
+
+    Raises:
+        InvalidInput: if there is nothing to measure, or a number is out of range.
+        CorruptFile, CannotWrite: as files are.
+    """
+    check_seed(config.seed)
+    check_ranges(
+        ("error of masks [px]", config.mask_error_px, 0, _MOST_MASK_PX),
+        ("starts of each object", config.repeats, 1, _MOST_REPEATS),
+    )
+    scenes, lamps = [read_scene(path) for path in scene_folders(config.data)], lamp_folders(config.data)
+    known = set(fields.names())
+    cases = [_Case(*case) for scene in scenes for case in _cases(config, scene, known)]
+    without = sum(name not in known for scene in scenes for name in scene.photo.masks)
+    if not cases and not lamps:
+        allowed = f"a folder of photographs with photo.json that have poses named {config.start!r}"
+        raise InvalidInput("data", config.data, allowed)
+    names = sorted({case.name for case in cases})
+    loaded = {name: fields.load(name) for name in names}
+    models, renderer = PhotoModels(loaded), SceneRenderer(loaded, None)
+    scores: list[PhotoScore] = []
+    for done, case in enumerate(cases):
+        yield PhotosStep(done, len(cases), f"{case.name} in {case.scene.name}")
+        scores.append(_measure(config, models, renderer, case))
+    lamp_errors = {subject.name: lamp_errors_deg(subject) for path in lamps for subject in read_lamps(path)}
+    report = report_of(scores, lamp_errors, without)
+    write_json(config.folder / "report.json", report.to_json())
+    yield PhotosStep(len(cases), len(cases), "Everything is measured", report)
+
+
+def _cases(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> Iterator[tuple[PhotoFolder, str, int]]:
+    source = GROUND_TRUTH if config.start == PERTURBED else config.start
+    for name in scene.photo.masks:
+        if name in known and (config.start == NONE or name in scene.poses.get(source, {})):
+            for number in range(config.repeats):
+                yield scene, name, number
+
+
+def _measure(config: EvaluatePhotos, models: PhotoModels, renderer: SceneRenderer, case: _Case) -> PhotoScore:
+    scene, name = case.scene, case.name
+    tag = sorted(CATALOGUE).index(name) if name in CATALOGUE else len(CATALOGUE)
+    rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, tag, case.number)
+    photo = _photo(config, scene)
+    start = _start(config, scene, name, rng)
+    starts = {} if start is None else {name: photo.T_world_camera @ start}
+    found = find_object(models, [photo], name, rng, PhotoConfig(starts, config.loss))
+    pose = photo.T_world_camera.inverse() @ found.best.pose
+    iou, depth_mm = _fit(renderer, scene, name, pose)
+    position_mm = rotation_deg = None
+    if (reference := scene.reference.get(name)) is not None:
+        symmetry = CATALOGUE[name].symmetry
+        rotation_deg = float(np.rad2deg(rotation_error(symmetry, pose.quaternion, reference.quaternion)))
+        position_mm = 1e3 * float(np.linalg.norm(pose.position - reference.position))
+    write_sheet(
+        config.folder / f"{scene.name}-{name}-{case.number}.png", models, scene.photo, replace_best(found, pose)
+    )
+    is_true = GROUND_TRUTH in scene.poses
+    return PhotoScore(scene.name, name, is_true, iou, depth_mm, position_mm, rotation_deg, found.doubt,
+                      min(found.ratio, 99.0), found.coarse_s, found.refine_s)  # fmt: skip
+
+
+def replace_best(found: PhotoObject, pose: Pose) -> PhotoObject:
+    """The same with the best pose in another frame."""
+    return replace(found, best=replace(found.best, pose=pose))
+
+
+def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
+    photo = scene.photo
+    if config.mask_error_px:
+        kernel = np.ones((2 * config.mask_error_px + 1,) * 2, np.uint8)
+        change = (cv2.dilate, cv2.erode)
+        masks = {name: change[k % 2](m.astype(np.uint8), kernel) > 0 for k, (name, m) in enumerate(photo.masks.items())}
+        photo = replace(photo, masks=masks)
+    if config.plane == "known" and scene.depth is not None:
+        T_world_camera = table_from_points(scene.table_points(), stream_rng(config.seed, Stream.PHOTO_PLANE))
+        photo = replace(photo, T_world_camera=T_world_camera, on_table=True)
+    return photo
+
+
+def _start(config: EvaluatePhotos, scene: PhotoFolder, name: str, rng: np.random.Generator) -> Pose | None:
+    if config.start == NONE:
+        return None
+    if config.start != PERTURBED:
+        return scene.poses[config.start][name]
+    true = scene.poses[GROUND_TRUTH][name]
+    shift, axis = rng.standard_normal((2, 3))
+    shift, axis = shift / np.linalg.norm(shift), axis / np.linalg.norm(axis)
+    turn = quaternion_exp(np.deg2rad(_TURN_DEG) * axis)
+    return Pose(true.position + _SHIFT_M * shift, quaternion_multiply(turn, true.quaternion))
+
+
+def _fit(renderer: SceneRenderer, scene: PhotoFolder, name: str, pose: Pose) -> tuple[float, float | None]:
+    """IoU of the field's silhouette with the mask, where that is known, and median depth error within both [mm]."""
+    window = object_windows([scene.photo], name, max(scene.photo.image.shape))[0]
+    camera = window.camera(name)
+    batch = SceneBatch((name,), pose.position[None, None], pose.quaternion[None, None], -pose.position[None] /
+                       np.linalg.norm(pose.position), None)  # fmt: skip
+    drawn = renderer.render(batch, [camera], outputs={"rgb", "masks", "depth"})
+    assert drawn.masks is not None
+    assert drawn.depth is not None
+    shown = drawn.masks[0, 0, 0]
+    both, either = shown & window.mask & window.known, (shown | window.mask) & window.known
+    if scene.depth is None:
+        return float(both.sum() / either.sum()), None
+    measured = window.frame.cut(scene.depth.astype(np.float32))
+    common = shown & window.mask & (measured > 0)
+    error = 1e3 * np.median(drawn.depth[0, 0][common] - measured[common]) if common.any() else None
+    return float(both.sum() / either.sum()), None if error is None else float(error)

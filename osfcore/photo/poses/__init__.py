@@ -1,0 +1,1 @@
+"""Poses of objects in photographs: surfels, losses, searches, Gauss-Newton."""

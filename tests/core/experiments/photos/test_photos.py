@@ -1,0 +1,118 @@
+"""Evaluation of photographs in folders, made of a field and of balls under lamps."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.experiments.photos.evaluation import EvaluatePhotos, evaluate_photos
+from osfcore.experiments.photos.folders import read_lamps, read_scene
+from osfcore.experiments.photos.lamp_errors import lamp_errors_deg
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.io.image_file import write_png
+from tests.core.photo.conftest import INTRINSICS, NAME, take
+
+SIDE = 96
+AZIMUTHS = np.arange(12) * 2.4
+LAMPS = np.stack([0.7 * np.cos(AZIMUTHS), 0.7 * np.sin(AZIMUTHS), -np.full(12, 0.75) - 0.3 * (AZIMUTHS % 1)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    library = FieldLibrary(None)
+    taken = take({NAME: library.load(NAME)})
+    folder = tmp_path_factory.mktemp("photos") / "desk"
+    folder.mkdir()
+    write_png(folder / "photo.png", taken.encoded)
+    write_png(folder / "mask.png", 255 * taken.photo.masks[NAME].astype(np.uint8))
+    table = np.full(taken.depth.shape, 0.65)
+    depth = np.where(taken.photo.masks[NAME], taken.depth, table)
+    cv2.imwrite(str(folder / "depth.png"), np.round(depth * 1e4).astype(np.uint16))
+    pose = {"position": taken.pose.position.tolist(), "quaternion": taken.pose.quaternion.tolist()}
+    known = {
+        "image": "photo.png", "encoding": "sRGB", "K": INTRINSICS.tolist(), "masks": {NAME: "mask.png"},
+        "depth": "depth.png", "depth_unit_m": 1e-4, "poses_camera_object": {"ground_truth": {NAME: pose}},
+    }  # fmt: skip
+    (folder / "photo.json").write_text(json.dumps(known))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def lamps(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lamps")
+    y, x = (np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2) / (SIDE / 2 - 4)
+    ball = x**2 + y**2 < 1
+    normals = np.stack([x, y, -np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)
+    stripes = np.where(np.sin(20 * x) > 0, 0.7, 0.4)
+    for name in ("chrome", "gray", "striped"):
+        (folder / name).mkdir()
+        write_png(folder / name / f"{name}.mask.png", 255 * ball.astype(np.uint8))
+        for number, lamp in enumerate(LAMPS / np.linalg.norm(LAMPS, axis=1, keepdims=True)):
+            half = lamp + [0, 0, -1]
+            shine = (normals @ (half / np.linalg.norm(half))) ** 2000
+            shade = np.maximum(normals @ lamp, 0) * (stripes if name == "striped" else 0.8)
+            value = ball * (shine if name == "chrome" else shade)
+            write_png(folder / name / f"{name}.{number}.png", np.uint8(255 * np.repeat(value[..., None], 3, -1)))
+    return folder
+
+
+def test_lamps_by_the_highlight_and_by_shading(lamps):
+    striped, gray = sorted(read_lamps(lamps), key=lambda s: s.name, reverse=True)
+    unit = LAMPS / np.linalg.norm(LAMPS, axis=1, keepdims=True)
+    assert np.rad2deg(np.arccos(np.clip((gray.directions * unit).sum(axis=1), -1, 1))).max() < 1.5
+    assert max(lamp_errors_deg(gray)) < 2
+    assert np.median(lamp_errors_deg(striped)) < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("start", "plane"), [("perturbed", "free"), ("none", "known")])
+def test_an_object_is_measured_against_its_truth(scene, tmp_path, start, plane):
+    config = EvaluatePhotos(tmp_path, scene.parent, start, plane)
+    *steps, last = evaluate_photos(config, FieldLibrary(None))
+    report = last.report.to_json()
+    assert steps[0].total == 1
+    assert report["objects_total"] == 1
+    assert report["iou_median"] == report["iou_min"] > 0.9
+    assert report["frac_10deg"] == 1
+    assert report["wrong_unflagged"] == 0
+    assert report["depth_within_10mm"] == 1
+    assert report["light_deg_median"] is None
+    assert json.loads((tmp_path / "report.json").read_text())["objects_total"] == 1
+    assert (tmp_path / f"desk-{NAME}-0.png").stat().st_size > 1000
+
+
+def test_the_table_is_where_depth_says(scene):
+    folder = read_scene(scene)
+    np.testing.assert_allclose(folder.table_points()[:, 2], 0.65, atol=1e-3)
+
+
+def test_lamps_alone_are_a_report(lamps, tmp_path):
+    *_, last = evaluate_photos(EvaluatePhotos(tmp_path, lamps), FieldLibrary(None))
+    report = last.report.to_json()
+    assert report["objects_total"] == 0
+    assert report["light_deg_median"] < 2
+
+
+def test_a_folder_without_photographs_is_told(tmp_path):
+    with pytest.raises(InvalidInput, match=r"a folder of photographs with photo\.json"):
+        list(evaluate_photos(EvaluatePhotos(tmp_path, tmp_path), FieldLibrary(None)))
+
+
+def test_poses_that_no_photograph_has_are_told(scene, tmp_path):
+    config = EvaluatePhotos(tmp_path, scene.parent, "guesses")
+    with pytest.raises(InvalidInput, match="poses named 'guesses'"):
+        list(evaluate_photos(config, FieldLibrary(None)))
+
+
+def test_a_number_out_of_range_is_told(scene, tmp_path):
+    with pytest.raises(InvalidInput, match="error of masks"):
+        list(evaluate_photos(replace(EvaluatePhotos(tmp_path, scene), mask_error_px=50), FieldLibrary(None)))
+
+
+def test_a_missing_image_is_told(scene, tmp_path):
+    (tmp_path / "photo.json").write_text((scene / "photo.json").read_text())
+    with pytest.raises(CorruptFile, match=r"photo\.png"):
+        read_scene(tmp_path)
