@@ -57,9 +57,11 @@ class PaperRenderer:
 
         Raises:
             UnknownName: if an object has no field here.
-            InvalidInput: if cameras differ in size, an output is unknown, or `only` is of another shape.
+            InvalidInput: if cameras differ in size, an output is unknown, `only` is of another shape, or a lamp is near.
         """
         size = check_request(self._fields, batch, cameras, outputs)
+        if batch.spots is not None:
+            raise InvalidInput("light of the published renderer", "a lamp at a finite distance", "a distant one")
         if only is not None and only.shape != (len(cameras), *size):
             raise InvalidInput("shape of the pixels to look at", only.shape, f"{(len(cameras), *size)}")
         from osfcore.paper.rendering.kernels import render_batch  # compiles
