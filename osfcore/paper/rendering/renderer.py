@@ -57,7 +57,8 @@ class PaperRenderer:
 
         Raises:
             UnknownName: if an object has no field here.
-            InvalidInput: if cameras differ in size, an output is unknown, `only` is of another shape, or a lamp is near.
+            InvalidInput: if cameras differ in size, an output is unknown, `only` is of another shape, or there are
+                near lamps.
         """
         size = check_request(self._fields, batch, cameras, outputs)
         if batch.spots is not None:
