@@ -86,7 +86,8 @@ def render_base(table, cameras, directs, lamps, samples, rgb, distance) -> None:
         table: `launch.Table`.
         cameras: V x 12 numbers of `types.camera_numbers`.
         directs, lamps: L x 3, direct light on a white table; or L lamps instead.
-        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough.
+        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough,
+            except for the edge of a lamp's cone.
         rgb: result, L x V x h x w x 3.
         distance: result, L x V x h x w [m]; 0 where there is no table.
     """
@@ -99,7 +100,7 @@ def render_base(table, cameras, directs, lamps, samples, rgb, distance) -> None:
                 u, v = np.float32(column + s % 2), np.float32(row + s // 2)
                 dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
                 hits += meet_table(table, cameras, view, dx, dy, dz) < FAR
-            count = samples if 0 < hits < 4 else 1
+            count = samples if 0 < hits < 4 or lamps is not None else 1
             share = _ONE / np.float32(count * count)
             red = green = blue = reach = _ZERO
             hits = 0
