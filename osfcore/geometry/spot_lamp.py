@@ -93,11 +93,12 @@ class SpotLamp:
 
     def falloff(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
         """How the light spreads on its way to points [m], (d0 / r)^2: 1 at the table's centre."""
-        return self.distance**2 / np.maximum(np.sum((self.position - points) ** 2, axis=-1), 1e-18)
+        squared = np.sum((self.position - points) ** 2, axis=-1)
+        return np.asarray(self.distance**2 / np.maximum(squared, 1e-18))
 
     def spot_factor(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
         """Share of the light that the cone sends toward points [m]."""
         inner, outer = self.cone_rad
         angle = np.arccos(np.clip(-self.toward(points) @ self.axis, -1, 1))
         s = np.clip((outer - angle) / max(outer - inner, MIN_PENUMBRA_RAD), 0, 1)
-        return s**2 * (3 - 2 * s)
+        return np.asarray(s**2 * (3 - 2 * s))

@@ -207,7 +207,7 @@ def _row_spans(outlines, boxes, shadows, b, view, row, count, width, spans):
 
 
 @numba.njit(**HELPER)
-def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, near, rules, work) -> None:
+def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work) -> None:
     """Sum of the rays of one pixel, left in work.total."""
     total, result, samples = work.total, work.result, rules.samples
     for c in range(5 + len(fields)):
@@ -215,7 +215,7 @@ def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, r
     for s in range(samples * samples):
         u = np.float32(column + (s % samples + 0.5) / samples)
         v = np.float32(row + (s // samples + 0.5) / samples)
-        _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, near, rules, work, result)
+        _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, work.near, rules, work, result)
         for c in range(5 + len(fields)):
             total[c] += result[c]
 
@@ -227,8 +227,7 @@ def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, 
 
     Args:
         pack, fields: packed fields, and that of each of N objects; table, scene, outlines, rules: types of `launch`.
-        directs, lamps: B x 3 direct light on a white table; or `lamps.Lamps` in the place of distant lights.
-        cameras: V x 12 numbers of `types.camera_numbers`.
+        directs, lamps, cameras: B x 3 direct light on a white table, or `Lamps`; V x 12 `types.camera_numbers`.
         base_rgb, base_distance, base_of: L empty tables (see `render_base`), and which of them each scene has.
         boxes, shadows: B x V x N x 4, pixels of objects and of their shadows (columns from, to, rows from, to).
         only: V x h x w, 0 for pixels that stay black, or empty.
@@ -264,9 +263,7 @@ def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, 
                     if wants_distance:
                         distance[b, view, row, column] = base_distance[base, view, row, column]
                     continue
-                _trace_pixel(
-                    pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, near, rules, work
-                )
+                _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work)
                 for c in range(3):
                     rgb[b, view, row, column, c] = total[c] * share
                 if wants_distance:
