@@ -10,8 +10,9 @@ import numba
 import numpy as np
 
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, NETWORK_INPUTS
-from osfcore.fields.ray_marching import interpolate, leave_blocks, optical_density, within
-from osfcore.render.table_kernels import FAR, HELPER
+from osfcore.fields.ray_marching import interpolate, inverted, leave_blocks, optical_density, within
+from osfcore.render.lamp_kernels import lamp_gain, toward_lamp
+from osfcore.render.numba_options import FAR, HELPER
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 
@@ -72,11 +73,17 @@ def next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step
 
 
 @numba.njit(**HELPER)
-def _depth_to_light(pack, a, n, reach, lit, lit_inverse, b, x, y, z, step, step_voxels, enough):
+def _depth_to_light(pack, a, n, scene, lamps, b, x, y, z, step, step_voxels, enough):
     """Optical depth of object n between a point, in its voxel coordinates, and the light; stops when it is enough."""
-    dx, dy, dz = lit[b, n, 0], lit[b, n, 1], lit[b, n, 2]
-    ix, iy, iz = lit_inverse[b, n, 0], lit_inverse[b, n, 1], lit_inverse[b, n, 2]
-    k, last = clip_to_extent(reach, n, x, y, z, ix, iy, iz, FAR, step)
+    if lamps is None:
+        dx, dy, dz, far = scene.lit[b, n, 0], scene.lit[b, n, 1], scene.lit[b, n, 2], FAR
+        ix, iy, iz = scene.lit_inverse[b, n, 0], scene.lit_inverse[b, n, 1], scene.lit_inverse[b, n, 2]
+    else:
+        voxel = pack.scales[a, 3]
+        dx, dy, dz, far = toward_lamp(lamps, b, n, x, y, z, voxel)
+        dx, dy, dz = dx / voxel, dy / voxel, dz / voxel
+        ix, iy, iz = inverted(dx), inverted(dy), inverted(dz)
+    k, last = clip_to_extent(scene.reach, n, x, y, z, ix, iy, iz, far, step)
     total = _ZERO
     while k <= last and total < enough:
         k, depth = next_sample(pack, a, x, y, z, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels)
@@ -96,11 +103,11 @@ def _transform(matrix, b, n, m, x, y, z):
 
 
 @numba.njit(**HELPER)
-def light_transmittance(pack, fields, scene, b, n, x, y, z, step_voxels, enough):
+def light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, step_voxels, enough):
     """Share of the light that reaches a point of object n past all other objects; n = N: a point of the world.
 
     Args:
-        pack, fields, scene: as in `kernels.render_batch`.
+        pack, fields, scene, lamps: as in `kernels.render_batch`.
         b, n: scene, and object that does not shade the point.
         x, y, z: the point, in voxel coordinates of object n or in the world [m].
         step_voxels: between samples of the shadow ray [voxels].
@@ -112,8 +119,7 @@ def light_transmittance(pack, fields, scene, b, n, x, y, z, step_voxels, enough)
             a = fields[m]
             qx, qy, qz = _transform(scene.between, b, n, m, x, y, z)
             step = step_voxels * pack.scales[a, 3]
-            depth += _depth_to_light(pack, a, m, scene.reach, scene.lit, scene.lit_inverse, b, qx, qy, qz, step,
-                                     step_voxels, enough - depth)  # fmt: skip
+            depth += _depth_to_light(pack, a, m, scene, lamps, b, qx, qy, qz, step, step_voxels, enough - depth)
     if depth >= enough:
         return _ZERO
     return np.exp(-depth)
@@ -186,17 +192,18 @@ def _run_network(flat, at, hidden, inputs, h1, h2):
 
 
 @numba.njit(**HELPER)
-def radiance_at(pack, fields, scene, b, n, t, rules, work):
+def radiance_at(pack, fields, scene, lamps, b, n, t, rules, work):
     """Rho of object n where the ray of `work` is at t, left in work.out[0:6].
 
     Args:
-        pack, fields, scene, rules: as in `kernels.render_batch`.
+        pack, fields, scene, lamps, rules: as in `kernels.render_batch`.
         b, n: scene and object.
         t: distance from the camera [m].
         work: the thread's ray and memory; light found before is kept in it, for `rules.one_shadow`.
 
     Returns:
-        Transmittance from there toward the light; 0, unasked, where the object scatters no direct light.
+        Transmittance from there toward the light, times what a lamp's distance and cone leave of it; 0, unasked, where
+        the object scatters no direct light or the lamp sheds none.
     """
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
     a, view = fields[n], work.where[0]
@@ -204,11 +211,14 @@ def radiance_at(pack, fields, scene, b, n, t, rules, work):
     y = within(scene.eye[b, view, n, 1] + t * d[n, 1], pack.shapes[a, 1])
     z = within(scene.eye[b, view, n, 2] + t * d[n, 2], pack.shapes[a, 2])
     s = pack.scales[a, 3]
-    _scatter(pack, a, x, y, z, scene.lit[b, n, 0] * s, scene.lit[b, n, 1] * s, scene.lit[b, n, 2] * s,
-             d[n, 0] * s, d[n, 1] * s, d[n, 2] * s, inputs, h1, h2, out)  # fmt: skip
-    if out[3] + out[4] + out[5] <= _ZERO:
+    if lamps is None:
+        lx, ly, lz, gain = scene.lit[b, n, 0] * s, scene.lit[b, n, 1] * s, scene.lit[b, n, 2] * s, _ONE
+    else:
+        lx, ly, lz, distance = toward_lamp(lamps, b, n, x, y, z, s)
+        gain = lamp_gain(lamps, b, n, lx, ly, lz, distance)
+    _scatter(pack, a, x, y, z, lx, ly, lz, d[n, 0] * s, d[n, 1] * s, d[n, 2] * s, inputs, h1, h2, out)
+    if out[3] + out[4] + out[5] <= _ZERO or gain <= _ZERO:
         return _ZERO
-    if rules.one_shadow and work.lit[n] >= _ZERO:
-        return work.lit[n]
-    work.lit[n] = light_transmittance(pack, fields, scene, b, n, x, y, z, rules.shadow_voxels, rules.enough)
-    return work.lit[n]
+    if not rules.one_shadow or work.lit[n] < _ZERO:
+        work.lit[n] = light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, rules.shadow_voxels, rules.enough)
+    return gain * work.lit[n]

@@ -18,7 +18,8 @@ import numpy as np
 from osfcore.fields.kiloosf import MOST_HIDDEN, NETWORK_INPUTS
 from osfcore.fields.ray_marching import inverted
 from osfcore.render.field_kernels import clip_to_extent, light_transmittance, next_sample, radiance_at
-from osfcore.render.table_kernels import FAR, HELPER, KERNEL, TINY, meet_table, pixel_ray, table_colour
+from osfcore.render.numba_options import FAR, HELPER, KERNEL, TINY
+from osfcore.render.table_kernels import meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
@@ -95,15 +96,15 @@ def _nearest_sample(pack, fields, rules, work):
 
 @numba.njit(**HELPER)
 def _add_background(
-    pack, table, fields, scene, directs, cameras, b, view, dx, dy, table_t, left, rules, result
+    pack, table, fields, scene, directs, lamps, cameras, b, view, dx, dy, table_t, left, rules, result
 ) -> None:
     """Add what passes all objects: the table with its shadows, or the surroundings."""
     if table_t < FAR:
         x, y = cameras[view, 0] + table_t * dx, cameras[view, 1] + table_t * dy
         visible = light_transmittance(
-            pack, fields, scene, b, len(fields), x, y, _ZERO, rules.shadow_voxels, rules.enough
+            pack, fields, scene, lamps, b, len(fields), x, y, _ZERO, rules.shadow_voxels, rules.enough
         )
-        r, g, blue = table_colour(table, directs, b, x, y, visible)
+        r, g, blue = table_colour(table, directs, lamps, b, x, y, visible)
         result[0] += left * r
         result[1] += left * g
         result[2] += left * blue
@@ -115,7 +116,7 @@ def _add_background(
 
 
 @numba.njit(**HELPER)
-def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, rules, work, result):
+def _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, near, rules, work, result):
     """Follow one ray.
 
     It leaves radiance in result[0:3], distance times weight in result[3], weight in result[4] and the seen share of
@@ -141,7 +142,7 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
         result[4] += weight
         result[5 + n] += weight
         if weight > rules.min_weight:
-            lit = radiance_at(pack, fields, scene, b, n, t, rules, work)
+            lit = radiance_at(pack, fields, scene, lamps, b, n, t, rules, work)
             coloured += weight
             for c in range(3):
                 result[c] += weight * (out[c] + lit * out[3 + c])
@@ -160,7 +161,7 @@ def _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, ru
         for c in range(5 + count):
             result[c] *= whole
         return
-    _add_background(pack, table, fields, scene, directs, cameras, b, view, dx, dy, table_t, left, rules, result)
+    _add_background(pack, table, fields, scene, directs, lamps, cameras, b, view, dx, dy, table_t, left, rules, result)
 
 
 @numba.njit(**HELPER)
@@ -206,7 +207,7 @@ def _row_spans(outlines, boxes, shadows, b, view, row, count, width, spans):
 
 
 @numba.njit(**HELPER)
-def _trace_pixel(pack, table, fields, scene, directs, cameras, b, view, row, column, near, rules, work) -> None:
+def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work) -> None:
     """Sum of the rays of one pixel, left in work.total."""
     total, result, samples = work.total, work.result, rules.samples
     for c in range(5 + len(fields)):
@@ -214,19 +215,19 @@ def _trace_pixel(pack, table, fields, scene, directs, cameras, b, view, row, col
     for s in range(samples * samples):
         u = np.float32(column + (s % samples + 0.5) / samples)
         v = np.float32(row + (s // samples + 0.5) / samples)
-        _trace(pack, table, fields, scene, directs, cameras, b, view, u, v, near, rules, work, result)
+        _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, work.near, rules, work, result)
         for c in range(5 + len(fields)):
             total[c] += result[c]
 
 
 @numba.njit(**KERNEL)
-def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_distance, base_of, boxes, shadows,
+def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, base_distance, base_of, boxes, shadows,
                  outlines, rules, only, rgb, opacity, distance) -> None:  # fmt: skip
     """Every image of a batch; what no object and no shadow can touch is copied from the empty table.
 
     Args:
         pack, fields: packed fields, and that of each of N objects; table, scene, outlines, rules: types of `launch`.
-        directs, cameras: B x 3 direct light on a white table; V x 12 numbers of `types.camera_numbers`.
+        directs, lamps, cameras: B x 3 direct light on a white table, or `Lamps`; V x 12 `types.camera_numbers`.
         base_rgb, base_distance, base_of: L empty tables (see `render_base`), and which of them each scene has.
         boxes, shadows: B x V x N x 4, pixels of objects and of their shadows (columns from, to, rows from, to).
         only: V x h x w, 0 for pixels that stay black, or empty.
@@ -262,7 +263,7 @@ def render_batch(pack, table, fields, scene, directs, cameras, base_rgb, base_di
                     if wants_distance:
                         distance[b, view, row, column] = base_distance[base, view, row, column]
                     continue
-                _trace_pixel(pack, table, fields, scene, directs, cameras, b, view, row, column, near, rules, work)
+                _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work)
                 for c in range(3):
                     rgb[b, view, row, column, c] = total[c] * share
                 if wants_distance:

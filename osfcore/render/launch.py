@@ -13,6 +13,7 @@ from osfcore.fields.table_field import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import quaternion_to_matrix
 from osfcore.render.kernels import NO_OUTLINE, render_batch
+from osfcore.render.lamps import Lamps, below_lamps, numbers_of_lamps, over_the_table, place_lamps
 from osfcore.render.packing import Packed
 from osfcore.render.table_kernels import render_base
 from osfcore.render.types import MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, poses_of
@@ -96,7 +97,8 @@ def launch(  # noqa: D417
         boxes, outline = _on_screen(corners, cameras)
         shadows, shadow_outline = np.zeros_like(boxes), np.zeros_like(outline)
     else:
-        both = _on_screen(np.concatenate([corners, _on_table(corners, batch.lights)], axis=1), cameras)
+        dropped = _on_table(corners, batch.lights) if batch.spots is None else below_lamps(corners, batch.spots)
+        both = _on_screen(np.concatenate([corners, dropped], axis=1), cameras)
         (boxes, shadows), (outline, shadow_outline) = (_halves(part) for part in both)
     shape = (scenes, views, *size)
     rgb = np.empty((*shape, 3), np.float32)
@@ -105,15 +107,13 @@ def launch(  # noqa: D417
     distance = np.empty(shape if "depth" in outputs else (0,) * 4, np.float32)
     plain, rules = plain_table(table), _rules(quality)
     lenses_f32 = np.array(lenses, np.float32, order="C")
-    different, base_of = np.unique(batch.lights.astype(np.float32), axis=0, return_inverse=True)
     directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
-    base = np.zeros((len(different), *shape[1:], 3), np.float32), np.zeros((len(different), *shape[1:]), np.float32)
+    lamps = None if batch.spots is None else place_lamps(batch.spots, pack, numbers, rotations, positions, table)
     scene = _scene(pack, numbers, rotations, positions, batch.lights, lenses)
     mask = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
     with ONE_AT_A_TIME:
-        if table is not None:  # the empty table, once per light
-            render_base(plain, lenses_f32, table.direct(different), quality.samples_per_side, *base)
-        render_batch(pack, plain, numbers, scene, directs, lenses_f32, *base, base_of.reshape(-1), boxes, shadows,
+        base = _empty_tables(plain, table, batch, lamps, lenses_f32, size, quality.samples_per_side)
+        render_batch(pack, plain, numbers, scene, directs, lamps, lenses_f32, *base, boxes, shadows,
                      Outlines(outline, shadow_outline), rules, mask, rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
@@ -121,6 +121,27 @@ def launch(  # noqa: D417
         opacity >= MASK_OPACITY if "masks" in outputs else None,
         z_depth(distance, cameras) if "depth" in outputs else None,
     )
+
+
+def _empty_tables(
+    plain: Table,
+    table: TableField | None,
+    batch: SceneBatch,
+    lamps: Lamps | None,
+    lenses: Float32[np.ndarray, "V 12"],
+    size: tuple[int, int],
+    samples: int,
+) -> tuple[Float32[np.ndarray, "L V h w 3"], Float32[np.ndarray, "L V h w"], Int[np.ndarray, "B"]]:
+    """Colours and distances of the empty table under each of L different lights, and which of them each scene has."""
+    lights = batch.lights.astype(np.float32)
+    rows = lights if batch.spots is None else numbers_of_lamps(batch.spots)
+    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    shape = len(first), len(lenses), *size
+    rgb, distance = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
+    if table is not None:
+        different = None if lamps is None else over_the_table(lamps, first)
+        render_base(plain, lenses, table.direct(lights[first]), different, samples, rgb, distance)
+    return rgb, distance, which.reshape(-1)
 
 
 def _scene(

@@ -1,8 +1,8 @@
 """The reference renderer: compositional volume rendering of OSFs in PyTorch, every ray and every sample.
 
 It defines what the fast path must compute, and it is what a GPU runs. For each ray, each object's field is sampled in
-its own frame (paper eq. 1); a sample's radiance is rho L_light with one distant light (eq. 2); the samples of all
-objects are sorted by distance and composited by `volume_rendering` (eq. 3).
+its own frame (paper eq. 1); a sample's radiance is rho L_light with one light, distant or near (eq. 2); the samples of
+all objects are sorted by distance and composited by `volume_rendering` (eq. 3).
 
 Deviations from eq. 3: the radiance of a point is the mean of the objects' radiances weighted by their densities (as in
 compositional NeRFs), not their sum, so that overlapping objects do not shine twice as bright; and the light that
@@ -25,13 +25,14 @@ from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.table_field import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import quaternion_to_matrix
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import SceneState
+from osfcore.render.reference_lights import FAR, DistantLight, near_light
 from osfcore.render.solids import pusher_field
 from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
 from osfcore.render.volume_rendering import accumulate_along_rays, final_transmittance, render_weights
 
 _RAYS_AT_ONCE = 4096
-_FAR = 1e9
 
 
 class _Placed(NamedTuple):
@@ -57,6 +58,7 @@ def render_reference(
     state: SceneState,
     camera: Camera,
     *,
+    spot: SpotLamp | None = None,
     dtype: torch.dtype = torch.float64,
     quality: Quality = EXACT,
     outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
@@ -68,6 +70,7 @@ def render_reference(
         table: None for black surroundings.
         state: the scene.
         camera: the view.
+        spot: a near lamp in the place of the state's light.
         dtype: to compute in.
         quality: only its spacing of samples and rays per pixel count; nothing is skipped here.
         outputs: as in `SceneRenderer.render`.
@@ -76,7 +79,7 @@ def render_reference(
         UnknownName: if an object has no field.
         InvalidInput: if an output is unknown.
     """
-    batch = SceneBatch.of(state)
+    batch = SceneBatch.of(state, spot)
     check_request(fields, batch, (camera,), outputs)
     return _render_batch(fields, table, batch, (camera,), torch.device("cpu"), dtype, quality, outputs)
 
@@ -125,7 +128,8 @@ def _render_batch(fields, table, batch, cameras, device, dtype, quality, outputs
     def tensor(array: object) -> Tensor:
         return torch.as_tensor(np.array(array), dtype=dtype, device=device)
 
-    for b, light in enumerate(batch.lights):
+    for b, direction in enumerate(batch.lights):
+        light = DistantLight(tensor(direction)) if batch.spots is None else near_light(batch.spots[b], tensor)
         rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions[b]), -1, -2)
         placed = [_Placed(queries[n], tensor(extents[n]), tensor(R), tensor(p))
                   for n, R, p in zip(batch.names, rotations, batch.positions[b], strict=True)]  # fmt: skip
@@ -133,7 +137,7 @@ def _render_batch(fields, table, batch, cameras, device, dtype, quality, outputs
             query, extent, centres = pusher
             placed.append(_Placed(query, tensor(extent), tensor(np.eye(3)), tensor(centres[b])))
         for v, camera in enumerate(cameras):
-            colours, shares, depths = _render_image(placed, table, tensor(light), camera, quality, tensor)
+            colours, shares, depths = _render_image(placed, table, light, camera, quality, tensor)
             rgb[b, v], depth[b, v] = colours.cpu().numpy(), depths.cpu().numpy()
             opacity[b, v] = shares[:count].cpu().numpy()
     return Rendered(
@@ -157,8 +161,8 @@ def _render_image(placed, table, light, camera, quality, tensor):  # noqa: ANN00
     height, width = camera.height, camera.width
     numbers = tensor(camera_numbers(camera))
     axis = tensor(camera.T_world_camera.matrix()[:3, 2])
-    rows = torch.arange(height * s, device=light.device, dtype=light.dtype) + 0.5
-    columns = torch.arange(width * s, device=light.device, dtype=light.dtype) + 0.5
+    rows = torch.arange(height * s, device=numbers.device, dtype=numbers.dtype) + 0.5
+    columns = torch.arange(width * s, device=numbers.device, dtype=numbers.dtype) + 0.5
     v, u = torch.meshgrid(rows / s, columns / s, indexing="ij")
     places = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
     rays_d = torch.nn.functional.normalize(places @ numbers[3:].view(3, 3).T, dim=-1)
@@ -193,14 +197,14 @@ def _render_rays(placed, table, light, rays_o, rays_d, quality, tensor):  # noqa
     owners = owner.to(rays_d.device)[order.long()] if samples else order
     shares = torch.stack([(weights * (owners == n)).sum(dim=1) for n in range(len(placed))] or [remaining[:0]], dim=-1)
     shares = shares if placed else rays_d.new_zeros(count, 0)
-    hit = table_t < _FAR
-    distance = (weights * t_mids.clamp(max=_FAR)).sum(dim=1) + torch.where(hit, remaining * table_t, 0)
+    hit = table_t < FAR
+    distance = (weights * t_mids.clamp(max=FAR)).sum(dim=1) + torch.where(hit, remaining * table_t, 0)
     weight = weights.sum(dim=1) + remaining * hit
     if table is not None:
         behind = tensor(table.background).expand(count, 3).clone()
         points = rays_o + table_t[hit, None] * rays_d[hit]
         visible = _light_transmittance(placed, -1, points, light, quality)
-        direct = tensor(table.direct(light.cpu().double().numpy()[None])[0])
+        direct = light.on_table(table, points)
         behind[hit] = _albedo(table, points, tensor) * (tensor(table.ambient) + visible[:, None] * direct)
         colour = colour + remaining[:, None] * behind
     return colour, shares, distance, weight
@@ -208,7 +212,7 @@ def _render_rays(placed, table, light, rays_o, rays_d, quality, tensor):  # noqa
 
 def _intersect_table(table: TableField | None, rays_o: Tensor, rays_d: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
     """Distance to the table [m]; very far for rays that miss it."""
-    far = torch.full_like(rays_d[:, 0], _FAR)
+    far = torch.full_like(rays_d[:, 0], FAR)
     if table is None or rays_o[2] <= 0:
         return far
     down = rays_d[:, 2] < -1e-9
@@ -242,7 +246,7 @@ def _sample_object(placed, n, light, rays_o, rays_d, table_t, quality) -> _Sampl
     own = placed[n]
     step = quality.step_voxels * own.query.voxel
     local_o = _to_object_frame(own, rays_o[None]).expand_as(rays_d)
-    local_d, local_light = rays_d @ own.rotation.T, own.rotation @ light
+    local_d = rays_d @ own.rotation.T
     t_mids, taus, radiances = [], [], []
     for t, used in _march(own, local_o, local_d, table_t, step):
         tau, radiance = torch.zeros_like(t), torch.zeros_like(rays_d)
@@ -252,12 +256,11 @@ def _sample_object(placed, n, light, rays_o, rays_d, table_t, quality) -> _Sampl
             some = sigma > 0
             inside = used.nonzero()[:, 0][some]
             tau[inside] = sigma[some] * step
-            light_there = local_light.expand(len(inside), 3)
-            scatter = own.query(x[some], light_there, local_d[inside])
             points = rays_o + t[inside, None] * rays_d[inside]
+            scatter = own.query(x[some], light.toward(points, own.rotation), local_d[inside])
             visible = _light_transmittance(placed, n, points, light, quality)
-            radiance[inside] = scatter.ambient + visible[:, None] * scatter.direct
-        t_mids.append(torch.where(used, t, _FAR))
+            radiance[inside] = scatter.ambient + visible[:, None] * light.gain(points) * scatter.direct
+        t_mids.append(torch.where(used, t, FAR))
         taus.append(tau)
         radiances.append(radiance)
     if not t_mids:
@@ -273,9 +276,9 @@ def _light_transmittance(placed, skip, points, light, quality) -> Float[Tensor, 
         if n == skip or not len(points):
             continue
         rays_o = _to_object_frame(other, points)
-        direction = (other.rotation @ light).expand_as(rays_o)
+        direction = light.toward(points, other.rotation)
         step = quality.shadow_voxels * other.query.voxel
-        for t, used in _march(other, rays_o, direction, torch.full_like(total, _FAR), step):
+        for t, used in _march(other, rays_o, direction, light.distance(points), step):
             if used.any():
                 x = (rays_o + t[:, None] * direction)[used]
                 total[used] += other.query.density(x) * step

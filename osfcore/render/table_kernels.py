@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numba
 import numpy as np
 
-FAR = np.float32(1e9)
-TINY = np.float32(1e-9)
-HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
-KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
+from osfcore.render.lamp_kernels import light_on_table
+from osfcore.render.numba_options import FAR, HELPER, KERNEL, TINY
+
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
@@ -48,12 +45,12 @@ def meet_table(table, cameras, view, dx, dy, dz):
 
 
 @numba.njit(**HELPER)
-def table_colour(table, directs, b, x, y, visible):
+def table_colour(table, directs, lamps, b, x, y, visible):
     """Radiance of the table at a point of it.
 
     Args:
         table: `launch.Table`.
-        directs, b: direct light on a white table (a row for each light), and which row.
+        directs, lamps, b: direct light of distant lights on a white table (a row for each), lamps, and which row.
         x, y: the point in the world [m].
         visible: transmittance from there toward the light.
     """
@@ -67,22 +64,30 @@ def table_colour(table, directs, b, x, y, visible):
     r = al[i, j, 0] * w00 + al[i, j + 1, 0] * w01 + al[i + 1, j, 0] * w10 + al[i + 1, j + 1, 0] * w11
     g_ = al[i, j, 1] * w00 + al[i, j + 1, 1] * w01 + al[i + 1, j, 1] * w10 + al[i + 1, j + 1, 1] * w11
     b_ = al[i, j, 2] * w00 + al[i, j + 1, 2] * w01 + al[i + 1, j, 2] * w10 + al[i + 1, j + 1, 2] * w11
+    if lamps is None:
+        return (
+            r * (table.ambient[0] + directs[b, 0] * visible),
+            g_ * (table.ambient[1] + directs[b, 1] * visible),
+            b_ * (table.ambient[2] + directs[b, 2] * visible),
+        )
+    red, green, blue = light_on_table(lamps, b, x, y)
     return (
-        r * (table.ambient[0] + directs[b, 0] * visible),
-        g_ * (table.ambient[1] + directs[b, 1] * visible),
-        b_ * (table.ambient[2] + directs[b, 2] * visible),
+        r * (table.ambient[0] + red * visible),
+        g_ * (table.ambient[1] + green * visible),
+        b_ * (table.ambient[2] + blue * visible),
     )
 
 
 @numba.njit(**KERNEL)
-def render_base(table, cameras, directs, samples, rgb, distance) -> None:
+def render_base(table, cameras, directs, lamps, samples, rgb, distance) -> None:
     """The empty, unshaded table under L lights from V cameras.
 
     Args:
         table: `launch.Table`.
         cameras: V x 12 numbers of `types.camera_numbers`.
-        directs: L x 3, direct light on a white table.
-        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough.
+        directs, lamps: L x 3, direct light on a white table; or L lamps instead.
+        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough,
+            except for the edge of a lamp's cone.
         rgb: result, L x V x h x w x 3.
         distance: result, L x V x h x w [m]; 0 where there is no table.
     """
@@ -95,7 +100,7 @@ def render_base(table, cameras, directs, samples, rgb, distance) -> None:
                 u, v = np.float32(column + s % 2), np.float32(row + s // 2)
                 dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
                 hits += meet_table(table, cameras, view, dx, dy, dz) < FAR
-            count = samples if 0 < hits < 4 else 1
+            count = samples if 0 < hits < 4 or lamps is not None else 1
             share = _ONE / np.float32(count * count)
             red = green = blue = reach = _ZERO
             hits = 0
@@ -106,7 +111,7 @@ def render_base(table, cameras, directs, samples, rgb, distance) -> None:
                 t = meet_table(table, cameras, view, dx, dy, dz)
                 if t < FAR:
                     x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
-                    r, g, bl = table_colour(table, directs, b, x, y, _ONE)
+                    r, g, bl = table_colour(table, directs, lamps, b, x, y, _ONE)
                     hits, reach = hits + 1, reach + t
                 else:
                     r, g, bl = table.background[0], table.background[1], table.background[2]

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float32
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import QUATERNION_NORM_TOLERANCE, Pose, quaternion_to_matrix
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import SceneState
 
 OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
@@ -53,8 +54,9 @@ class SceneBatch:
         names: of the N objects; each one's field is looked up under this name.
         positions: of the objects [m].
         quaternions: (w, x, y, z), unit.
-        lights: unit vectors toward the light.
+        lights: unit vectors toward the distant light; they play no part where there are near lamps.
         pusher: its centre [m]; None where there is none.
+        spots: the near lamp of each scene, in the place of its distant light; None for distant lights.
     """
 
     names: tuple[str, ...]
@@ -62,6 +64,7 @@ class SceneBatch:
     quaternions: Float[np.ndarray, "B N 4"]
     lights: Float[np.ndarray, "B 3"]
     pusher: Float[np.ndarray, "B 3"] | None
+    spots: tuple[SpotLamp, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and numbers."""
@@ -84,14 +87,18 @@ class SceneBatch:
                 raise InvalidInput(f"norms of the {name} of a batch", f"{norms.min():g} to {norms.max():g}", "1")
         if count > MOST_OBJECTS:
             raise InvalidInput("number of objects", count, f"at most {MOST_OBJECTS}")
+        if self.spots is not None and len(self.spots) != scenes:
+            raise InvalidInput("number of lamps of a batch", len(self.spots), f"{scenes}, one for each scene")
 
     @staticmethod
-    def of(state: SceneState) -> SceneBatch:
-        """One scene as a batch."""
+    def of(state: SceneState, spot: SpotLamp | None = None) -> SceneBatch:
+        """One scene as a batch, under a near lamp in the place of its light if one is given."""
         pusher = None if state.pusher is None else state.pusher[None]
+        light = state.light if spot is None else spot.distant
         return SceneBatch(
-            state.names, state.poses.position[None], state.poses.quaternion[None], state.light.direction[None], pusher
-        )
+            state.names, state.poses.position[None], state.poses.quaternion[None], light.direction[None], pusher,
+            None if spot is None else (spot,),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, slots=True)

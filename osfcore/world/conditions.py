@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from osfcore.errors import InvalidInput
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.world.imaging.optics import Lamp, TableSurface
 
 _MAX_FACTOR = 100.0
@@ -20,12 +21,14 @@ class Conditions:
         friction_factor: on the friction of every object, hence between object and table, and object and pusher; between
             two objects it counts twice.
         mass_factor: on the mass and the moments of inertia of every object.
+        spot: a near lamp in the place of the distant light, whatever is asked of that; None for the distant light.
     """
 
     lamp: Lamp = field(default_factory=Lamp)
     table: TableSurface = field(default_factory=TableSurface)
     friction_factor: float = 1.0
     mass_factor: float = 1.0
+    spot: SpotLamp | None = None
 
     def __post_init__(self) -> None:
         """Check the factors.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -43,7 +44,7 @@ class Tabletop:
         request: what `reset` puts on the table.
         renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used).
         executor: takes the views of an observation side by side, if given; threads serve.
-        conditions: lamp and table, of which "tiny" knows nothing, and contacts; the usual ones if None.
+        conditions: lamps and table, of which "tiny" knows nothing, and contacts; the usual ones if None.
 
     Raises:
         UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
@@ -139,7 +140,8 @@ class Tabletop:
 
     def truth(self) -> SceneState:
         """The true state, for drawing and evaluation; estimators must not see it."""
-        return SceneState(self._names, self._poses(), self._light, self._bodies.pusher)
+        light = self._conditions.spot.distant if self._conditions.spot else self._light
+        return SceneState(self._names, self._poses(), light, self._bodies.pusher)
 
     def _poses(self) -> Pose:
         poses = [self._bodies.pose(name) for name in self._names]
@@ -302,16 +304,15 @@ class Tabletop:
 
     def pictures(self, cameras: tuple[Camera, ...], *, with_pusher: bool = True) -> tuple[Picture, ...]:
         """Images with coverage and depth, for tests and evaluation."""
-        state = self.truth()
-        if not with_pusher:
-            state = SceneState(state.names, state.poses, state.light, None)
+        state = self.truth() if with_pusher else replace(self.truth(), pusher=None)
         if self._renderer == "tiny":
             if self._tiny is None:
                 self._tiny = TinyScene(self.assets)
             return self._tiny.render(state, cameras)
         self._meshes |= {name: TracedMesh(self._asset(name).mesh) for name in self._names if name not in self._meshes}
-        lamp, table = self._conditions.lamp, self._conditions.table
-        return RayTracer(self._meshes, lamp=lamp, table=table, executor=self._executor).render(state, cameras)
+        c = self._conditions
+        tracer = RayTracer(self._meshes, lamp=c.lamp, table=c.table, spot=c.spot, executor=self._executor)
+        return tracer.render(state, cameras)
 
     def _asset(self, name: str) -> ObjectAsset:
         if name not in self._assets:

@@ -58,7 +58,7 @@ class UnlitRenderer(SceneRenderer):
     ) -> Rendered:
         """Images of every scene of a batch from every camera; its lights play no part."""
         unlit = replace(quality, shadow_voxels=_NO_SHADOWS)
-        return super().render(batch, cameras, quality=unlit, outputs=outputs, only=only)
+        return super().render(replace(batch, spots=None), cameras, quality=unlit, outputs=outputs, only=only)
 
 
 def mean_table(table: TableField) -> TableField:

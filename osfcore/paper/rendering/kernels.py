@@ -156,7 +156,7 @@ def _add_behind(
         red, green, blue = _RED * shade, _GREEN * shade, _BLUE * shade
     else:
         visible = light_reaches(scene, maps, b, -1, x, y, _ZERO)
-        red, green, blue = table_colour(table, directs, b, x, y, visible)
+        red, green, blue = table_colour(table, directs, None, b, x, y, visible)
     work.result[0] += left * red
     work.result[1] += left * green
     work.result[2] += left * blue

@@ -27,6 +27,15 @@ _FINE_MAP, _COARSE_MAP = 96, 32  # sides of shadow maps [px]
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)), bool)
 
 
+def _check_light_and_pixels(
+    batch: SceneBatch, only: Bool[np.ndarray, "V h w"] | None, shape: tuple[int, int, int]
+) -> None:
+    if batch.spots is not None:
+        raise InvalidInput("light of the published renderer", "a lamp at a finite distance", "a distant one")
+    if only is not None and only.shape != shape:
+        raise InvalidInput("shape of the pixels to look at", only.shape, f"{shape}")
+
+
 class PaperRenderer:
     """Renders scenes of known fields.
 
@@ -57,11 +66,11 @@ class PaperRenderer:
 
         Raises:
             UnknownName: if an object has no field here.
-            InvalidInput: if cameras differ in size, an output is unknown, or `only` is of another shape.
+            InvalidInput: if cameras differ in size, an output is unknown, `only` is of another shape, or there are
+                near lamps.
         """
         size = check_request(self._fields, batch, cameras, outputs)
-        if only is not None and only.shape != (len(cameras), *size):
-            raise InvalidInput("shape of the pixels to look at", only.shape, f"{(len(cameras), *size)}")
+        _check_light_and_pixels(batch, only, (len(cameras), *size))
         from osfcore.paper.rendering.kernels import render_batch  # compiles
         from osfcore.paper.rendering.shadow_maps import shadow_maps
         from osfcore.render.launch import plain_table, screen_boxes, z_depth

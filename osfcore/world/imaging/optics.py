@@ -2,6 +2,7 @@
 
 Lambert shading without specular part, as stated in the README's conventions:
 radiance = albedo * (ambient + diffuse * max(0, n . l) * visible), visible in {0, 1}. Values are linear, no gamma.
+A near lamp has its place, cone and falloff besides (`SpotLamp`).
 Lamps of another strength or colour, and other tables, are for measuring what a method does that is not told of them.
 """
 
@@ -110,7 +111,7 @@ def lambert(
 
     Args:
         albedo: linear, in [0, 1].
-        cosine: n . l.
+        cosine: n . l, times a near lamp's falloff and cone.
         visible: 1 where the light arrives, 0 in shadow.
         lamp: strengths of ambient and diffuse light, and their colour.
     """

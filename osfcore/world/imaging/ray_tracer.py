@@ -1,4 +1,4 @@
-"""Pictures of a tabletop by ray tracing: anti-aliased, textured, with exact shadows of a parallel light.
+"""Pictures of a tabletop by ray tracing: anti-aliased, textured, with exact shadows of a parallel light or a near lamp.
 
 This is the image model of object image sets, scenes and goals alike. Pixels that an object may cover, and those where a
 shadow or the table's edge crosses, take a grid of samples each; the open table is known in closed form. Depth and
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import SceneState
 from osfcore.world.imaging.optics import Lamp, TableSurface, lambert
 from osfcore.world.imaging.shot import Body, Shot
@@ -51,6 +52,7 @@ class RayTracer:
         meshes: the objects that scenes may name.
         lamp: strengths of ambient and diffuse light, and their colour; the usual ones if None.
         table: what the table looks like; the usual one if None.
+        spot: a near lamp in the place of the light of every state.
         executor: traces the views of one call side by side, if given (threads serve: Embree releases the GIL).
     """
 
@@ -60,12 +62,14 @@ class RayTracer:
         *,
         lamp: Lamp | None = None,
         table: TableSurface | None = None,
+        spot: SpotLamp | None = None,
         executor: Executor | None = None,
     ) -> None:
         self._meshes = dict(meshes)
         self._pusher = TracedMesh(pusher_mesh())
         self._lamp = lamp or Lamp()
         self._table = table or TableSurface()
+        self._spot = spot
         self._executor = executor
 
     def render(
@@ -86,8 +90,8 @@ class RayTracer:
         if state.pusher is not None:
             bodies.append(Body(self._pusher, Pose(state.pusher, Pose.identity().quaternion)))
         light = state.light.direction.astype(np.float32)
-        lamp, table = self._lamp, self._table
-        shots = [Shot(tuple(bodies), light, c, lamp, table, samples or _samples_for(c), sharp) for c in cameras]
+        lamp, table, spot = self._lamp, self._table, self._spot
+        shots = [Shot(tuple(bodies), light, c, lamp, table, samples or _samples_for(c), sharp, spot) for c in cameras]
         mapped = map(_trace, shots) if self._executor is None else self._executor.map(_trace, shots)
         return tuple(mapped)
 
@@ -244,9 +248,9 @@ def _body_colour(
     normals = surface.normals @ rotation.T
     spacing_m = float(distance.mean()) / shot.camera.intrinsics[1, 1] / shot.samples
     albedo = body.mesh.albedo(surface.uv, 0.0 if shot.sharp else spacing_m)
-    cosine = normals @ shot.light
+    points = shot.origin + distance[:, None] * directions
+    incidence = shot.incidence(points, normals)
     visible = np.zeros(len(distance), np.float32)
-    facing = np.nonzero(cosine > 0)[0]
-    points = shot.origin + distance[facing, None] * directions[facing] + _BIAS_M * normals[facing]
-    visible[facing] = shot.lit(points, index)
-    return lambert(albedo, cosine, visible, shot.lamp)
+    facing = np.nonzero(incidence > 0)[0]
+    visible[facing] = shot.lit(points[facing] + _BIAS_M * normals[facing], index)
+    return lambert(albedo, incidence, visible, shot.lamp)

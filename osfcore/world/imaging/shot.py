@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.world.imaging.optics import Lamp, TableSurface
 from osfcore.world.imaging.traced_mesh import TracedMesh, into_frame
 
@@ -63,6 +64,7 @@ class Shot:
         table: what the table looks like; None where there is none.
         samples: along each side of a pixel.
         sharp: take textures at their finest level and sample every pixel alike.
+        spot: a near lamp in the place of the distant light.
     """
 
     bodies: tuple[Body, ...]
@@ -72,6 +74,7 @@ class Shot:
     table: TableSurface | None
     samples: int
     sharp: bool
+    spot: SpotLamp | None = None
 
     @property
     def origin(self) -> Float[np.ndarray, "3"]:
@@ -101,6 +104,15 @@ class Shot:
             points = (np.stack([c, r], axis=-1)[:, None] + grid).reshape(-1, 2).astype(np.float32)
             yield PixelSamples(r, c, points)
 
+    def incidence(
+        self, points: Float[np.ndarray, "S 3"], normals: Float[np.ndarray, "S 3"] | Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "S"]:
+        """Cosine of the light's angle to the normals at points, times a near lamp's falloff and cone."""
+        if self.spot is None:
+            return normals @ self.light
+        cosine = np.sum(normals * self.spot.toward(points), axis=-1)
+        return (cosine * self.spot.falloff(points) * self.spot.spot_factor(points)).astype(np.float32)
+
     def lit(self, points: Float[np.ndarray, "S 3"], receiver: int | None) -> Float[np.ndarray, "S"]:
         """1 where the light reaches world points, 0 where a body stands in the way (the receiver itself included).
 
@@ -112,14 +124,28 @@ class Shot:
         for i, body in enumerate(self.bodies):
             if i == receiver:
                 candidates = np.nonzero(lit)[0]
-            else:  # only points whose ray toward the light passes through the body's bounding sphere
-                to_centre = body.pose.position.astype(np.float32) - points
-                along = to_centre @ self.light
-                across2 = np.einsum("ij,ij->i", to_centre, to_centre) - along**2
-                radius = body.mesh.radius_m
-                candidates = np.nonzero((lit > 0) & (across2 < radius**2) & (along > -radius))[0]
+            else:
+                candidates = np.nonzero((lit > 0) & self._may_shade(body, points))[0]
             if len(candidates):
-                light = np.broadcast_to(self.light, (len(candidates), 3))
-                blocked = body.mesh.occludes(*into_frame(body.pose, points[candidates], light))
+                rays, end = self._to_light(points[candidates])
+                blocked = body.mesh.occludes(*into_frame(body.pose, points[candidates], rays), end)
                 lit[candidates[blocked]] = 0
         return lit
+
+    def _to_light(self, points: Float[np.ndarray, "S 3"]) -> tuple[Float[np.ndarray, "S 3"], float | None]:
+        """Rays from points toward the light, and where they end [ray lengths]."""
+        if self.spot is None:
+            return np.broadcast_to(self.light, points.shape), None
+        return self.spot.position.astype(np.float32) - points, 1.0
+
+    def _may_shade(self, body: Body, points: Float[np.ndarray, "S 3"]) -> Bool[np.ndarray, "S"]:
+        """Whether the ray from each point toward the light passes through the body's bounding sphere."""
+        to_centre, radius = body.pose.position.astype(np.float32) - points, body.mesh.radius_m
+        if self.spot is None:
+            along = to_centre @ self.light
+            across2 = np.einsum("ij,ij->i", to_centre, to_centre) - along**2
+            return (across2 < radius**2) & (along > -radius)
+        rays, _ = self._to_light(points)
+        share = np.einsum("ij,ij->i", to_centre, rays) / np.einsum("ij,ij->i", rays, rays)
+        nearest = to_centre - np.clip(share, 0, 1)[:, None] * rays
+        return np.einsum("ij,ij->i", nearest, nearest) < radius**2

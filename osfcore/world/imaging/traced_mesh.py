@@ -65,10 +65,10 @@ class TracedMesh:
         return distance, hits["primID"], np.stack([hits["u"], hits["v"]], axis=-1)
 
     def occludes(
-        self, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"]
+        self, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"], end: float | None = None
     ) -> Bool[np.ndarray, "S"]:
-        """Whether the mesh stands in each ray's way."""
-        return self._scene.run(origins, directions, query="OCCLUDED") >= 0
+        """Whether the mesh stands in each ray's way, before it ends [ray lengths] if it does."""
+        return self._scene.run(origins, directions, end, query="OCCLUDED") >= 0
 
     def surface(
         self, faces: Int[np.ndarray, "S"], barycentric: Float[np.ndarray, "S 2"], directions: Float[np.ndarray, "S 3"]

@@ -13,6 +13,7 @@ from osfcore.world.imaging.optics import BACKGROUND_RADIANCE, lambert
 from osfcore.world.imaging.shot import Shot
 
 _BACKGROUND = -1.0
+_UP = np.array([0, 0, 1], np.float32)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,14 +46,15 @@ def see_table(shot: Shot, directions: Float[np.ndarray, "S 3"]) -> TableHits:
     kind[on_table] = shot.lit(points[on_table], None)
     colour = np.empty((len(depth), 3), np.float32)
     colour[:] = BACKGROUND_RADIANCE
-    colour[on_table] = _radiance(shot, _albedo(shot, points[on_table, :2]), kind[on_table])
+    colour[on_table] = _radiance(shot, _albedo(shot, points[on_table, :2]), points[on_table], kind[on_table])
     return TableHits(kind, colour, np.where(on_table, depth, np.inf).astype(np.float32))
 
 
 def open_table(shot: Shot, near_body: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> Bool[np.ndarray, "h w"]:
     """Fill pixels without body from their four corners; return those whose corners disagree.
 
-    Light is the same all over a pixel whose corners agree; where the table has a texture, only that is sampled.
+    Light arrives all over a pixel whose corners agree, or nowhere in it; there only what changes from place to place is
+    sampled: a texture, and a near lamp's light.
     """
     height, width = near_body.shape
     y, x = np.mgrid[: height + 1, : width + 1]
@@ -63,17 +65,22 @@ def open_table(shot: Shot, near_body: np.ndarray, rgb: np.ndarray, depth: np.nda
     rgb[:] = seen.colour.reshape(height + 1, width + 1, 3)[:-1, :-1]
     distance = seen.depth.reshape(height + 1, width + 1)
     depth[:] = (distance[:-1, :-1] + distance[:-1, 1:] + distance[1:, :-1] + distance[1:, 1:]) / 4
-    if shot.table is not None and shot.table.texture is not None:
-        _fill_textured(shot, (corners[0] != _BACKGROUND) & ~busy & ~near_body, corners[0], rgb)
+    if shot.spot is not None or (shot.table is not None and shot.table.texture is not None):
+        _fill_open(shot, (corners[0] != _BACKGROUND) & ~busy & ~near_body, corners[0], rgb)
     return busy
 
 
-def _fill_textured(shot: Shot, pixels: Bool[np.ndarray, "h w"], kind: np.ndarray, rgb: np.ndarray) -> None:
+def _fill_open(shot: Shot, pixels: Bool[np.ndarray, "h w"], kind: np.ndarray, rgb: np.ndarray) -> None:
     """Fill pixels that show nothing but table, each all in light or all in shadow as `kind` tells."""
     for samples in shot.sampled(pixels):
         points = cv2.perspectiveTransform(samples.points[None], _pixels_to_table(shot))[0]
-        chosen = samples.rows, samples.columns
-        rgb[chosen] = _radiance(shot, samples.means(_albedo(shot, points)), kind[chosen])
+        chosen, albedo = (samples.rows, samples.columns), _albedo(shot, points)
+        if shot.spot is None:  # light is the same all over the table
+            rgb[chosen] = _radiance(shot, samples.means(albedo), points, kind[chosen])
+        else:
+            points = np.pad(points, ((0, 0), (0, 1)))
+            lit = np.repeat(kind[chosen], shot.samples**2)
+            rgb[chosen] = samples.means(_radiance(shot, albedo, points, lit))
 
 
 def _pixels_to_table(shot: Shot) -> Float[np.ndarray, "3 3"]:
@@ -90,6 +97,8 @@ def _albedo(shot: Shot, points: Float[np.ndarray, "S 2"]) -> Float[np.ndarray, "
 
 
 def _radiance(
-    shot: Shot, albedo: Float[np.ndarray, "S 3"], visible: Float[np.ndarray, "S"]
+    shot: Shot, albedo: Float[np.ndarray, "S 3"], points: Float[np.ndarray, "_ _"], visible: Float[np.ndarray, "S"]
 ) -> Float[np.ndarray, "S 3"]:
-    return lambert(albedo, np.full(len(albedo), shot.light[2], np.float32), visible, shot.lamp)
+    """Of the table at points of it, which only a near lamp asks for."""
+    incidence = np.full(len(albedo), shot.light[2], np.float32) if shot.spot is None else shot.incidence(points, _UP)
+    return lambert(albedo, incidence, visible, shot.lamp)

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.kernels import render_batch
 from osfcore.render.launch import screen_boxes
@@ -75,7 +76,7 @@ def test_no_shadow_is_cut_off(azimuth_deg, elevation_deg):
 
 def test_no_batch_makes_the_compiler_work_again():
     """Every way of building a batch leads to arrays of one layout: compiling anew takes half a minute."""
-    fields = {"a": ball(), "b": block()}
+    fields, spot = {"a": ball(), "b": block()}, SpotLamp(np.array([0, 0.1, 0.5]), np.zeros(3), 30, 40)
     for table in (None, plain_table()):
         for names in (("a",), ("a", "b"), ()):
             for scenes in (1, 2):
@@ -84,9 +85,10 @@ def test_no_batch_makes_the_compiler_work_again():
                 quaternions = np.broadcast_to(UPRIGHT, (scenes, count, 4))
                 lights = np.broadcast_to([0, 0, 1.0], (scenes, 3))
                 for pusher in (None, np.zeros((scenes, 3))):
-                    batch = SceneBatch(names, positions, quaternions, lights, pusher)
-                    for quality in (EXACT, PLANNING):
-                        for cameras in ([view(size=16)], [view(size=16).resized(16, 20)] * 2):
-                            SceneRenderer(fields, table).render(batch, cameras, quality=quality, outputs=OUTPUTS)
-                            SceneRenderer(fields, table).render(batch, cameras, quality=quality)
-    assert len(render_batch.signatures) == len(render_base.signatures) == 1
+                    for spots in (None, (spot,) * scenes):
+                        batch = SceneBatch(names, positions, quaternions, lights, pusher, spots)
+                        for quality in (EXACT, PLANNING):
+                            for cameras in ([view(size=16)], [view(size=16).resized(16, 20)] * 2):
+                                SceneRenderer(fields, table).render(batch, cameras, quality=quality, outputs=OUTPUTS)
+                                SceneRenderer(fields, table).render(batch, cameras, quality=quality)
+    assert len(render_batch.signatures) == len(render_base.signatures) == 2  # distant lights, near lamps

@@ -5,6 +5,8 @@ import pytest
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.light import Light
+from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.world.conditions import Conditions
 from osfcore.world.imaging.optics import Lamp, TableSurface
@@ -82,3 +84,20 @@ def test_factors_that_no_world_has_are_refused(factor):
         Conditions(friction_factor=factor)
     with pytest.raises(InvalidInput, match="mass"):
         Conditions(mass_factor=factor)
+
+
+def test_a_near_lamp_takes_the_place_of_the_scenes_light(library):
+    """In pictures, and in the truth as the direction in which it stands; the rest of the scene stays as it is."""
+    spot = SpotLamp(np.array([0.2, -0.1, 0.5]), np.zeros(3), 20, 25)
+    usual, near = (world_with(library, c) for c in (None, Conditions(spot=spot)))
+    for world in (usual, near):
+        world.arrange(2)
+    np.testing.assert_array_equal(usual.truth().poses.position, near.truth().poses.position)
+    np.testing.assert_allclose(near.truth().light.direction, spot.direction)
+    first = near.observe().images
+    near.set_light(Light(np.array([0, 0, 1.0])))
+    np.testing.assert_array_equal(near.observe().images, first)
+    x, y = np.floor(CAMERAS[0].project(np.array([-0.5, 0.0, 0]))).astype(int)
+    assert first[0][y, x, 0] == pytest.approx(0.25 * 0.66, abs=1e-3)  # outside the cone
+    usual.close()
+    near.close()

@@ -1,0 +1,254 @@
+"""Closed forms of a lamp at a finite distance, for both paths, and that they agree."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import quaternion_exp
+from osfcore.geometry.spot_lamp import SpotLamp
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
+from osfcore.paper.rendering.renderer import PaperRenderer
+from osfcore.render.reference import render_on_device, render_reference
+from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.types import EXACT, OUTPUTS, PLANNING, Quality, SceneBatch
+from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, random_scene, state, view, wooden_table
+
+ALBEDO = 0.5  # of the plain table
+LAMP = SpotLamp(np.array([0.25, -0.15, 0.45]), np.array([0.02, 0.03, 0.0]), 25, 40)
+WIDE = SpotLamp(np.array([0.25, -0.15, 0.45]), np.zeros(3), 80, 90)
+
+
+def both(fields, table, scene, spot, camera, quality=EXACT):
+    """Everything from one camera, from the reference and from the fast path."""
+    slow = render_reference(fields, table, scene, camera, spot=spot, quality=quality, outputs=OUTPUTS)
+    fast = SceneRenderer(fields, table).render(SceneBatch.of(scene, spot), [camera], quality=quality, outputs=OUTPUTS)
+    return slow, fast
+
+
+def seen_points(camera: Camera) -> np.ndarray:
+    """Where the rays through pixel centres meet the plane z = 0 [m]."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = camera.ray_directions(np.stack([x, y], axis=-1))
+    origin = camera.T_world_camera.position
+    return origin + rays * (-origin[2] / rays[..., 2:])
+
+
+def random_lamp(seed: int) -> SpotLamp:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.3, 1.0)
+    angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.3, 0.8)
+    flat = np.sqrt(1 - z**2)
+    place = distance * np.array([flat * np.cos(angle), flat * np.sin(angle), z])
+    inner = rng.uniform(10, 40)
+    return SpotLamp(place, np.array([*rng.uniform(-0.05, 0.05, 2), 0]), inner, inner + rng.uniform(0, 30))
+
+
+@pytest.mark.parametrize("spot", [LAMP, WIDE, SpotLamp(np.array([0, 0.1, 0.3]), np.array([0.1, 0, 0.05]), 20, 20)])
+def test_the_empty_table_falls_off_and_has_the_cones_edge(spot):
+    camera = view((0.1, 0, 0.9), (0, 0, 0), 24, 50.0)
+    points = seen_points(camera)
+    lit = 0.75 * spot.toward(points)[..., 2] * spot.falloff(points) * spot.spot_factor(points)
+    off_the_edge = np.abs(spot.spot_factor(points + 1e-5) - spot.spot_factor(points - 1e-5)) < 0.01
+    assert off_the_edge.mean() > 0.9
+    for rendered in both({}, plain_table(ALBEDO), state({}), spot, camera):
+        expected = np.broadcast_to(ALBEDO * (0.25 + lit[..., None]), (24, 24, 3))
+        np.testing.assert_allclose(rendered.rgb[0, 0][off_the_edge], expected[off_the_edge], atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [0.75, 2.0])
+def test_light_falls_off_with_the_square_of_the_distance(factor):
+    """Below a lamp overhead, on the top of a block nearer to it than the table is; there it is as a distant light."""
+    camera = view((0, 0, 2.0), (0, 0, 0), 16, 0.2)
+    spot = SpotLamp(np.array([0, 0, 0.4 * factor]), np.zeros(3), 60, 60)
+    for rendered in both({}, plain_table(ALBEDO), state({}), spot, camera):
+        np.testing.assert_allclose(rendered.rgb, ALBEDO, atol=1e-3)
+    top = {"block": block((0.05, 0.05, 0.02), voxel=0.002, albedo=(0.5, 0.5, 0.5))}
+    for rendered in both(top, None, state({"block": (0, 0, 0.1)}), spot, camera):
+        gain = (0.4 * factor / (0.4 * factor - 0.12)) ** 2
+        np.testing.assert_allclose(
+            rendered.rgb[0, 0, 8, 8], 0.5 * (0.25 + 0.75 * gain), rtol=0.015
+        )  # samples lie a little below the surface
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_a_lamp_200_m_away_is_the_distant_light(seed):
+    fields, scene = random_scene(seed)
+    spot = SpotLamp(200 * scene.light.direction, np.zeros(3), 10, 20)
+    for rendered, distant in zip(
+        both(fields, wooden_table(), scene, spot, view(size=24)),
+        both(fields, wooden_table(), scene, None, view(size=24)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(rendered.rgb, distant.rgb, atol=5e-3)
+        np.testing.assert_array_equal(rendered.opacity, distant.opacity)
+
+
+def test_nothing_but_the_light_changes():
+    fields, scene = random_scene(4)
+    fast = SceneRenderer(fields, wooden_table())
+    near, distant = (fast.render(SceneBatch.of(scene, spot), [view()], outputs=OUTPUTS) for spot in (LAMP, None))
+    for name in ("opacity", "masks", "depth"):
+        np.testing.assert_allclose(getattr(near, name), getattr(distant, name), atol=1e-6)
+    assert np.abs(near.rgb - distant.rgb).max() > 0.05
+
+
+def test_the_shadow_of_a_box_is_its_perspective_projection():
+    """A point of the table is dark if the way to the lamp passes through the box (slab method)."""
+    half, centre = np.array([0.03, 0.02, 0.05]), np.array([0.0, 0.0, 0.05])
+    camera = view((0, 0, 1.5), (0, 0, 0), 96, 18.0)
+    points = seen_points(camera)
+    for lamp in ((0.2, 0.05, 0.3), (-0.1, 0.2, 0.16)):
+        spot = SpotLamp(np.array(lamp), centre, 80, 90)
+        ways = spot.position - points
+        with np.errstate(divide="ignore"):
+            enter, leave = np.sort([(centre - half - points) / ways, (centre + half - points) / ways], axis=0)
+        dark = np.maximum(enter.max(axis=-1), 0) < np.minimum(leave.min(axis=-1), 1)
+        fields = {"box": block(half, voxel=0.0025)}
+        for rendered in both(fields, plain_table(ALBEDO), state({"box": centre}), spot, camera):
+            on_table = rendered.opacity[0, 0, 0] < 1e-3
+            open_table = ALBEDO * (0.25 + 0.75 * spot.toward(points)[..., 2] * spot.falloff(points))
+            shaded = rendered.rgb[0, 0, ..., 0] < (open_table + 0.25 * ALBEDO) / 2
+            union = (shaded | dark) & on_table
+            assert union.sum() > 200
+            assert (shaded & dark & on_table).sum() > 0.92 * union.sum()
+            core = shaded & dark & on_table & (rendered.rgb[0, 0, ..., 0] < 0.126)
+            assert core.sum() > 0.85 * union.sum()  # ambient light alone
+
+
+def test_the_shadow_of_a_ball_is_the_cone_around_it():
+    radius, centre = 0.04, np.array([0.02, -0.01, 0.09])
+    camera = view((0, 0, 1.5), (0, 0, 0), 96, 20.0)
+    points, spot = seen_points(camera), SpotLamp(np.array([-0.15, 0.1, 0.35]), np.zeros(3), 80, 90)
+    away = points - spot.position
+    to_centre = centre - spot.position
+    share = np.clip(away @ to_centre / np.sum(away**2, axis=-1), 0, 1)
+    dark = np.linalg.norm(share[..., None] * away - to_centre, axis=-1) < radius
+    for rendered in both(
+        {"ball": ball(radius, voxel=0.0025)}, plain_table(ALBEDO), state({"ball": centre}), spot, camera
+    ):
+        on_table = rendered.opacity[0, 0, 0] < 1e-3
+        open_table = ALBEDO * (0.25 + 0.75 * spot.toward(points)[..., 2] * spot.falloff(points))
+        shaded = rendered.rgb[0, 0, ..., 0] < (open_table + 0.25 * ALBEDO) / 2
+        assert (shaded & dark & on_table).sum() > 0.94 * ((shaded | dark) & on_table).sum() > 200
+
+
+def test_what_lies_beyond_the_lamp_casts_no_shadow():
+    """A plate above the lamp, one below it, and light from far above both."""
+    fields = {"plate": block((0.06, 0.06, 0.01))}
+    camera = view((0.4, 0, 0.1), (0, 0, 0), 24, 20.0)
+    spot = SpotLamp(np.array([0, 0, 0.3]), np.zeros(3), 60, 70)
+    empty, beyond, between = (
+        both(fields if names else {}, plain_table(), state(names), spot, camera)
+        for names in ({}, {"plate": (0, 0, 0.4)}, {"plate": (0, 0, 0.2)})
+    )
+    for open_table, unshaded, shaded in zip(empty, beyond, between, strict=True):
+        np.testing.assert_allclose(unshaded.rgb, open_table.rgb, atol=1e-6)
+        assert shaded.rgb[0, 0, 12, 12, 0] == pytest.approx(0.125, abs=1e-4)
+
+
+def test_sides_that_face_the_lamp_are_bright_and_others_are_not():
+    """A lamp between two blocks lights the side of each that looks at it, as no distant light can."""
+    fields = {"left": block((0.04, 0.04, 0.04), voxel=0.002), "right": block((0.04, 0.04, 0.04), voxel=0.002)}
+    scene = state({"left": (-0.2, 0, 0.04), "right": (0.2, 0, 0.04)})
+    spot = SpotLamp(np.array([0.0, 0.0, 0.2]), np.zeros(3), 85, 90)
+    for side in (-1, 1):
+        middle = np.array([0.16 * side, 0, 0.04])  # of the face toward the lamp
+        bright = 0.25 + 0.75 * spot.falloff(middle) * spot.toward(middle)[0] * -side
+        within, beyond = (
+            view((0, 0, 0.15), middle, 16, 4.0),
+            view((0.6 * side, 0, 0.15), middle + [0.08 * side, 0, 0], 16, 4.0),
+        )
+        for camera, expected in ((within, bright), (beyond, 0.25)):
+            for rendered in both(fields, None, scene, spot, camera):
+                np.testing.assert_allclose(rendered.rgb[0, 0, 8, 8], np.array([0.3, 0.6, 0.8]) * expected, rtol=0.03)
+
+
+# Seeds are chosen so that one, two and four objects and pushers occur.
+@pytest.mark.parametrize("seed", [1, 2, 6, 9, 11])
+def test_exact_is_the_reference(seed):
+    fields, scene = random_scene(seed)
+    table = None if seed % 3 == 0 else wooden_table(seed=seed)
+    camera = view(np.random.default_rng(seed).normal(size=3) * 0.1 + [0.35, 0, 0.3], size=20, fov_y_deg=50)
+    slow, fast = both(fields, table, scene, random_lamp(seed), camera)
+    for name in ("rgb", "opacity", "depth"):
+        np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), atol=2e-3, err_msg=name)
+    assert fast.rgb.dtype == np.float32
+
+
+def test_a_trained_tables_answer_to_the_lights_direction_counts():
+    """Its network is asked for the direction at every point."""
+    rng = np.random.default_rng(0)
+    table = replace(
+        wooden_table(),
+        w1=rng.normal(size=(3, 6)).astype(np.float32),
+        b1=rng.normal(size=6).astype(np.float32),
+        w2=0.3 * rng.normal(size=(6, 3)).astype(np.float32),
+    )
+    slow, fast = both({}, table, state({}), LAMP, view(size=24))
+    np.testing.assert_allclose(fast.rgb, slow.rgb, atol=1e-5)
+
+
+@pytest.mark.parametrize("lamp", [(0.3, 0.1, 0.3), (0.12, 0.1, 0.12), (-0.2, 0.15, 0.05), (0.0, 0.05, 0.16)])
+def test_no_shadow_is_cut_off(lamp):
+    """A scene whose second, transparent object makes every pixel be looked at shows the same shadows."""
+    spot = SpotLamp(np.array(lamp), np.zeros(3), 89, 90)
+    fields = {"block": block(), "glass": block((0.7, 0.7, 0.1), voxel=0.1, g=-7.0)}
+    camera, tilt = view((0.3, 0.2, 0.6), (0, 0, 0), 48, 70), quaternion_exp(np.array([0.3, 0.5, 0]))
+    renderer = SceneRenderer(fields, plain_table(half_side=2.0))
+    for height in (0.06, 0.01):
+        pose = ((0.05, 0, height), tilt)
+        one = state({"block": pose}, pusher=(-0.1, 0.1, PUSHER_CENTRE_Z_M))
+        two = state({"block": pose, "glass": ((0, 0, 0), UPRIGHT)}, pusher=(-0.1, 0.1, PUSHER_CENTRE_Z_M))
+        a, b = (renderer.render(SceneBatch.of(s, spot), [camera]).rgb for s in (one, two))
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+@pytest.mark.parametrize("quality", [EXACT, PLANNING, Quality(samples_per_side=2)])
+def test_a_batch_is_its_scenes_one_by_one(quality):
+    """Whose lamps are equal, or differ in nothing but the place, the aim or the cone."""
+    fields, scene = random_scene(9)
+    moved = (LAMP, replace(LAMP, position=LAMP.position + 0.05), LAMP, replace(LAMP, aim=np.array([0.1, 0, 0])),
+             replace(LAMP, outer_deg=60), replace(LAMP, inner_deg=30))  # fmt: skip
+    one = SceneBatch.of(scene)
+    parts = [np.repeat(a, len(moved), axis=0) for a in (one.positions, one.quaternions, one.lights)]
+    pusher = None if one.pusher is None else np.repeat(one.pusher, len(moved), axis=0)
+    batch = SceneBatch(one.names, *parts, pusher, moved)
+    renderer = SceneRenderer(fields, wooden_table())
+    whole = renderer.render(batch, [view(size=24)], quality=quality, outputs=OUTPUTS)
+    for b, spot in enumerate(moved):
+        single = renderer.render(SceneBatch.of(scene, spot), [view(size=24)], quality=quality, outputs=OUTPUTS)
+        for name in ("rgb", "opacity", "masks", "depth"):
+            np.testing.assert_array_equal(getattr(whole, name)[b], getattr(single, name)[0], err_msg=name)
+    assert not any(np.array_equal(whole.rgb[0], whole.rgb[b]) for b in (1, 3, 4, 5))
+    np.testing.assert_array_equal(whole.rgb[0], whole.rgb[2])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_planning_stays_above_40_db(seed):
+    rng = np.random.default_rng(seed)
+    fields = {"a": block(rng.uniform(0.02, 0.05, 3), voxel=0.002), "b": ball(rng.uniform(0.02, 0.05), voxel=0.002)}
+    scene = state({"a": (0.06, 0.02, 0.05), "b": (-0.07, -0.03, 0.05)}, pusher=(0, 0.12, PUSHER_CENTRE_Z_M))
+    renderer, batch = SceneRenderer(fields, wooden_table()), SceneBatch.of(scene, random_lamp(seed))
+    camera = Camera.look_at("0", (0.65, 0, 0.55), (0, 0, 0.04), size=128)
+    exact, planned = (renderer.render(batch, [camera], quality=quality).rgb for quality in (EXACT, PLANNING))
+    assert -10 * np.log10(np.mean((planned - exact) ** 2)) > 40
+
+
+def test_a_device_draws_the_same():
+    fields, scene = random_scene(2)
+    batch, cameras = SceneBatch.of(scene, LAMP), [view(size=16)]
+    there = render_on_device(fields, wooden_table(), batch, cameras, "cpu", EXACT, OUTPUTS)
+    here = SceneRenderer(fields, wooden_table()).render(batch, cameras)
+    np.testing.assert_allclose(there.rgb, here.rgb, atol=2e-3)
+
+
+def test_lamps_are_counted_and_the_published_renderer_knows_none():
+    one = SceneBatch.of(state({}), LAMP)
+    np.testing.assert_allclose(one.lights[0], LAMP.direction)
+    with pytest.raises(InvalidInput, match="number of lamps of a batch is 2, but it must be 1, one for each scene"):
+        replace(one, spots=(LAMP, LAMP))
+    with pytest.raises(InvalidInput, match="published renderer is a lamp at a finite distance"):
+        PaperRenderer({}, plain_table()).render(one, [view()])
