@@ -29,7 +29,7 @@ from osfcore.photo.poses.surfels import Surfels, surfels_of
 from osfcore.photo.poses.table_prior import TablePrior
 from osfcore.progress import Progress
 
-_COARSE_SIDE, _FINE_SIDE = 44, 130  # of a mask [px]
+_COARSE_SIDE, _FINE_SIDE, _SHARP_SIDE = 44, 130, 240  # of a mask [px]
 COARSE_ACROSS, FINE_ACROSS = 36, 110  # surfels along an object's diameter
 _LEAST_SPACING_M = 1.2e-3
 _ROTATIONS = 3000
@@ -132,9 +132,9 @@ def find_object(
     """Look for one object in its masks; arguments as of `estimate_photo`."""
     on_table = all(photo.on_table for photo in photos)
     table = models.table_prior(name) if on_table else None
-    coarse, fine = (
+    coarse, fine, sharp = (
         PoseLoss(object_windows(photos, name, side), models.surfels(name, across), table=table, kind=config.loss)
-        for side, across in ((_COARSE_SIDE, COARSE_ACROSS), (_FINE_SIDE, FINE_ACROSS))
+        for side, across in ((_COARSE_SIDE, COARSE_ACROSS), (_FINE_SIDE, FINE_ACROSS), (_SHARP_SIDE, FINE_ACROSS))
     )
     start = time.perf_counter()
     given = config.starts.get(name)
@@ -154,7 +154,8 @@ def find_object(
         spread=0.35,
         rng=rng,
     )
-    ends = [align(fine, poses[k])[0] for k in np.argsort(losses)[:_ALIGNED]]
+    poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
+    ends = [align(sharp, poses[k])[0] for k in range(len(poses.position))]
     poses = Pose(np.stack([p.position for p in ends]), np.stack([p.quaternion for p in ends]))
     terms = fine.terms(poses)
     kept = distinct(poses, terms.losses, _ALIGNED, _APART_DEG)

@@ -8,7 +8,8 @@ with the light a, b by robust least squares (Tukey) at every step; for surfels o
 
     r_c = phi(u_c) - phi_drawn(u_c),                  d r_c / d xi = grad phi(u_c) . d u_c / d xi,
 
-phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. xi is a shift in the world
+phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline; a mask whose border is off by a
+constant is marginalised where the table tells how large an object appears. xi is a shift in the world
 and a turn about the object's origin. Which surfels are visible is found anew at each step and frozen within it.
 """
 
@@ -26,7 +27,7 @@ from osfcore.photo.poses.object_window import ObjectWindow, signed_distance
 from osfcore.photo.poses.pose_loss import PoseLoss, draw
 from osfcore.photo.poses.surfels import Surfels
 
-_ITERATIONS = 15
+_ITERATIONS = 40
 _DAMPING = 1e-4
 _MOST_TURN_RAD, _MOST_SHIFT = 0.1, 0.05  # of a step; the shift as a share of the distance
 _LEAST_TURN_RAD, _LEAST_SHIFT = 2e-4, 2e-5
@@ -36,7 +37,8 @@ _HUBER, _TUKEY = 1.5, 4.0  # deviations at which residuals begin to count less, 
 _LEAST_STD = 0.004  # of colours [radiance]
 _FEWEST = 30  # surfels for colours to count
 _REWEIGHTINGS = 2
-_WORSE = 0.05  # a loss that much above the first: it went astray
+_WORSE = 0.15  # a loss that much above the first: it went astray
+_BORDER_STD_PX, _BORDER_STD_ON_TABLE_PX = 0.1, 2.0  # of a constant error of the mask's border
 _CORRELATED = 0.03  # share of independent residuals: what the table says counts against them
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _RIDGE = np.diag([1e-4, 2e-2, 2e-2, 2e-2])
@@ -106,7 +108,8 @@ def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> 
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for part in prepared:
         index, _ = draw(loss.surfels, part.window, _batch(pose))
-        terms = [_outline_terms(part, loss.surfels, pose, index[0])]
+        std = _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
+        terms = [_outline_terms(part, loss.surfels, pose, index[0], std)]
         if loss.kind == "all":
             terms.append(_colour_terms(part, loss.surfels, pose, index[0]))
         for more_normal, more_right in terms:
@@ -160,7 +163,10 @@ def _tukey(residual: np.ndarray, std: float) -> np.ndarray:
     return (1 - np.minimum(np.abs(residual) / (_TUKEY * std), 1) ** 2) ** 2
 
 
-def _outline_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _outline_terms(
+    part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray, border_std_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the outline; a border of the mask that is off by a constant is marginalised."""
     shown = index >= 0
     border = shown & (cv2.erode(shown.astype(np.uint8), _CROSS) == 0) & part.clear
     pixels, jacobian = _project(part.window, pose, surfels.points[index[border]])
@@ -169,8 +175,11 @@ def _outline_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndar
     slope = x[:, None] * jacobian[:, 0] + y[:, None] * jacobian[:, 1]
     sizes = np.abs(residual) / _OUTLINE_STD_PX
     weights = np.where(np.abs(residual) < _FARTHEST_PX, np.minimum(1, _HUBER / np.maximum(sizes, 1e-9)), 0)
-    weighted = slope * (weights / _OUTLINE_STD_PX**2)[:, None]
-    return weighted.T @ slope, -weighted.T @ residual
+    weights /= _OUTLINE_STD_PX**2
+    normal, right = (slope * weights[:, None]).T @ slope, -(slope * weights[:, None]).T @ residual
+    coupling, shift = slope.T @ weights, -float(weights @ residual)
+    own = float(weights.sum()) + 1 / (_CORRELATED * border_std_px**2)
+    return normal - np.outer(coupling, coupling) / own, right - coupling * shift / own
 
 
 def _project(

@@ -10,14 +10,15 @@ from osfcore.geometry.poses import Pose, quaternion_conjugate, rotate
 
 _HEIGHT_STD_M = 2e-3
 _TILT_STD_RAD = np.deg2rad(1.5)
-_FARTHEST = 6.0  # deviations, beyond which an object may as well lean or lie on another one
+_FARTHEST = 20.0  # deviations, beyond which a refined object may as well lean or lie on another one
+_MOST_PENALTY = 10.0  # deviations that count at most while orientations are compared
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
 class TablePrior:
     """Height of the lowest point above z = 0 and tilt from the nearest stable orientation, both normally distributed.
 
-    Beyond six standard deviations the penalty is constant: objects may lie on objects.
+    Beyond ten standard deviations the penalty is constant: objects may lie on objects.
 
     Args:
         resting: how the object can lie.
@@ -28,12 +29,12 @@ class TablePrior:
         self._stable = np.unique(np.round(rotate(quaternion_conjugate(resting.quaternions), _DOWN), 6), axis=0)
 
     def penalties(self, poses: Pose) -> Float[np.ndarray, "B"]:
-        """Squared deviations of B poses, each of the two at most 36."""
+        """Squared deviations of B poses, each of the two at most 100."""
         lowest = rotate(poses.quaternion[:, None], self._hull)[..., 2].min(axis=1) + poses.position[:, 2]
         cosines = (rotate(poses.quaternion[:, None], self._stable) @ _DOWN).max(axis=1)
         heights = np.abs(lowest) / _HEIGHT_STD_M
         tilts = np.arccos(np.clip(cosines, -1, 1)) / _TILT_STD_RAD
-        return np.minimum(heights, _FARTHEST) ** 2 + np.minimum(tilts, _FARTHEST) ** 2
+        return np.minimum(heights, _MOST_PENALTY) ** 2 + np.minimum(tilts, _MOST_PENALTY) ** 2
 
     def normal_equations(self, pose: Pose) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
         """J^T J and -J^T r of one pose's deviations, for a shift [m] and a turn about its origin [rad] in the world."""

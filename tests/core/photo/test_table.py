@@ -46,7 +46,7 @@ def test_what_stands_on_the_table_pays_nothing_and_the_rest_a_bounded_price(lyin
     )
     penalties = prior.penalties(batch(pose, high, leaning))
     assert penalties[0] < 0.1
-    np.testing.assert_allclose(penalties[1:], [36 + penalties[0], 72], rtol=0.1)
+    np.testing.assert_allclose(penalties[1:], [100 + penalties[0], 200], rtol=0.1)
 
 
 def test_a_gauss_newton_step_brings_it_back_to_the_table(lying):
