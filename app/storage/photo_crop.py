@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from app.storage.photos import MIN_SIDE, Photo
+from app.storage.photos import Photo
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import Camera
+from osfcore.photo.read_photograph import MIN_SIDE
 
 GOAL_SIDE = 512  # of goal images at most [px]: estimators look at less
 MAX_TURN_DEG = 180.0

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.io.image_file import to_uint8
+from osfcore.photo.camera_response import linear_of_srgb, srgb_of_linear
 
 ImageChange = Literal["none", "noise", "jpeg", "srgb_8bit", "srgb_8bit_decoded"]
 NOISE_SIGMA = 0.02  # of each channel of each pixel
@@ -45,16 +46,6 @@ def received(
             return linear_of_srgb(to_uint8(srgb_of_linear(image)).astype(np.float32) / 255)
         case "none":
             return image
-
-
-def srgb_of_linear(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Values in [0, 1] as sRGB encodes them (IEC 61966-2-1)."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def linear_of_srgb(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The inverse of `srgb_of_linear`."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _through_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

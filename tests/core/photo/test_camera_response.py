@@ -1,19 +1,33 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from osfcore.photo.camera_response import encoded_from_linear, linear_from_encoded
-
-
-def test_encoding_and_decoding_undo_each_other():
-    values = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(encoded_from_linear(linear_from_encoded(values)), values, atol=1e-6)
+from osfcore.photo.camera_response import linear_from_encoded, linear_of_srgb, srgb_of_linear
 
 
-@pytest.mark.parametrize(("encoded", "linear"), [(0.0, 0.0), (1.0, 1.0), (0.5, 0.2140411), (0.04, 0.04 / 12.92)])
-def test_values_of_the_standard(encoded, linear):
-    assert linear_from_encoded(np.array([encoded]))[0] == pytest.approx(linear, abs=1e-6)
+def test_srgb_has_its_well_known_values():
+    linear = np.array([0, 0.002, 0.18, 0.5, 1])
+    np.testing.assert_allclose(srgb_of_linear(linear), [0, 0.02584, 0.46136, 0.73536, 1], atol=1e-5)
 
 
-def test_linear_files_stay_as_they_are():
-    values = np.linspace(0, 1, 7)
-    np.testing.assert_allclose(linear_from_encoded(values, "linear"), values, atol=1e-7)
+@given(value=st.floats(0, 1))
+def test_each_curve_is_the_inverse_of_the_other(value):
+    values = np.array([value])
+    np.testing.assert_allclose(linear_of_srgb(srgb_of_linear(values)), values, atol=1e-7)
+    np.testing.assert_allclose(srgb_of_linear(linear_of_srgb(values)), values, atol=1e-7)
+
+
+@pytest.mark.parametrize("curve", [srgb_of_linear, linear_of_srgb])
+def test_the_curves_rise_without_a_step(curve):
+    steps = np.diff(curve(np.linspace(0, 1, 100_001)))
+    assert np.all(steps > 0)
+    assert steps.max() < 2e-4
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_types_of_numbers_are_kept(dtype):
+    values = np.linspace(0, 1, 7, dtype=dtype)
+    assert linear_from_encoded(values, "srgb").dtype == dtype
+    assert srgb_of_linear(values).dtype == dtype
+    np.testing.assert_array_equal(linear_from_encoded(values, "linear"), values)

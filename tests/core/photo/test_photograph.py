@@ -1,47 +1,118 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
+from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.photo.photograph import Photograph
 
-K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
+K = np.array([[90.0, 0, 31.0], [0, 92.0, 25.0], [0, 0, 1]])
+TABLE = Pose(np.array([0.1, -0.5, 0.7]), quaternion_exp(np.array([2.2, 0.1, 0.0])))
 
 
-def photograph(height=96, width=128, **changes):
-    arguments = {"image": np.full((height, width, 3), 0.4, np.float32), "well_exposed": np.ones((height, width), bool)}
-    return Photograph(**{**arguments, "intrinsics": K, **changes})
+def photograph(height=48, width=64, **changed):
+    image = np.random.default_rng(0).random((height, width, 3), np.float32)
+    facts = {
+        "image": image,
+        "well_exposed": np.ones((height, width), bool),
+        "intrinsics": K,
+        "T_world_camera": TABLE,
+        "on_table": True,
+    }
+    return Photograph(**(facts | changed))
 
 
-def test_a_reduced_photograph_sees_the_same_rays():
-    point = np.array([0.03, -0.02, 0.5])
-    photo = photograph(192, 256, masks={"a": np.ones((192, 256), bool)})
-    small = photo.reduced(128)
-    assert small.image.shape == (96, 128, 3)
-    whole, half = (K @ point, small.intrinsics @ point)
-    np.testing.assert_allclose(half[:2] / half[2], whole[:2] / whole[2] / 2)
-    assert small.masks["a"].all()
-    assert small.well_exposed.all()
+def disc(height, width, centre=(30.0, 22.0), radius=14.0):
+    y, x = np.mgrid[:height, :width] + 0.5
+    return np.hypot(x - centre[0], y - centre[1]) < radius
 
 
-def test_a_small_photograph_is_not_enlarged():
-    photo = photograph()
-    assert photo.reduced(5000) is photo
+def test_it_tells_its_size():
+    assert (photograph().width, photograph().height) == (64, 48)
 
 
+@pytest.mark.wrong_arrays
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changed", "words"),
     [
-        ({"masks": {"mug": np.zeros((96, 128), bool)}}, "mask of mug is empty"),
-        ({"masks": {"mug": np.ones((95, 128), bool)}}, "size of the mask of mug is 128 x 95 pixels"),
-        ({"intrinsics": np.diag([-1.0, 1, 1])}, "K of the photo is"),
-        ({"intrinsics": np.full((3, 3), np.nan)}, "K of the photo is"),
+        ({"image": np.zeros((48, 64, 3))}, "image of the photo is an array of float64"),
+        ({"image": np.zeros((48, 64), np.float32)}, r"float32, of shape \(height, width, 3\)"),
+        ({"image": np.full((48, 64, 3), np.nan, np.float32)}, "radiance of the photo is between nan and nan"),
+        ({"image": np.full((48, 64, 3), 1.5, np.float32)}, "finite and between 0 and 1"),
+        ({"well_exposed": np.ones((64, 48), bool)}, "exposure mask of the photo is .* boolean, of shape"),
+        ({"intrinsics": np.diag([-1.0, 1, 1])}, "positive focal lengths"),
+        ({"intrinsics": np.diag([1.0, 1, 2])}, "last row 0, 0, 1"),
+        ({"T_world_camera": Pose(np.full(3, np.nan), np.array([1.0, 0, 0, 0]))}, "one pose of finite numbers"),
+        ({"on_table": False}, "must be the identity where no table is known"),
+        (
+            {"masks": {"mug": np.ones((24, 32), bool)}},
+            "mask of mug is 32 x 24 px, .* as large as the photo, 64 x 48 px",
+        ),
+        ({"masks": {"mug": np.zeros((48, 64), bool)}}, "mask of mug is empty, but it must be drawn over the object"),
+        ({"masks": {"mug": np.ones((48, 64))}}, "mask of mug is an array of float64"),
     ],
 )
-def test_mistakes_are_told(changes, sentence):
-    with pytest.raises(InvalidInput, match=sentence):
-        photograph(**changes)
+def test_what_makes_no_sense_is_refused(changed, words):
+    with pytest.raises(InvalidInput, match=words):
+        photograph(**changed)
 
 
-def test_a_tiny_photograph_is_refused():
-    with pytest.raises(InvalidInput, match="size of the photo is 20 x 20 pixels"):
-        photograph(20, 20)
+def test_without_a_table_the_world_is_the_camera():
+    seen = photograph(T_world_camera=Pose.identity(), on_table=False)
+    np.testing.assert_array_equal(seen.T_world_camera.matrix(), np.eye(4))
+
+
+def test_masks_can_be_given_later():
+    masks = {"mug": disc(48, 64)}
+    seen = photograph().with_masks(masks)
+    np.testing.assert_array_equal(seen.masks["mug"], masks["mug"])
+    with pytest.raises(InvalidInput, match="mask of mug is empty"):
+        photograph().with_masks({"mug": ~np.ones((48, 64), bool)})
+
+
+@given(longest=st.integers(4, 64))
+def test_a_smaller_photo_shows_the_same_view(longest):
+    """Points are projected to the same share of the image, wherever they are."""
+    whole = photograph()
+    small = whole.resized(longest)
+    assert max(small.width, small.height) == longest
+    points = np.random.default_rng(longest).normal(size=(20, 3)) + [0, 0, 6]
+    shares = [(points @ p.intrinsics.T / points[:, 2:])[:, :2] / (p.width, p.height) for p in (whole, small)]
+    np.testing.assert_allclose(*shares, atol=1e-12)
+    np.testing.assert_allclose(small.image.mean((0, 1)), whole.image.mean((0, 1)), atol=0.03)
+
+
+def test_radiance_and_masks_are_averaged_over_areas():
+    whole = photograph(masks={"mug": disc(48, 64)}, well_exposed=~disc(48, 64, radius=0.8))
+    small = whole.resized(16)
+    np.testing.assert_allclose(small.image, whole.image.reshape(12, 4, 16, 4, 3).mean((1, 3)), atol=1e-6)
+    shares = whole.masks["mug"].reshape(12, 4, 16, 4).mean((1, 3))
+    np.testing.assert_array_equal(small.masks["mug"], shares > 0.5)
+    np.testing.assert_array_equal(small.well_exposed, whole.well_exposed.reshape(12, 4, 16, 4).all((1, 3)))
+
+
+@given(longest=st.integers(3, 63), seed=st.integers(0, 1000))
+def test_a_pixel_is_well_exposed_only_if_all_that_it_is_made_of_is(longest, seed):
+    """The number of bad pixels covers at least the area that was bad, at any ratio of sizes."""
+    bad = np.random.default_rng(seed).random((48, 64)) < 0.01
+    small = photograph(well_exposed=~bad).resized(longest)
+    y, x = np.nonzero(bad)
+    rows = (y * small.height // 48, ((y + 1) * small.height - 1) // 48)
+    columns = (x * small.width // 64, ((x + 1) * small.width - 1) // 64)
+    assert not any(small.well_exposed[r, c].any() for r in rows for c in columns)
+    assert (~small.well_exposed).sum() <= 4 * bad.sum()
+
+
+def test_a_photo_is_never_enlarged():
+    whole = photograph()
+    assert whole.resized(64) is whole
+    assert whole.resized(1000) is whole
+
+
+def test_a_size_at_which_nothing_is_left_is_refused():
+    speck = photograph(masks={"pin": disc(48, 64, radius=1.0)})
+    with pytest.raises(InvalidInput, match="nothing of pin would be left"):
+        speck.resized(8)
+    with pytest.raises(InvalidInput, match="at least 1"):
+        speck.resized(0)

@@ -1,0 +1,287 @@
+"""Picture files that people send: decoded upright, at a moderate size, with what EXIF says of the focal length.
+
+A file is judged by its header first, and whatever a decoder stumbles over becomes one sentence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+from pillow_heif import register_heif_opener
+
+from osfcore.errors import CorruptFile, OsfError, check_ranges, shown
+from osfcore.geometry.poses import Pose
+from osfcore.photo.camera_response import Encoding, linear_from_encoded
+from osfcore.photo.photograph import Photograph
+
+FORMATS = ("PNG", "JPEG", "WEBP", "HEIF", "AVIF", "TIFF", "GIF", "BMP")
+MAX_PIXELS = 200_000_000
+MAX_BYTES = 500_000_000
+MIN_SIDE = 32
+KEPT_SIDE = 2048  # larger photos are scaled down to this
+SATURATED, BLACK = 251 / 255, 1 / 255  # encoded values from which and up to which a sensor tells nothing
+ASSUMED_DIAGONAL_DEG = 75.0  # field of view of a phone's main camera, from corner to corner
+_FILM_DIAGONAL_MM = 43.27  # of the 36 x 24 mm to which equivalent focal lengths refer
+_FOCAL_RANGE = 0.2, 50.0  # per longest side: what lies outside is a mistake in the metadata
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's FocalPlaneResolutionUnit
+_WIDE_MODES = ("I;16", "I;16B", "I;16L", "I;16N")
+_UPRIGHT = {  # quarter turns counter-clockwise, then whether to mirror, by EXIF's orientation
+    2: (0, True),
+    3: (2, False),
+    4: (2, True),
+    5: (3, True),
+    6: (3, False),
+    7: (1, True),
+    8: (1, False),
+}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RawPhotograph:
+    """A decoded photo, upright.
+
+    Attributes:
+        encoded: values as the file holds them, in the primaries of sRGB; perhaps scaled down.
+        encoding: of these values.
+        sent_size: width and height of the upright photo as it was sent [px].
+        focal_px: focal length in pixels of `encoded`, from EXIF; None if that does not tell.
+        notes: sentences for the user about what was done to the photo.
+    """
+
+    encoded: UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]
+    encoding: Encoding
+    sent_size: tuple[int, int]
+    focal_px: float | None
+    notes: tuple[str, ...]
+
+    @property
+    def eight_bit(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The encoded values in 8 bit, to look at."""
+        return _eight_bit(self.encoded)
+
+
+def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb") -> RawPhotograph:
+    """A photo in any usual format, upright, no side longer than 2048 px.
+
+    Grey, palettes, CMYK and 16 bits a channel (which PNG and grey TIFF keep) are understood; what is transparent
+    becomes white; 8-bit colours of another profile are converted to sRGB; of an animation the first image counts.
+
+    Args:
+        data: the file, or its content.
+        encoding: what its values mean.
+
+    Raises:
+        CorruptFile: if it is no such image, is broken, or has too many or too few pixels.
+    """
+    name, content = ("The photo", data) if isinstance(data, bytes) else (shown(data), _content(data))
+    try:
+        with _no_warnings(), Image.open(io.BytesIO(content), formats=FORMATS) as image:
+            _check_size(name, *image.size)
+            return _read(image, content, encoding)
+    except OsfError:  # a ValueError itself
+        raise
+    except MemoryError:
+        raise CorruptFile(name, "it needs too much memory to be decoded; take a smaller one") from None
+    except UnidentifiedImageError:
+        kinds = "a JPEG, PNG, WebP, HEIC, AVIF, TIFF, GIF or BMP file"
+        raise CorruptFile(name, f"it is no picture that can be read here; send {kinds}") from None
+    except Image.DecompressionBombError:
+        raise CorruptFile(name, f"it has far too many pixels; {_millions(MAX_PIXELS)} are allowed") from None
+    except Exception:  # decoders raise whatever their own code stumbles over
+        raise CorruptFile(name, "it is damaged or incomplete, and cannot be decoded; send it anew") from None
+
+
+def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Float[np.ndarray, "3 3"]:
+    """K of a camera with square pixels that looks through the middle of its image; pixel centres at +0.5.
+
+    Raises:
+        InvalidInput: if the focal length is less than a fifth of the image's longest side, or more than 50 times that.
+    """
+    low, high = (factor * max(width, height) for factor in _FOCAL_RANGE)
+    check_ranges(("focal length [px]", focal_px, low, high))
+    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
+
+
+def guessed_intrinsics(raw: RawPhotograph) -> tuple[Float[np.ndarray, "3 3"], str]:
+    """K as EXIF tells it, else that of a phone's main camera, and a sentence that says which."""
+    height, width = raw.encoded.shape[:2]
+    if raw.focal_px is not None:
+        note = f"The focal length, {raw.focal_px:.0f} pixels, is what the camera wrote into the photo."
+        return intrinsics_from_focal(width, height, raw.focal_px), note
+    focal = np.hypot(width, height) / 2 / np.tan(np.deg2rad(ASSUMED_DIAGONAL_DEG) / 2)
+    note = (
+        "The photo does not tell its focal length; that of a phone's main camera is assumed "
+        f"({ASSUMED_DIAGONAL_DEG:g} degrees from corner to corner), so distances may be off by a fifth."
+    )
+    return intrinsics_from_focal(width, height, float(focal)), note
+
+
+def to_photograph(
+    raw: RawPhotograph,
+    intrinsics: Float[np.ndarray, "3 3"],
+    T_world_camera: Pose | None = None,
+    masks: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
+) -> Photograph:
+    """Linear radiance of a decoded photo, and which of its pixels can be trusted.
+
+    Args:
+        raw: as it was read.
+        intrinsics: K of `raw.encoded` [px].
+        T_world_camera: pose over the table's plane z = 0; None if no table is known.
+        masks: by object name.
+
+    Raises:
+        InvalidInput: if intrinsics, pose or masks do not fit the photo.
+    """
+    most = np.iinfo(raw.encoded.dtype).max
+    radiance = linear_from_encoded(np.arange(most + 1) / most, raw.encoding).astype(np.float32)
+    brightest = raw.encoded.max(axis=2)
+    well_exposed = (brightest > BLACK * most) & (brightest < SATURATED * most)
+    pose = Pose.identity() if T_world_camera is None else T_world_camera
+    return Photograph(radiance[raw.encoded], well_exposed, intrinsics, pose, T_world_camera is not None, masks or {})
+
+
+def _content(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise CorruptFile(path, f"it is larger than {MAX_BYTES // 1_000_000} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise CorruptFile(path, error.strerror or str(error)) from error
+
+
+@contextlib.contextmanager
+def _no_warnings() -> Iterator[None]:
+    """Pillow opens all that is allowed here, and keeps to itself what it thinks of odd metadata and of sizes."""
+    register_heif_opener()
+    before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MAX_PIXELS  # an error comes at twice that
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before
+
+
+def _check_size(name: str, width: int, height: int) -> None:
+    size = f"it has {width} x {height} pixels"
+    if width * height > MAX_PIXELS:
+        raise CorruptFile(name, f"{size}; {_millions(MAX_PIXELS)} are allowed")
+    if min(width, height) < MIN_SIDE:
+        raise CorruptFile(name, f"{size}; at least {MIN_SIDE} a side are needed")
+
+
+def _millions(pixels: int) -> str:
+    return f"{pixels // 1_000_000} million"
+
+
+def _read(image: Image.Image, content: bytes, encoding: Encoding) -> RawPhotograph:
+    width, height = image.size
+    orientation, focal = _orientation(image), _focal_per_diagonal(image)
+    if image.mode in _WIDE_MODES or (image.format == "PNG" and content[24] == 16):
+        encoded, notes = _sixteen_bit(image, content), ()
+    else:
+        encoded, notes = _eight_bit_rgb(image, encoding)
+    turns, is_mirrored = _UPRIGHT.get(orientation, (0, False))
+    upright = np.rot90(encoded, turns)
+    upright = np.ascontiguousarray(upright[:, ::-1] if is_mirrored else upright)
+    sent = (height, width) if turns % 2 else (width, height)
+    kept = upright.shape[1], upright.shape[0]
+    if kept != sent:
+        reduced = f"The photo was reduced from {sent[0]} x {sent[1]} to {kept[0]} x {kept[1]} pixels."
+        notes = (reduced, *notes)
+    focal_px = None if focal is None else focal * float(np.hypot(*kept))
+    return RawPhotograph(upright, encoding, sent, focal_px, notes)
+
+
+def _eight_bit_rgb(image: Image.Image, encoding: Encoding) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[str, ...]]:
+    image.draft("RGB", (KEPT_SIDE, KEPT_SIDE))  # lets a JPEG be decoded small at once
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    plain = image if image.mode == mode else image.convert(mode)
+    plain.thumbnail((KEPT_SIDE, KEPT_SIDE), Image.Resampling.BOX)
+    notes: list[str] = []
+    if mode == "RGBA":
+        if np.asarray(plain.getchannel("A")).min() < 255:
+            notes.append("Transparent parts of the photo were taken for white.")
+        plain = Image.alpha_composite(Image.new("RGBA", plain.size, "white"), plain).convert("RGB")
+    profile = image.info.get("icc_profile")
+    if profile and encoding == "srgb" and image.mode in ("RGB", "RGBA"):
+        plain, note = _in_srgb(plain, profile)
+        notes += [note] if note else []
+    return np.asarray(plain), tuple(notes)
+
+
+def _in_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, str]:
+    """The colours that a profile stands for: phones write a wider gamut than sRGB."""
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = shown(ImageCms.getProfileDescription(source).strip())
+        if name.startswith("sRGB"):
+            return image, ""
+        converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
+        assert converted is not None
+        return converted, f"The photo's colours were converted from {name} to sRGB."
+    except Exception:  # profiles may be wrong in as many ways as other metadata
+        return image, "The photo's colour profile cannot be understood; its colours are taken for sRGB."
+
+
+def _sixteen_bit(image: Image.Image, content: bytes) -> UInt16[np.ndarray, "h w 3"]:
+    """All sixteen bits, of which Pillow keeps half unless the image is grey; transparent parts become white."""
+    image.load()  # finds out damage, which OpenCV passes over
+    if image.mode in _WIDE_MODES:
+        values = np.asarray(image).astype(np.uint16)
+    else:
+        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert decoded is not None
+        values = decoded
+    scale = KEPT_SIDE / max(values.shape[:2])
+    if scale < 1:
+        size = max(round(values.shape[1] * scale), 1), max(round(values.shape[0] * scale), 1)
+        values = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    if values.ndim == 2:
+        return np.repeat(values[..., None], 3, axis=2)
+    rgb = values[..., 2::-1]
+    if values.shape[2] == 4:
+        alpha = values[..., 3:] / 65535
+        rgb = np.round(rgb * alpha + 65535 * (1 - alpha)).astype(np.uint16)
+    return rgb
+
+
+def _eight_bit(encoded: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+    return encoded if encoded.dtype == np.uint8 else ((encoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _orientation(image: Image.Image) -> int:
+    """What EXIF says; 1 if its metadata cannot be understood (ImageOps gives up)."""
+    try:
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        return orientation if orientation in _UPRIGHT else 1
+    except Exception:  # there are too many kinds of mistakes in metadata to name them
+        return 1
+
+
+def _focal_per_diagonal(image: Image.Image) -> float | None:
+    """Focal length for each pixel of the diagonal, from EXIF; None if that does not tell, or nothing sane."""
+    width, height = image.size
+    diagonal = float(np.hypot(width, height))
+    try:
+        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        if equivalent := float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)):
+            focal = equivalent / _FILM_DIAGONAL_MM
+        else:
+            unit = _MM_PER_UNIT[int(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))]
+            px_per_mm = float(tags[ExifTags.Base.FocalPlaneXResolution]) / unit
+            focal = float(tags[ExifTags.Base.FocalLength]) * px_per_mm / diagonal
+    except Exception:  # as above
+        return None
+    low, high = _FOCAL_RANGE
+    return focal if low <= focal * diagonal / max(width, height) <= high else None

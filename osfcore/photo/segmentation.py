@@ -1,0 +1,202 @@
+"""Which pixels show an object, from a box around it, clicks and brush strokes: GrabCut (Rother et al. 2004)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from osfcore.errors import InvalidInput
+
+Box = tuple[float, float, float, float]
+MIN_BOX_SIDE = 8
+_WORKING_SIDE = 200  # of the box at most [px]: fine enough for an outline, and fast
+_MARGIN = 0.2  # of the box's sides: what lies so near around it is the sample of the background
+_CLICK_RADIUS = 0.06  # of the box's shorter side: what a click speaks for
+_NOISE_LEVELS, _NOISE_RADIUS = 20.0, 3.0  # differences and distances that smoothing evens out [levels of 255, px]
+_CORE = 0.8  # axes of the ellipse in the box, per side of the box, that one of the two searches begins from
+_ITERATIONS = 3
+_OUTLINE_SIGMA = 0.7  # over which the outline is smoothed [px of the reduced picture]
+_WHAT = "box of the object [px]"
+
+
+def propose_mask(
+    image: UInt8[np.ndarray, "h w 3"],
+    box: Box,
+    foreground: Float[np.ndarray, "k 2"],
+    background: Float[np.ndarray, "j 2"] | None = None,
+    add: Bool[np.ndarray, "h w"] | None = None,
+    remove: Bool[np.ndarray, "h w"] | None = None,
+) -> Bool[np.ndarray, "h w"]:
+    """The mask of an object that a person points at.
+
+    GrabCut runs twice, beginning from the whole box and from an ellipse in it; the result whose extent fits the box
+    better is taken. Of each those parts remain that hold a click or a stroke (without such, the largest), and holes
+    are filled unless they are marked. The same input always gives the same mask.
+
+    Args:
+        image: encoded RGB, as people see it.
+        box: x0, y0, x1, y1 around the object, loosely [px]; what lies outside is taken for background.
+        foreground: clicks on the object, (x, y) [px]; may be none.
+        background: clicks beside it.
+        add: strokes of a brush over the object, even outside the box.
+        remove: strokes over what is no part of it; they win over other marks.
+
+    Raises:
+        InvalidInput: if the box is beside the image or too small, a click on the object is outside the box, strokes
+            have another size than the image, or nothing is found.
+    """
+    shape = image.shape[:2]
+    box = _checked_box(box, *shape)
+    clicks = _checked_clicks(foreground, box), np.zeros((0, 2)) if background is None else background
+    strokes = _checked_stroke(add, shape), _checked_stroke(remove, shape)
+    window = _Window.around(box, *shape)
+    picture = cv2.bilateralFilter(window.reduced(image), -1, _NOISE_LEVELS, _NOISE_RADIUS)
+    corners = np.round(window.points(np.reshape(box, (2, 2)))).astype(int)
+    marks = _marks(window, corners, clicks, strokes)
+    found = [_tidied(_cut(picture, start), marks) for start in _starts(marks, corners)]
+    mask = window.enlarged(min(found, key=lambda mask: _misfit(mask, corners)), shape)
+    if not mask.any():
+        raise InvalidInput(_WHAT, _told(box), "around something that differs from what surrounds it")
+    return mask
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """A box with some margin, cut out of a picture and reduced."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    scale: float
+
+    @staticmethod
+    def around(box: Box, height: int, width: int) -> _Window:
+        x0, y0, x1, y1 = box
+        across, down = _MARGIN * (x1 - x0), _MARGIN * (y1 - y0)
+        right, bottom = min(width, int(np.ceil(x1 + across))), min(height, int(np.ceil(y1 + down)))
+        scale = min(1.0, _WORKING_SIDE / max(x1 - x0, y1 - y0))
+        return _Window(max(0, int(x0 - across)), max(0, int(y0 - down)), right, bottom, scale)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of what is cut out, reduced [px]."""
+        width, height = self.scale * (self.right - self.left), self.scale * (self.bottom - self.top)
+        return max(round(width), 1), max(round(height), 1)
+
+    def reduced(self, picture: np.ndarray) -> np.ndarray:
+        """What is cut out, averaged."""
+        part = picture[self.top : self.bottom, self.left : self.right]
+        return cv2.resize(part, self.size, interpolation=cv2.INTER_AREA)
+
+    def points(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
+        """Positions in the reduced picture."""
+        per_px = np.array(self.size) / (self.right - self.left, self.bottom - self.top)
+        return (points - (self.left, self.top)) * per_px
+
+    def enlarged(self, mask: Bool[np.ndarray, "a b"], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+        """A mask at its place in the whole picture, its outline smooth."""
+        soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
+        whole = np.zeros(shape, bool)
+        size = self.right - self.left, self.bottom - self.top
+        whole[self.top : self.bottom, self.left : self.right] = cv2.resize(soft, size) > 0.5
+        return whole
+
+
+def _checked_box(box: Box, height: int, width: int) -> Box:
+    x0, y0, x1, y1 = (float(side) for side in box)
+    inside = max(x0, 0.0), max(y0, 0.0), min(x1, float(width)), min(y1, float(height))
+    sides = inside[2] - inside[0], inside[3] - inside[1]
+    if not np.all(np.isfinite(box)) or not min(sides) > 0:
+        raise InvalidInput(
+            _WHAT, _told(box), f"within the picture's {width} x {height}, given as left, top, right, bottom"
+        )
+    if min(sides) < MIN_BOX_SIDE:
+        raise InvalidInput(_WHAT, _told(box), f"at least {MIN_BOX_SIDE} a side within the picture")
+    return inside
+
+
+def _checked_clicks(points: np.ndarray, box: Box) -> Float[np.ndarray, "k 2"]:
+    low, high = np.reshape(box, (2, 2))
+    inside = np.all((points >= low) & (points < high), axis=1)  # false for NaN
+    if not inside.all():
+        raise InvalidInput("click on the object [px]", points[~inside][0].tolist(), f"inside its box, {_told(box)}")
+    return points
+
+
+def _checked_stroke(stroke: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+    if stroke is not None and stroke.shape != shape:
+        raise InvalidInput("size of the brush strokes' picture [px]", stroke.shape, f"{shape}, as the photo's")
+    return np.zeros(shape, np.float32) if stroke is None else stroke.astype(np.float32)
+
+
+def _told(box: Box) -> str:
+    return ", ".join(f"{side:.0f}" for side in box)
+
+
+def _marks(
+    window: _Window, corners: np.ndarray, clicks: tuple[np.ndarray, np.ndarray], strokes: tuple[np.ndarray, np.ndarray]
+) -> UInt8[np.ndarray, "a b"]:
+    """What is known of each pixel: GC_FGD or GC_BGD; GC_PR_FGD where it is to be found out."""
+    width, height = window.size
+    marks = np.full((height, width), cv2.GC_BGD, np.uint8)
+    (x0, y0), (x1, y1) = corners
+    marks[y0:y1, x0:x1] = cv2.GC_PR_FGD
+    radius = max(round(_CLICK_RADIUS * min(x1 - x0, y1 - y0)), 1)
+    on_object = np.zeros_like(marks)
+    for point in window.points(clicks[0]):
+        cv2.circle(on_object, np.floor(point).astype(int).tolist(), radius, 1, -1)
+    for point in window.points(clicks[1]):
+        cv2.circle(marks, np.floor(point).astype(int).tolist(), radius, cv2.GC_BGD, -1)
+    marks[y0:y1, x0:x1][on_object[y0:y1, x0:x1] > 0] = cv2.GC_FGD
+    some = 0.3  # of a pixel's area is enough for a stroke that is thin
+    marks[window.reduced(strokes[0]) > some] = cv2.GC_FGD
+    marks[window.reduced(strokes[1]) > some] = cv2.GC_BGD
+    return marks
+
+
+def _starts(marks: UInt8[np.ndarray, "a b"], corners: np.ndarray) -> list[UInt8[np.ndarray, "a b"]]:
+    """Labels of GrabCut: all that is unknown is probably object; only an ellipse in the middle is."""
+    (x0, y0), (x1, y1) = corners
+    core = np.zeros_like(marks)
+    middle, axes = ((x0 + x1) / 2, (y0 + y1) / 2), (_CORE * (x1 - x0), _CORE * (y1 - y0))
+    cv2.ellipse(core, (middle, axes, 0.0), 1, -1)
+    outer = np.where((marks == cv2.GC_PR_FGD) & (core == 0), cv2.GC_PR_BGD, marks)
+    return [marks.copy(), outer.astype(np.uint8)]
+
+
+def _cut(picture: UInt8[np.ndarray, "a b 3"], labels: UInt8[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
+    is_object = labels % 2 == 1  # GC_FGD and GC_PR_FGD are odd
+    if is_object.all() or not is_object.any():  # GrabCut needs samples of both
+        return np.zeros(labels.shape, bool)
+    cv2.setRNGSeed(0)  # of this thread alone; GrabCut clusters colours from a random start
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    no_box = (0, 0, 0, 0)  # the labels say more
+    cv2.grabCut(picture, labels, no_box, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    return labels % 2 == 1
+
+
+def _tidied(found: Bool[np.ndarray, "a b"], marks: UInt8[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
+    """The parts that hold a mark, else the largest; holes that hold no mark of the background are filled."""
+    if not found.any():
+        return found
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=4)
+    marked = np.unique(parts[found & (marks == cv2.GC_FGD)])
+    largest = 1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])
+    kept = np.isin(parts, marked if marked.size else largest)
+    _, gaps = cv2.connectedComponents(np.pad(~kept, 1, constant_values=True).astype(np.uint8), connectivity=4)
+    background = np.pad(marks == cv2.GC_BGD, 1, constant_values=True)
+    holes = (gaps > 0) & ~np.isin(gaps, gaps[background])
+    return kept | holes[1:-1, 1:-1]
+
+
+def _misfit(mask: Bool[np.ndarray, "a b"], corners: np.ndarray) -> float:
+    """How far a mask's extent is from the box, summed over its four sides, each per side of the box."""
+    if not mask.any():
+        return np.inf
+    xs, ys = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    extent = np.array([[xs[0], ys[0]], [xs[-1] + 1, ys[-1] + 1]])
+    return float((np.abs(extent - corners) / (corners[1] - corners[0])).sum())

@@ -1,0 +1,340 @@
+import io
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import ExifTags, Image, ImageCms
+from pillow_heif import register_heif_opener
+
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.geometry.poses import Pose
+from osfcore.photo.camera_response import linear_of_srgb
+from osfcore.photo.read_photograph import (
+    KEPT_SIDE,
+    MIN_SIDE,
+    guessed_intrinsics,
+    intrinsics_from_focal,
+    read_photograph,
+    to_photograph,
+)
+
+register_heif_opener()
+DIAGONAL_MM = 43.27  # of film, to which equivalent focal lengths refer
+
+
+def blocks(width=96, height=64, dtype=np.uint8, seed=0):
+    """Blocks of colours, so that JPEG keeps them."""
+    most = np.iinfo(dtype).max
+    small = np.random.default_rng(seed).integers(0, most, (-(-height // 16), -(-width // 16), 3), dtype, endpoint=True)
+    return small.repeat(16, axis=0).repeat(16, axis=1)[:height, :width]
+
+
+def encoded(image, kind="PNG", **options):
+    data = io.BytesIO()
+    image.save(data, kind, **options)
+    return data.getvalue()
+
+
+def exif(orientation=None, **camera):
+    data = Image.Exif()
+    if orientation:
+        data[ExifTags.Base.Orientation] = orientation
+    for name, value in camera.items():
+        data.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base[name]] = value
+    return data.tobytes()
+
+
+def sixteen_bit_png(values):
+    """OpenCV writes the sixteen bits that Pillow does not."""
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[values.shape[2]]
+    return cv2.imencode(".png", values[..., order])[1].tobytes()
+
+
+def png_head(width, height):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"0")) + chunk(b"IEND", b"")
+
+
+# Pixels
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "1"])
+def test_every_kind_of_png_is_understood(mode):
+    image = Image.fromarray(blocks()).convert(mode)
+    seen = read_photograph(encoded(image))
+    np.testing.assert_array_equal(seen.encoded, np.asarray(image.convert("RGB")))
+    assert seen.notes == ()
+
+
+@given(height=st.integers(MIN_SIDE, 80), width=st.integers(MIN_SIDE, 80), channels=st.sampled_from([1, 3]))
+def test_sixteen_bits_stay_sixteen_bits(height, width, channels):
+    values = np.random.default_rng(height).integers(0, 65536, (height, width, channels), np.uint16)
+    seen = read_photograph(sixteen_bit_png(values)).encoded
+    np.testing.assert_array_equal(seen, np.broadcast_to(values, (height, width, 3)))
+
+
+def test_sixteen_bits_keep_dark_tones_apart_that_eight_cannot():
+    values = np.full((64, 64, 3), 1000, np.uint16) + np.arange(64, dtype=np.uint16)[:, None]
+    raw = read_photograph(sixteen_bit_png(values))
+    seen = to_photograph(raw, intrinsics_from_focal(64, 64, 64.0))
+    np.testing.assert_allclose(seen.image, linear_of_srgb(values / 65535), rtol=1e-6)
+    assert len(np.unique(seen.image)) == 64
+    assert len(np.unique(raw.eight_bit)) == 1
+
+
+def test_transparent_parts_are_white_and_it_is_said():
+    image = Image.fromarray(blocks()).convert("RGBA")
+    alpha = np.full((64, 96), 255, np.uint8)
+    alpha[:, :32], alpha[:, 32:64] = 0, 128
+    image.putalpha(Image.fromarray(alpha))
+    seen = read_photograph(encoded(image))
+    assert seen.notes == ("Transparent parts of the photo were taken for white.",)
+    share = alpha[..., None] / 255
+    np.testing.assert_allclose(seen.encoded, share * blocks() + 255 * (1 - share), atol=1)
+
+
+def test_sixteen_bits_may_be_transparent_too():
+    values = np.dstack([blocks(dtype=np.uint16), np.full((64, 96), 32768, np.uint16)])
+    seen = read_photograph(sixteen_bit_png(values)).encoded
+    assert seen.dtype == np.uint16
+    np.testing.assert_allclose(seen, (values[..., :3].astype(float) + 65535) / 2, atol=2)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "HEIF", "WEBP", "AVIF", "TIFF", "BMP"])
+def test_every_usual_format_is_understood(kind):
+    seen = read_photograph(encoded(Image.fromarray(blocks()), kind, quality=95)).encoded
+    assert seen.dtype == np.uint8
+    assert np.abs(seen.astype(int) - blocks()).mean() < 8
+
+
+def turned_by(orientation, picture):
+    """A picture as its camera would store it, were it held as EXIF's orientation says (by EXIF's own definition)."""
+    return {
+        1: picture,
+        2: picture[:, ::-1],
+        3: picture[::-1, ::-1],
+        4: picture[::-1],
+        5: picture.swapaxes(0, 1),
+        6: np.rot90(picture),
+        7: picture[::-1, ::-1].swapaxes(0, 1),
+        8: np.rot90(picture, -1),
+    }[orientation]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_stand_upright(orientation):
+    stored = np.ascontiguousarray(turned_by(orientation, blocks()))
+    seen = read_photograph(encoded(Image.fromarray(stored), exif=exif(orientation)))
+    np.testing.assert_array_equal(seen.encoded, blocks())
+    assert seen.sent_size == (96, 64)
+
+
+def test_sixteen_bits_stand_upright_too():
+    stored = np.rot90(blocks(dtype=np.uint16)[..., 0])
+    seen = read_photograph(encoded(Image.fromarray(np.ascontiguousarray(stored)), exif=exif(6)))
+    np.testing.assert_array_equal(seen.encoded[..., 0], blocks(dtype=np.uint16)[..., 0])
+
+
+@pytest.mark.parametrize("turned", [1, 6])
+def test_heic_of_a_phone_stands_upright(turned):
+    stored = Image.fromarray(np.ascontiguousarray(turned_by(turned, blocks())))
+    seen = read_photograph(encoded(stored, "HEIF", quality=95, exif=exif(turned, FocalLengthIn35mmFilm=26)))
+    assert seen.sent_size == (96, 64)
+    assert np.abs(seen.encoded.astype(int) - blocks()).mean() < 8
+    assert seen.focal_px == pytest.approx(26 / DIAGONAL_MM * np.hypot(96, 64))
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_large_photos_are_reduced_and_it_is_said(kind):
+    image = Image.new("RGB", (5000, 400), (200, 100, 50))
+    seen = read_photograph(encoded(image, kind, exif=exif(FocalLengthIn35mmFilm=26)))
+    height, width = seen.encoded.shape[:2]
+    assert (width, height) == (KEPT_SIDE, 164)
+    assert seen.notes == ("The photo was reduced from 5000 x 400 to 2048 x 164 pixels.",)
+    assert np.abs(seen.encoded.mean((0, 1)) - [200, 100, 50]).max() < 4
+    assert seen.focal_px == pytest.approx(26 / DIAGONAL_MM * np.hypot(width, height))
+
+
+def test_large_photos_of_sixteen_bits_are_averaged():
+    values = np.random.default_rng(0).integers(0, 65536, (32, 2 * KEPT_SIDE, 3), np.uint16)
+    seen = read_photograph(sixteen_bit_png(values)).encoded
+    assert seen.shape == (16, KEPT_SIDE, 3)
+    np.testing.assert_allclose(seen, values.reshape(16, 2, KEPT_SIDE, 2, 3).mean((1, 3)), atol=0.51)
+
+
+# Colours
+
+
+def srgb_profile():
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def exchanged_profile():
+    """Like sRGB, but with the primaries red and blue exchanged."""
+    odd = srgb_profile().replace(b"rXYZ", b"????").replace(b"bXYZ", b"rXYZ").replace(b"????", b"bXYZ")
+    return odd.replace("sRGB".encode("utf-16-be"), "xBGR".encode("utf-16-be"))
+
+
+def test_colours_of_another_profile_are_converted():
+    seen = read_photograph(encoded(Image.fromarray(blocks()), icc_profile=exchanged_profile()))
+    np.testing.assert_allclose(seen.encoded, blocks()[..., ::-1].astype(int), atol=2)
+    assert seen.notes == ("The photo's colours were converted from xBGR built-in to sRGB.",)
+
+
+@pytest.mark.parametrize(("profile", "encoding"), [(srgb_profile(), "srgb"), (exchanged_profile(), "linear")])
+def test_colours_stay_if_the_profile_is_srgb_or_the_file_is_linear(profile, encoding):
+    seen = read_photograph(encoded(Image.fromarray(blocks()), icc_profile=profile), encoding=encoding)
+    np.testing.assert_array_equal(seen.encoded, blocks())
+    assert seen.notes == ()
+
+
+@pytest.mark.parametrize("profile", [b"profile" * 40, b"\0"])
+def test_a_profile_that_makes_no_sense_changes_nothing(profile):
+    seen = read_photograph(encoded(Image.fromarray(blocks()), icc_profile=profile))
+    np.testing.assert_array_equal(seen.encoded, blocks())
+    assert seen.notes == ("The photo's colour profile cannot be understood; its colours are taken for sRGB.",)
+
+
+# Focal length
+
+
+@given(f35=st.integers(13, 300), width=st.integers(MIN_SIDE, 120), height=st.integers(MIN_SIDE, 120))
+def test_the_equivalent_focal_length_refers_to_the_diagonal(f35, width, height):
+    seen = read_photograph(encoded(Image.new("RGB", (width, height)), exif=exif(FocalLengthIn35mmFilm=f35)))
+    diagonal_deg = 2 * np.rad2deg(np.arctan(DIAGONAL_MM / 2 / f35))
+    assert 2 * np.rad2deg(np.arctan(np.hypot(width, height) / 2 / seen.focal_px)) == pytest.approx(diagonal_deg)
+
+
+@pytest.mark.parametrize(("unit", "px_per_unit"), [(2, 25.4 * 20), (3, 10 * 20), (None, 25.4 * 20)])
+def test_a_sensor_of_known_resolution_tells_the_focal_length(unit, px_per_unit):
+    camera = {"FocalLength": 4.5, "FocalPlaneXResolution": px_per_unit, "FocalPlaneYResolution": px_per_unit}
+    if unit:
+        camera["FocalPlaneResolutionUnit"] = unit
+    seen = read_photograph(encoded(Image.fromarray(blocks()), "JPEG", exif=exif(**camera)))
+    assert seen.focal_px == pytest.approx(4.5 * 20, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {},
+        {"FocalLength": 4.5},
+        {"FocalLengthIn35mmFilm": 0},
+        {"FocalLengthIn35mmFilm": 60_000},
+        {"FocalLength": 4.5, "FocalPlaneXResolution": 0.0},
+        {"FocalLength": 4.5, "FocalPlaneXResolution": 100.0, "FocalPlaneResolutionUnit": 77},
+    ],
+)
+def test_what_exif_does_not_tell_is_not_known(camera):
+    seen = read_photograph(encoded(Image.fromarray(blocks()), "JPEG", exif=exif(**camera)))
+    assert seen.focal_px is None
+    K, note = guessed_intrinsics(seen)
+    assert "does not tell its focal length; that of a phone's main camera is assumed (75 degrees" in note
+    assert 2 * np.rad2deg(np.arctan(np.hypot(96, 64) / 2 / K[0, 0])) == pytest.approx(75)
+
+
+def test_what_exif_tells_is_taken():
+    seen = read_photograph(encoded(Image.fromarray(blocks()), exif=exif(FocalLengthIn35mmFilm=26)))
+    K, note = guessed_intrinsics(seen)
+    np.testing.assert_allclose(K, intrinsics_from_focal(96, 64, seen.focal_px))
+    assert note == "The focal length, 69 pixels, is what the camera wrote into the photo."
+
+
+def test_a_camera_looks_through_the_middle_of_its_image():
+    K = intrinsics_from_focal(640, 480, 600.0)
+    np.testing.assert_array_equal(K @ [0, 0, 1], [320, 240, 1])
+    for focal in (0.0, -600.0, np.nan, 1e9):
+        with pytest.raises(InvalidInput, match=r"focal length \[px\]"):
+            intrinsics_from_focal(640, 480, focal)
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "it is no picture that can be read here; send a JPEG, PNG"),
+        (b"Dear reader, this is a letter.", "it is no picture that can be read here; send a JPEG, PNG"),
+        (b"%PDF-1.7 ...", "no picture"),
+        (png_head(20_000, 12_000), "it has 20000 x 12000 pixels; 200 million are allowed"),
+        (png_head(100_000, 100_000), "it has far too many pixels; 200 million are allowed"),
+        (png_head(16, 400), "it has 16 x 400 pixels; at least 32 a side are needed"),
+        (png_head(64, 64), "it is damaged or incomplete, and cannot be decoded; send it anew"),
+    ],
+)
+def test_what_is_no_photo_is_told_so(data, words, tmp_path):
+    with pytest.raises(CorruptFile, match=f"^The photo cannot be used: .*{words}"):
+        read_photograph(data)
+    path = tmp_path / "desk.png"
+    path.write_bytes(data)
+    with pytest.raises(CorruptFile, match=f"desk.png cannot be used: .*{words}"):
+        read_photograph(path)
+
+
+def test_a_file_that_is_not_there_is_told_so(tmp_path):
+    with pytest.raises(CorruptFile, match=r"desk\.jpg cannot be used: No such file"):
+        read_photograph(tmp_path / "desk.jpg")
+
+
+@pytest.mark.parametrize(
+    "whole",
+    [
+        encoded(Image.fromarray(blocks())),
+        encoded(Image.fromarray(blocks()), "JPEG"),
+        encoded(Image.fromarray(blocks()), "HEIF"),
+        sixteen_bit_png(blocks(dtype=np.uint16)),
+    ],
+    ids=["PNG", "JPEG", "HEIF", "16 bit"],
+)
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_photo_that_was_cut_off_is_refused(whole, share):
+    with pytest.raises(CorruptFile, match="cannot be used: it is"):
+        read_photograph(whole[: int(share * len(whole))])
+
+
+def test_a_limit_of_other_code_on_pictures_is_left_as_it_was():
+    before = Image.MAX_IMAGE_PIXELS
+    read_photograph(encoded(Image.fromarray(blocks())))
+    after = Image.MAX_IMAGE_PIXELS
+    assert after == before
+
+
+# Radiance
+
+
+def test_photographs_are_linear_and_know_where_they_are_exposed_well():
+    values = np.full((64, 64, 3), 128, np.uint8)
+    values[0, 0], values[0, 1], values[0, 2], values[0, 3] = (250, 9, 9), (251, 9, 9), (1, 1, 1), (1, 2, 0)
+    raw = read_photograph(encoded(Image.fromarray(values)))
+    seen = to_photograph(raw, intrinsics_from_focal(64, 64, 70.0))
+    np.testing.assert_allclose(seen.image, linear_of_srgb(values / 255), atol=1e-6)
+    assert seen.well_exposed[0, :5].tolist() == [True, False, False, True, True]
+    assert seen.well_exposed.sum() == 64 * 64 - 2
+    assert not seen.on_table
+    np.testing.assert_array_equal(seen.T_world_camera.matrix(), np.eye(4))
+
+
+def test_eight_and_sixteen_bits_agree():
+    eight = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
+    K = intrinsics_from_focal(40, 40, 40.0)
+    one = to_photograph(read_photograph(encoded(Image.fromarray(eight))), K)
+    other = to_photograph(read_photograph(sixteen_bit_png(eight.astype(np.uint16) * 257)), K)
+    np.testing.assert_allclose(other.image, one.image, atol=1e-6)
+    np.testing.assert_array_equal(other.well_exposed, one.well_exposed)
+
+
+def test_linear_files_stay_as_they_are():
+    raw = read_photograph(encoded(Image.fromarray(blocks())), encoding="linear")
+    pose = Pose(np.array([0, 0, 0.8]), np.array([0, 1.0, 0, 0]))
+    seen = to_photograph(raw, intrinsics_from_focal(96, 64, 90.0), pose, {"mug": np.ones((64, 96), bool)})
+    np.testing.assert_allclose(seen.image, blocks() / 255, atol=1e-6)
+    assert seen.on_table
+    assert list(seen.masks) == ["mug"]

@@ -1,0 +1,210 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from osfcore.errors import InvalidInput
+from osfcore.photo.segmentation import propose_mask
+
+WIDTH, HEIGHT = 200, 160
+NO_CLICK = np.empty((0, 2))
+
+
+def textured(rng, colour, contrast=25.0):
+    """A surface with soft blotches, as wood or print has."""
+    noise = cv2.GaussianBlur(rng.standard_normal((HEIGHT, WIDTH, 3)), (0, 0), 3)
+    return np.asarray(colour, float) + contrast * noise / noise.std()
+
+
+def drawn(table, *layers, rng, noise=6.0):
+    """Surfaces within masks over a table, with the noise of a sensor."""
+    picture = table.copy()
+    for surface, mask in layers:
+        picture[mask] = surface[mask]
+    return np.clip(picture + noise * rng.standard_normal(picture.shape), 0, 255).astype(np.uint8)
+
+
+def turned_box(centre, sides, angle_deg):
+    corners = cv2.boxPoints((centre, sides, angle_deg)).round().astype(np.int32)
+    return cv2.fillConvexPoly(np.zeros((HEIGHT, WIDTH), np.uint8), corners, 1) > 0
+
+
+def disc(centre, radius):
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return np.hypot(x - centre[0], y - centre[1]) < radius
+
+
+def box_around(mask, grown=0.05):
+    ys, xs = np.nonzero(mask)
+    across, down = grown * np.ptp(xs), grown * np.ptp(ys)
+    return xs.min() - across, ys.min() - down, xs.max() + 1 + across, ys.max() + 1 + down
+
+
+def overlap(a, b):
+    return (a & b).sum() / (a | b).sum()
+
+
+def random_scene(seed):
+    """A box or a ball on a table whose colour is 80 levels away; each varies by 30 levels, the sensor by 15."""
+    rng = np.random.default_rng(seed)
+    table, away = rng.uniform(60, 195, 3), rng.standard_normal(3)
+    colour = table + 80 * away / np.linalg.norm(away)
+    centre = (rng.uniform(80, 120), rng.uniform(65, 95))
+    sides = (rng.uniform(50, 90), rng.uniform(40, 80))
+    shape = turned_box(centre, sides, rng.uniform(0, 90)) if rng.random() < 0.6 else disc(centre, rng.uniform(25, 50))
+    layers = (textured(rng, colour, 30.0), shape)
+    return drawn(textured(rng, table, 30.0), layers, rng=rng, noise=15.0), shape, centre
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), grown=st.floats(0.02, 0.1))
+def test_an_object_on_a_table_is_found(seed, grown):
+    image, shape, centre = random_scene(seed)
+    found = propose_mask(image, box_around(shape, grown), np.array([centre]))
+    assert overlap(found, shape) > 0.9
+
+
+def test_a_large_photo_is_no_different():
+    """It is looked at with fewer pixels; the outline is as good as these, and smooth."""
+    image, shape, centre = random_scene(1)
+    large, true = (np.kron(a, np.ones((6, 6, 1)[: a.ndim], a.dtype)) for a in (image, shape))
+    found = propose_mask(large, box_around(true), 6 * np.array([centre]))
+    assert overlap(found, true) > 0.95
+    contours, _ = cv2.findContours(found.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    assert len(contours) == 1
+    assert cv2.arcLength(contours[0], True) < 1.15 * cv2.arcLength(cv2.convexHull(contours[0]), True)
+
+
+def test_the_same_input_gives_the_same_mask_whatever_happened_before():
+    image, shape, centre = random_scene(2)
+    masks = []
+    for seed in (1, 2):
+        cv2.setRNGSeed(seed)
+        masks.append(propose_mask(image, box_around(shape), np.array([centre])))
+    np.testing.assert_array_equal(*masks)
+
+
+def two_discs():
+    rng = np.random.default_rng(3)
+    left, right = disc((65, 80), 26), disc((135, 80), 26)
+    surface = textured(rng, (190, 60, 50))
+    image = drawn(textured(rng, (120, 130, 120)), (surface, left), (surface, right), rng=rng)
+    return image, left, right
+
+
+def test_the_click_says_which_of_two_objects_is_meant():
+    image, left, right = two_discs()
+    box = box_around(left | right)
+    for meant, click in ((left, (65.0, 80.0)), (right, (135.0, 80.0))):
+        assert overlap(propose_mask(image, box, np.array([click])), meant) > 0.9
+
+
+def test_all_that_is_clicked_at_belongs_to_the_object():
+    image, left, right = two_discs()
+    found = propose_mask(image, box_around(left | right), np.array([[65.0, 80.0], [135.0, 80.0]]))
+    assert overlap(found, left | right) > 0.9
+
+
+def test_without_a_click_the_largest_part_is_taken():
+    image, shape, _ = random_scene(4)
+    assert overlap(propose_mask(image, box_around(shape), NO_CLICK), shape) > 0.9
+
+
+def overlapping():
+    """A ball partly behind another one of the same colour."""
+    rng = np.random.default_rng(5)
+    front, behind = disc((130, 85), 30), disc((85, 80), 40)
+    surface = textured(rng, (60, 90, 190), 10.0)
+    image = drawn(textured(rng, (170, 150, 120), 10.0), (surface, behind | front), rng=rng)
+    return image, behind & ~front, front
+
+
+def test_strokes_mend_what_colours_cannot_tell():
+    image, shape, front = overlapping()
+    box = box_around(shape | front)
+    click = np.array([[70.0, 80.0]])
+    before = overlap(propose_mask(image, box, click), shape)
+    stroke = disc((131, 85), 26)
+    after = overlap(propose_mask(image, box, click, remove=stroke), shape)
+    assert before < 0.75
+    assert after > 0.9
+
+
+def test_a_click_beside_the_object_and_strokes_over_it_count():
+    image, shape, centre = random_scene(6)
+    box = box_around(shape)
+    wrong = propose_mask(image, box, NO_CLICK, background=np.array([centre]))
+    assert not wrong[int(centre[1]), int(centre[0])]
+    beside = disc((box[0] + 4, box[1] + 4), 4)
+    added = propose_mask(image, box, np.array([centre]), add=beside)
+    assert (added & beside).sum() > 0.7 * beside.sum()
+    assert overlap(added & ~beside, shape & ~beside) > 0.85
+
+
+def test_a_stroke_may_lead_out_of_the_box():
+    image, shape, centre = random_scene(7)
+    x0, y0, x1, y1 = box_around(shape, 0.0)
+    tight = x0 + 6, y0, x1, y1
+    stroke = shape & (np.arange(WIDTH) < x0 + 6)
+    found = propose_mask(image, tight, np.array([centre]), add=stroke)
+    assert (found & stroke).sum() > 0.7 * stroke.sum()
+
+
+def test_holes_are_filled_unless_they_are_marked():
+    rng = np.random.default_rng(8)
+    ring, hole = disc((100, 80), 50), disc((100, 80), 20)
+    image = drawn(textured(rng, (200, 200, 190), 10.0), (textured(rng, (150, 40, 40), 10.0), ring & ~hole), rng=rng)
+    click = np.array([[65.0, 80.0]])
+    assert overlap(propose_mask(image, box_around(ring), click), ring) > 0.95
+    marked = propose_mask(image, box_around(ring), click, background=np.array([[100.0, 80.0]]))
+    assert overlap(marked, ring & ~hole) > 0.95
+
+
+def test_an_object_may_fill_the_picture_or_lead_out_of_it():
+    image, shape, _ = random_scene(9)
+    ys, xs = np.nonzero(shape)
+    cut = slice(ys.min() + 10, None), slice(xs.min() + 10, None)
+    part, true = np.ascontiguousarray(image[cut]), shape[cut]
+    click = np.argwhere(true).mean(axis=0)[::-1][None] + 0.5
+    x1, y1 = box_around(true)[2:]
+    assert overlap(propose_mask(part, (-20, -20, x1, y1), click), true) > 0.9
+    inside = np.ascontiguousarray(image[ys.min() : ys.max(), xs.min() : xs.max()])
+    whole = propose_mask(inside, (0, 0, inside.shape[1], inside.shape[0]), click)
+    assert whole.any()
+
+
+@pytest.mark.parametrize(
+    ("box", "click", "words"),
+    [
+        ((300, 20, 400, 90), (350, 50), r"box of the object \[px\] is 300, 20, 400, 90, but .* picture's 200 x 160"),
+        ((90, 20, 40, 90), (60, 50), "given as left, top, right, bottom"),
+        ((np.nan, 20, 40, 90), (30, 50), "given as left, top, right, bottom"),
+        ((20, 20, 27, 90), (23, 50), "at least 8 a side within the picture"),
+        ((195, 20, 300, 90), (197, 50), "at least 8 a side within the picture"),
+        (
+            (40, 20, 90, 90),
+            (95, 50),
+            r"click on the object \[px\] is \[95.0, 50.0\], but it must be inside its box, 40",
+        ),
+        ((40, 20, 90, 90), (np.nan, 50), "must be inside its box"),
+    ],
+)
+def test_boxes_and_clicks_that_make_no_sense_are_refused(box, click, words):
+    image, _, _ = random_scene(0)
+    with pytest.raises(InvalidInput, match=words):
+        propose_mask(image, box, np.array([click], float))
+
+
+@pytest.mark.wrong_arrays
+def test_strokes_of_another_size_are_refused():
+    image, _, _ = random_scene(0)
+    with pytest.raises(InvalidInput, match=r"brush strokes' picture .* is \(5, 5\), .* \(160, 200\), as the photo's"):
+        propose_mask(image, (40, 20, 90, 90), NO_CLICK, add=np.ones((5, 5), bool))
+
+
+def test_where_there_is_nothing_it_is_said():
+    image, _, _ = random_scene(0)
+    everything = np.ones((HEIGHT, WIDTH), bool)
+    with pytest.raises(InvalidInput, match="must be around something that differs from what surrounds it"):
+        propose_mask(image, (40, 20, 90, 90), NO_CLICK, remove=everything)
