@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.photo.camera_response import encoded_from_linear
+from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels
 from osfcore.photo.poses.object_window import object_windows
@@ -33,13 +33,13 @@ def sheet(models: PhotoModels, photo: Photograph, found: PhotoObject) -> UInt8[n
     surfels, pose = models.surfels(found.name, FINE_ACROSS), found.best.pose
     index = draw(surfels, window, Pose(pose.position[None], pose.quaternion[None]))[0][0]
     shown = index >= 0
-    picture = to_uint8(encoded_from_linear(window.image))
+    picture = to_uint8(srgb_of_linear(window.image))
     outlined = picture.copy()
     for mask, colour in ((window.mask, _MASK_COLOUR), (shown, _FOUND_COLOUR)):
         contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(outlined, contours, -1, colour, 1)
     albedo = np.where(shown[..., None], surfels.albedo[np.maximum(index, 0)], 0)
-    return np.hstack([picture, outlined, to_uint8(encoded_from_linear(albedo))])
+    return np.hstack([picture, outlined, to_uint8(srgb_of_linear(albedo))])
 
 
 def write_sheet(path: Path, models: PhotoModels, photo: Photograph, found: PhotoObject) -> None:

@@ -9,7 +9,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.io.image_file import to_uint8
-from osfcore.photo.camera_response import encoded_from_linear, linear_from_encoded
+from osfcore.photo.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.photo.photograph import Photograph
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
@@ -44,9 +44,9 @@ def take(fields, name=NAME, turn=(2.2, 0.5, -0.3), light=(0.5, -0.7, -0.6), gain
     mask = drawn.masks[0, 0, 0]
     background = np.random.default_rng(0).uniform(0.1, 0.3, (260, 300, 3))
     radiance = np.where(mask[..., None], drawn.rgb[0, 0], background) * np.array(gain)
-    encoded = to_uint8(encoded_from_linear(radiance))
+    encoded = to_uint8(srgb_of_linear(radiance))
     image = linear_from_encoded(encoded / 255.0)
-    photo = Photograph(image, np.all(encoded < 251, axis=-1), INTRINSICS, masks={name: mask})
+    photo = Photograph(image, np.all(encoded < 251, axis=-1), INTRINSICS, Pose.identity(), False, {name: mask})
     return Taken(photo, encoded, pose, light, drawn.depth[0, 0])
 
 

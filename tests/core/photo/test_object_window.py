@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
+from osfcore.geometry.poses import Pose
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses.object_window import object_windows, signed_distance
 
@@ -10,7 +11,7 @@ K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
 
 def photo(**masks):
     image = np.random.default_rng(0).uniform(size=(96, 128, 3)).astype(np.float32)
-    return Photograph(image, np.ones((96, 128), bool), K, masks=masks)
+    return Photograph(image, np.ones((96, 128), bool), K, Pose.identity(), False, masks)
 
 
 def rectangle(top, bottom, left, right):
