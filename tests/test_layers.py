@@ -27,6 +27,7 @@ ROOMS = (
     "osfcore.fields",
     "osfcore.render",
     "osfcore.estimation",
+    "osfcore.photo",
     "osfcore.dynamics",
     "osfcore.planning",
     "osfcore.control",

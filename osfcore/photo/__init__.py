@@ -1,0 +1,1 @@
+"""Real photographs: camera response, board, masks, appearance under an unknown lamp, poses."""
