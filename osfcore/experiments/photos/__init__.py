@@ -1,0 +1,1 @@
+"""How exactly real photographs are understood, measured on synthetic ones whose truth is known."""
