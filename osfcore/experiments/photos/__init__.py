@@ -1,1 +1,1 @@
-"""Evaluation on real photographs."""
+"""Evaluation of photographs, real ones and synthetic views of the calibration board."""

@@ -1,0 +1,231 @@
+import cv2
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.experiments.photos.board_views import (
+    board_errors,
+    board_photograph,
+    photograph,
+    random_camera,
+    tag_errors,
+    tag_print,
+)
+from osfcore.geometry.poses import rotation_angle
+from osfcore.photo.board import Board, locate_board, locate_tag
+
+VGA = (640, 480)
+BOARD = Board()
+
+
+@pytest.fixture(scope="module")
+def slanted():
+    """A photograph from 0.6 m at 45 degrees."""
+    rng = np.random.default_rng(7)
+    return board_photograph(rng, VGA, BOARD, random_camera(rng, VGA, (0.6, 0.6), (45, 45)))
+
+
+@pytest.fixture(scope="module")
+def tag():
+    """A photograph of a tag of 10 cm, from 0.6 m at 45 degrees."""
+    rng = np.random.default_rng(8)
+    return photograph(*tag_print(0.1), random_camera(rng, VGA, (0.6, 0.6), (45, 45)), VGA, rng)
+
+
+def covered(view, *rectangles):
+    """The photograph with grey rectangles on the table over it, each from one corner to the opposite one [m]."""
+    image = view.image.copy()
+    for low, high in rectangles:
+        corners = np.array([[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]])
+        pixels = view.T_world_camera.inverse().apply(corners) @ view.intrinsics.T
+        cv2.fillConvexPoly(image, np.round(pixels[:, :2] / pixels[:, 2:]).astype(np.int32), (120, 110, 100))
+    return image
+
+
+def assert_near(found, true, angle_deg=0.2, distance_m=0.002):
+    assert np.rad2deg(rotation_angle(found.T_world_camera.quaternion, true.T_world_camera.quaternion)) < angle_deg
+    assert np.linalg.norm(found.T_world_camera.position - true.T_world_camera.position) < distance_m
+
+
+def test_camera_is_found_in_random_views():
+    errors = board_errors(6, np.random.default_rng(0), VGA)
+    assert errors.refusals == ("",) * 6
+    assert np.rad2deg(errors.rotation_rad).max() < 0.2
+    assert errors.nearby_m.max() < 0.001
+    assert errors.camera_m.max() < 0.002
+    assert errors.rms_px.max() < 0.1
+    assert np.all(errors.corners == len(BOARD.corners_m()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "count"), [(VGA, 200), ((1280, 960), 60)])
+def test_95_of_100_cameras_are_found_within_a_tenth_of_a_degree_and_a_millimetre(size, count):
+    errors = board_errors(count, np.random.default_rng(1), size)
+    found = np.isfinite(errors.rotation_rad)
+    assert found.mean() > 0.98
+    for values, bound in ((np.rad2deg(errors.rotation_rad), 0.1), (errors.nearby_m, 0.0005), (errors.camera_m, 0.001)):
+        assert np.percentile(values[found], 95) < bound
+
+
+@pytest.mark.slow
+def test_a_tag_of_8_cm_gives_the_camera_too():
+    errors = tag_errors(100, np.random.default_rng(1), VGA)
+    found = np.isfinite(errors.rotation_rad)
+    assert found.mean() > 0.95
+    assert np.percentile(np.rad2deg(errors.rotation_rad[found]), 95) < 0.3
+    assert np.percentile(errors.nearby_m[found], 95) < 0.002
+
+
+def test_view_tells_points_and_camera(slanted):
+    view = locate_board(slanted.image, BOARD, slanted.intrinsics)
+    assert_near(view, slanted)
+    assert view.corner_count == 15
+    assert not view.is_focal_estimated
+    assert view.focal_std_px == 0
+    np.testing.assert_array_equal(view.intrinsics, slanted.intrinsics)
+    points = np.pad(view.points_m, ((0, 0), (0, 1)))
+    pixels = slanted.T_world_camera.inverse().apply(points) @ slanted.intrinsics.T
+    assert np.abs(pixels[:, :2] / pixels[:, 2:] - view.points_px).max() < 0.2
+
+
+def test_grey_photographs_and_parts_of_them_give_the_same_camera(slanted):
+    part = cv2.cvtColor(slanted.image, cv2.COLOR_RGB2GRAY)[11:-3, 7:-20]
+    intrinsics = slanted.intrinsics - np.array([[0, 0, 7], [0, 0, 11], [0, 0, 0]])
+    assert_near(locate_board(part, BOARD, intrinsics), slanted)
+
+
+def test_large_photographs_give_the_same_camera(slanted):
+    large = cv2.resize(slanted.image, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
+    view = locate_board(large, BOARD, np.diag([6, 6, 1]) @ slanted.intrinsics)
+    assert_near(view, slanted)
+    small = locate_board(slanted.image, BOARD, slanted.intrinsics)
+    np.testing.assert_allclose(view.points_px / 6, small.points_px, atol=0.2)
+
+
+def test_a_board_that_is_small_in_a_large_photograph_is_found(slanted):
+    large = np.full((3000, 4000, 3), 110, np.uint8)
+    large[1000:1480, 2000:2640] = slanted.image
+    intrinsics = slanted.intrinsics + np.array([[0, 0, 2000], [0, 0, 1000], [0, 0, 0]])
+    assert_near(locate_board(large, BOARD, intrinsics), slanted)
+
+
+def test_another_board_is_found_when_it_is_told():
+    rng, board = np.random.default_rng(3), Board(7, 5, 0.036, 0.027, "DICT_5X5_50")
+    view = board_photograph(rng, VGA, board, random_camera(rng, VGA, (0.5, 0.5), (50, 50)))
+    assert_near(locate_board(view.image, board, view.intrinsics), view)
+    with pytest.raises(InvalidInput, match="board in the photograph"):
+        locate_board(view.image, BOARD, view.intrinsics)
+
+
+def test_a_board_of_another_layout_is_refused():
+    rng = np.random.default_rng(3)
+    view = board_photograph(rng, VGA, Board(7, 5, 0.036, 0.027), random_camera(rng, VGA, (0.5, 0.5), (50, 50)))
+    with pytest.raises(InvalidInput, match="another one"):
+        locate_board(view.image, BOARD, view.intrinsics)
+
+
+def test_unknown_focal_length_is_estimated(slanted):
+    view = locate_board(slanted.image, BOARD)
+    true = slanted.intrinsics[0, 0]
+    assert view.is_focal_estimated
+    assert 0 < view.focal_std_px < 0.02 * true
+    assert abs(view.intrinsics[0, 0] - true) < 3 * view.focal_std_px
+    assert_near(view, slanted, angle_deg=0.5, distance_m=0.01)
+
+
+def test_a_view_from_straight_above_needs_the_focal_length():
+    rng = np.random.default_rng(4)
+    view = board_photograph(rng, VGA, BOARD, random_camera(rng, VGA, (0.6, 0.6), (88, 88)))
+    assert_near(locate_board(view.image, BOARD, view.intrinsics), view)
+    with pytest.raises(InvalidInput, match="focal length is unknown"):
+        locate_board(view.image, BOARD)
+
+
+def test_things_on_the_board_do_not_move_the_camera(slanted):
+    view = locate_board(covered(slanted, ((-0.2, -0.2), (-0.05, 0.01))), BOARD, slanted.intrinsics)
+    assert 6 <= view.corner_count < 15
+    assert_near(view, slanted, angle_deg=0.5, distance_m=0.005)
+
+
+def test_a_board_that_is_mostly_covered_is_refused(slanted):
+    image = covered(slanted, ((-0.2, -0.2), (0.0, 0.2)), ((-0.02, 0.025), (0.2, 0.2)))
+    with pytest.raises(InvalidInput, match=r"number of corners .* at least 6"):
+        locate_board(image, BOARD, slanted.intrinsics)
+
+
+def test_a_photograph_without_a_board_is_refused(slanted, tag):
+    for image in (np.random.default_rng(0).integers(0, 256, (480, 640, 3)).astype(np.uint8), tag.image):
+        with pytest.raises(InvalidInput, match="board in the photograph is not to be found"):
+            locate_board(image, BOARD)
+    with pytest.raises(InvalidInput, match="tag in the photograph is not to be found"):
+        locate_tag(slanted.image, 0.1, slanted.intrinsics)
+
+
+def test_a_mirrored_photograph_is_refused(slanted):
+    with pytest.raises(InvalidInput, match="not to be found"):
+        locate_board(slanted.image[:, ::-1].copy(), BOARD, slanted.intrinsics)
+
+
+def test_a_blurred_photograph_is_called_so(slanted):
+    with pytest.raises(InvalidInput, match="blur of the photograph"):
+        locate_board(cv2.GaussianBlur(slanted.image, (0, 0), 6), BOARD)
+
+
+def test_wrong_intrinsics_are_noticed(slanted):
+    with pytest.raises(InvalidInput, match="check the intrinsics"):
+        locate_board(slanted.image, BOARD, np.diag([3, 3, 1]) @ slanted.intrinsics)
+
+
+def test_a_tag_gives_the_camera(tag):
+    view = locate_tag(tag.image, 0.1, tag.intrinsics)
+    assert_near(view, tag, angle_deg=0.5, distance_m=0.005)
+    assert view.corner_count == 4
+
+
+def test_several_tags_are_refused():
+    rng = np.random.default_rng(5)
+    one, resolution = tag_print(0.06)
+    view = photograph(np.hstack([one, one]), resolution, random_camera(rng, VGA, (0.6, 0.6), (60, 60)), VGA, rng)
+    with pytest.raises(InvalidInput, match="number of tags in the photograph is 2"):
+        locate_tag(view.image, 0.06, view.intrinsics)
+
+
+@pytest.mark.wrong_arrays
+@pytest.mark.parametrize("image", [np.zeros((480, 640, 3)), np.zeros((480, 640, 4), np.uint8), np.zeros(9, np.uint8)])
+def test_what_is_no_photograph_is_refused(image):
+    with pytest.raises(InvalidInput, match="photograph is an array"):
+        locate_board(image, BOARD)
+
+
+@pytest.mark.wrong_arrays
+@pytest.mark.parametrize("intrinsics", [np.eye(2), np.diag([0, 1, 1]), np.full((3, 3), np.nan), np.ones((3, 3))])
+def test_wrong_intrinsics_are_refused(tag, intrinsics):
+    with pytest.raises(InvalidInput, match="intrinsics is"):
+        locate_tag(tag.image, 0.1, intrinsics)
+
+
+def test_wrong_tags_are_refused(tag):
+    with pytest.raises(InvalidInput, match="side of the tag"):
+        locate_tag(tag.image, 0.0, tag.intrinsics)
+    with pytest.raises(UnknownName, match="DICT_APRILTAG_36h11"):
+        locate_tag(tag.image, 0.1, tag.intrinsics, "tag36h11")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"columns": 2}, "squares of the board"),
+        ({"square_m": 0.05, "marker_m": 0.04}, "side of the board"),
+        ({"square_m": float("nan")}, "of the board"),
+        ({"marker_m": 0.044}, "marker_m of the board"),
+        ({"columns": 20, "rows": 15, "square_m": 0.012, "marker_m": 0.009}, "squares of the board"),
+    ],
+)
+def test_boards_that_cannot_be_are_refused(wrong, what):
+    with pytest.raises(InvalidInput, match=what):
+        Board(**wrong)
+
+
+def test_unknown_dictionaries_are_refused():
+    with pytest.raises(UnknownName, match="DICT_4X4_50"):
+        Board(dictionary="DICT_4x4_50")
