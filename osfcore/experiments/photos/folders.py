@@ -122,7 +122,7 @@ def read_scene(folder: Path) -> PhotoFolder:
     image = _read(folder / known.image)[..., 2::-1]
     masks = {name: _read(folder / file, cv2.IMREAD_GRAYSCALE) > _MASK_LEVEL for name, file in known.masks.items()}
     values = (image / np.float32(np.iinfo(image.dtype).max)).astype(np.float32)
-    linear = linear_from_encoded(values, "linear" if known.encoding == "linear" else "srgb")
+    linear = linear_from_encoded(values, "linear" if known.encoding == "linear" else "srgb").astype(np.float32)
     exposed = np.all(values < _SATURATED, axis=-1)
     photo = Photograph(linear, exposed, np.array(known.K), Pose.identity(), False, masks)
     depth = None if known.depth is None else _read(folder / known.depth, cv2.IMREAD_UNCHANGED) * known.depth_unit_m

@@ -8,9 +8,9 @@ with the light a, b by robust least squares (Tukey) at every step; for surfels o
 
     r_c = phi(u_c) - phi_drawn(u_c),                  d r_c / d xi = grad phi(u_c) . d u_c / d xi,
 
-phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. A mask whose border is off by
-a constant is marginalised where the table tells how large an object appears. xi is a shift in the world and a turn about
-the object's origin. Which surfels are visible is found anew at each step and frozen within it.
+phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. A mask whose border is off
+by a constant is marginalised where the table tells how large an object appears. xi is a shift in the world and a turn
+about the object's origin. Which surfels are visible is found anew at each step and frozen within it.
 """
 
 from __future__ import annotations

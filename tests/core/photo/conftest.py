@@ -45,7 +45,7 @@ def take(fields, name=NAME, turn=(2.2, 0.5, -0.3), light=(0.5, -0.7, -0.6), gain
     background = np.random.default_rng(0).uniform(0.1, 0.3, (260, 300, 3))
     radiance = np.where(mask[..., None], drawn.rgb[0, 0], background) * np.array(gain)
     encoded = to_uint8(srgb_of_linear(radiance))
-    image = linear_from_encoded(encoded / 255.0)
+    image = linear_from_encoded(encoded / 255.0, "srgb").astype(np.float32)
     photo = Photograph(image, np.all(encoded < 251, axis=-1), INTRINSICS, Pose.identity(), False, {name: mask})
     return Taken(photo, encoded, pose, light, drawn.depth[0, 0])
 
