@@ -9,7 +9,7 @@ A map of the rooms, each importing only from those above it:
     fields       neural scattering functions (OSF, KiloOSF), the table's field, and their training
     render       volume rendering of many fields on the table: a reference and a fast path
     estimation   images to poses and light: CMA-ES, light search, Gauss-Newton, template matching
-    photo        real photographs: reading them, camera response, masks
+    photo        real photographs: reading them, board, masks, poses and lamp
     dynamics     what a push does: contact graph and propagation network
     planning     MPPI, costs, push primitives, path planning
     control      Algorithm 1 of the paper as a generator of events over a `World`

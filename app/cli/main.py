@@ -19,6 +19,7 @@ from app.cli.commands.episode import RunEpisode
 from app.cli.commands.estimate import Estimate
 from app.cli.commands.evaluate import Evaluate
 from app.cli.commands.evaluations.reproduce import ReproduceCommand
+from app.cli.commands.photo import Photo
 from app.cli.commands.predict import Predict
 from app.cli.commands.record import Record
 from app.cli.commands.render import Render
@@ -47,6 +48,7 @@ Commands = Annotated[
     | Annotated[Train, tyro.conf.subcommand("train", description="Train fields from images, dynamics from pushes.")]
     | Annotated[Render, tyro.conf.subcommand("render", description="Render a scene through its fields.")]
     | Annotated[Estimate, tyro.conf.subcommand("estimate", description="Find poses and light in images.")]
+    | Annotated[Photo, tyro.conf.subcommand("photo", description="Find objects and lamp in a photograph.")]
     | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
     | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
     | Annotated[Clip, tyro.conf.subcommand("clip", description="Make a clip of an episode.")]

@@ -21,9 +21,9 @@ from osfcore.experiments.photos.folders import (
 )
 from osfcore.experiments.photos.lamp_errors import lamp_errors_deg
 from osfcore.experiments.photos.report import PhotoReport, PhotoScore, report_of
-from osfcore.experiments.photos.sheets import write_sheet
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.inspection.photo_sheet import write_sheet
 from osfcore.io.files import write_json
 from osfcore.metrics.pose_errors import rotation_error
 from osfcore.objects.catalogue import CATALOGUE
