@@ -13,7 +13,6 @@ from app.cli.commands.assets import Assets
 from app.cli.commands.backup import Backup, Restore
 from app.cli.commands.bench import Bench
 from app.cli.commands.check import Check
-from app.cli.commands.clip import Clip
 from app.cli.commands.collect import Collect
 from app.cli.commands.episode import RunEpisode
 from app.cli.commands.estimate import Estimate
@@ -21,7 +20,8 @@ from app.cli.commands.evaluate import Evaluate
 from app.cli.commands.evaluations.reproduce import ReproduceCommand
 from app.cli.commands.photo import Photo
 from app.cli.commands.predict import Predict
-from app.cli.commands.record import Record
+from app.cli.commands.recordings.clip import Clip
+from app.cli.commands.recordings.record import Record
 from app.cli.commands.render import Render
 from app.cli.commands.serve import Serve
 from app.cli.commands.train import Train

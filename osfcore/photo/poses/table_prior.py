@@ -28,6 +28,14 @@ class TablePrior:
         self._hull = resting.hull
         self._stable = np.unique(np.round(rotate(quaternion_conjugate(resting.quaternions), _DOWN), 6), axis=0)
 
+    def downs(self, pose: Pose) -> Float[np.ndarray, "K 3"]:
+        """Directions, in the pose's outer frame, one of which is down if the object stands in a stable orientation."""
+        return rotate(pose.quaternion, self._stable)
+
+    def extent(self, pose: Pose, direction: Float[np.ndarray, "3"]) -> float:
+        """How far the object reaches along a direction, from the outer frame's origin [m]."""
+        return float((pose.apply(self._hull) @ direction).max())
+
     def penalties(self, poses: Pose) -> Float[np.ndarray, "B"]:
         """Squared deviations of B poses, each of the two at most 100."""
         lowest = rotate(poses.quaternion[:, None], self._hull)[..., 2].min(axis=1) + poses.position[:, 2]
@@ -45,7 +53,7 @@ class TablePrior:
         if abs(height) < _FARTHEST * _HEIGHT_STD_M:
             rows.append(np.concatenate([[0.0, 0.0, 1.0], np.cross(low, [0.0, 0.0, 1.0])]) / _HEIGHT_STD_M)
             residuals.append(height / _HEIGHT_STD_M)
-        down = rotate(pose.quaternion, self._stable)
+        down = self.downs(pose)
         nearest = down[np.argmax(down @ _DOWN)]
         if np.arccos(np.clip(nearest @ _DOWN, -1, 1)) < _FARTHEST * _TILT_STD_RAD:
             for axis in range(2):  # a turn by nearest x down brings it there
