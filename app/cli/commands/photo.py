@@ -15,7 +15,8 @@ from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from osfcore.photo.photograph import Photograph
-    from osfcore.photo.poses.photo_steps import PhotoObject
+    from osfcore.photo.poses.estimate_photo import PhotoModels
+    from osfcore.photo.poses.photo_steps import PhotoPose, PhotoStep
     from osfcore.photo.read_photograph import RawPhotograph
 
 
@@ -80,13 +81,13 @@ class PhotoEstimate:
         fields = FieldLibrary(self.data_dir)
         models = PhotoModels({name: fields.load(name) for name in boxes})
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
-        last = follow(_Shown(step.progress.done, step.progress.total, step.progress.note, step.found)
+        last = follow(_Shown(step.progress.done, step.progress.total, step.progress.note, step)
                       for step in estimate_photo(models, [photo], tuple(boxes), rng))  # fmt: skip
         assert last is not None
-        result = _result(photo, last.found, models, notes)
+        result = _result(photo, last.step, models, notes)
         write_json(self.out, result)
         if self.images is not None:
-            for found in last.found:
+            for found in last.step.found:
                 write_sheet(self.images / f"{found.name}.png", models, photo, found)
         if not self.json:
             _show(result, self.out)
@@ -104,7 +105,7 @@ class PhotoEstimate:
             view = locate_board(raw.eight_bit, Board(), given)
         except InvalidInput as error:
             K, note = (given, "") if given is not None else guessed_intrinsics(raw)
-            unknown = f"The table is not known, and positions are told in the camera's frame: {error}"
+            unknown = f"The photo does not tell where the table is: {error}"
             return to_photograph(raw, K), [*raw.notes, *([note] if note else []), unknown]
         return to_photograph(raw, view.intrinsics, view.T_world_camera), list(raw.notes)
 
@@ -116,7 +117,7 @@ class _Shown:
     done: int
     total: int
     note: str
-    found: tuple[PhotoObject, ...]
+    step: PhotoStep
 
 
 def _box(text: str, raw: RawPhotograph) -> tuple[str, tuple[float, float, float, float]]:
@@ -143,23 +144,36 @@ def _masks(raw: RawPhotograph, boxes: dict[str, tuple[float, float, float, float
     return masks
 
 
-def _result(photo: Photograph, found: tuple[PhotoObject, ...], models: Any, notes: list[str]) -> dict[str, Any]:  # noqa: ANN401
+def _result(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: list[str]) -> dict[str, Any]:
+    """What the file holds, in the table's frame where there is one."""
     import numpy as np
 
+    from osfcore.geometry.poses import Pose, rotate
     from osfcore.photo.light.photo_light import photo_light
     from osfcore.photo.poses.estimate_photo import FINE_ACROSS
 
-    light = photo_light(photo, found, [models.surfels(o.name, FINE_ACROSS) for o in found])
+    light = photo_light(photo, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
+    T_table_world, table = Pose.identity(), "board" if photo.on_table else None
+    if step.table is not None:
+        T_table_world, table = step.table.T_world_camera, "objects"
+        count, spread = len(step.table.supported), step.table.spread_deg
+        seen = f"The table was found from how {count} objects lie, whose verticals differ by {spread:.1f} degrees"
+        notes = [*notes, f"{seen}; it may be off by a few."]
 
-    def pose(p: Any) -> dict[str, Any]:  # noqa: ANN401
-        return {"position": p.pose.position.tolist(), "quaternion": p.pose.quaternion.tolist(),
-                "loss": p.loss, "iou": p.iou}  # fmt: skip
+    def entry(found: PhotoPose) -> dict[str, Any]:
+        pose = T_table_world @ found.pose
+        return {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist(), "loss": found.loss,
+                "iou": found.iou}  # fmt: skip
 
-    objects = [{"name": o.name, **pose(o.best), "doubt": o.doubt, "rivals": [pose(r) for r in o.rivals]} for o in found]
-    lamp = {"direction": light.direction.tolist(), "std_deg": float(np.rad2deg(light.std)), "diffuse": light.is_diffuse}
-    camera = {"K": photo.intrinsics.tolist(), "T_world_camera": photo.T_world_camera.matrix().tolist(),
-              "width": photo.width, "height": photo.height}  # fmt: skip
-    return {"on_table": photo.on_table, "objects": objects, "light": lamp, "camera": camera, "notes": notes}
+    objects = [
+        {"name": o.name, **entry(o.best), "doubt": o.doubt, "rivals": [entry(r) for r in o.rivals]} for o in step.found
+    ]
+    toward = rotate(T_table_world.quaternion, light.direction)
+    lamp = {"direction": toward.tolist(), "std_deg": float(np.rad2deg(light.std)), "diffuse": light.is_diffuse}
+    T_table_camera = (T_table_world @ photo.T_world_camera).matrix()
+    camera = {"K": photo.intrinsics.tolist(), "T_world_camera": T_table_camera.tolist(), "width": photo.width,
+              "height": photo.height}  # fmt: skip
+    return {"table": table, "objects": objects, "light": lamp, "camera": camera, "notes": notes}
 
 
 def _show(result: dict[str, Any], out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from osfcore.io.files import write_json
 from osfcore.metrics.pose_errors import rotation_error
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.poses.estimate_photo import PhotoConfig, PhotoModels, find_object
+from osfcore.photo.poses.estimate_photo import PhotoConfig, PhotoModels, estimate_photo
 from osfcore.photo.poses.object_window import object_windows
 from osfcore.photo.poses.photo_steps import PhotoObject
 from osfcore.photo.poses.pose_loss import LossKind
@@ -79,15 +80,6 @@ class PhotosStep:
     report: PhotoReport | None = None
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Case:
-    """One search: an object of a scene, and which of several starts."""
-
-    scene: PhotoFolder
-    name: str
-    number: int
-
-
 def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[PhotosStep]:
     """Look for every object of every folder, then for the lamps; report.json and sheets go to `config.folder`.
 
@@ -106,58 +98,64 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ph
     )
     scenes, lamps = [read_scene(path) for path in scene_folders(config.data)], lamp_folders(config.data)
     known = set(fields.names())
-    cases = [_Case(*case) for scene in scenes for case in _cases(config, scene, known)]
+    asked = [(scene, _names(config, scene, known)) for scene in scenes]
+    cases = [(scene, names, number) for scene, names in asked if names for number in range(config.repeats)]
     without = sum(name not in known for scene in scenes for name in scene.photo.masks)
     if not cases and not lamps:
         allowed = f"a folder of photographs with photo.json that have poses named {config.start!r}"
         raise InvalidInput("data", config.data, allowed)
-    names = sorted({case.name for case in cases})
-    loaded = {name: fields.load(name) for name in names}
+    loaded = {name: fields.load(name) for name in sorted({name for _, names in asked for name in names})}
     models, renderer = PhotoModels(loaded), SceneRenderer(loaded, None)
     scores: list[PhotoScore] = []
-    for done, case in enumerate(cases):
-        yield PhotosStep(done, len(cases), f"{case.name} in {case.scene.name}")
-        scores.append(_measure(config, models, renderer, case))
+    for done, (scene, names, number) in enumerate(cases):
+        yield PhotosStep(done, len(cases), f"{len(names)} objects in {scene.name}")
+        scores += _measure(config, models, renderer, scene, names, number)
     lamp_errors = {subject.name: lamp_errors_deg(subject) for path in lamps for subject in read_lamps(path)}
     report = report_of(scores, lamp_errors, without)
     write_json(config.folder / "report.json", report.to_json())
     yield PhotosStep(len(cases), len(cases), "Everything is measured", report)
 
 
-def _cases(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> Iterator[tuple[PhotoFolder, str, int]]:
+def _names(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> list[str]:
+    """Objects of a scene that are looked for."""
     source = GROUND_TRUTH if config.start == PERTURBED else config.start
-    for name in scene.photo.masks:
-        if name in known and (config.start == NONE or name in scene.poses.get(source, {})):
-            for number in range(config.repeats):
-                yield scene, name, number
+    return [n for n in scene.photo.masks if n in known and (config.start == NONE or n in scene.poses.get(source, {}))]
 
 
-def _measure(config: EvaluatePhotos, models: PhotoModels, renderer: SceneRenderer, case: _Case) -> PhotoScore:
-    scene, name = case.scene, case.name
-    tag = sorted(CATALOGUE).index(name) if name in CATALOGUE else len(CATALOGUE)
-    rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, tag, case.number)
+def _measure(
+    config: EvaluatePhotos,
+    models: PhotoModels,
+    renderer: SceneRenderer,
+    scene: PhotoFolder,
+    names: list[str],
+    number: int,
+) -> list[PhotoScore]:
+    """Look for the objects of one scene, all together."""
+    rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, zlib.crc32(scene.name.encode()), number)
     photo = _photo(config, scene)
-    start = _start(config, scene, name, rng)
-    starts = {} if start is None else {name: photo.T_world_camera @ start}
-    found = find_object(models, [photo], name, rng, PhotoConfig(starts, config.loss))
-    pose = photo.T_world_camera.inverse() @ found.best.pose
+    starts = {name: _start(config, scene, name, rng) for name in names}
+    placed = {name: photo.T_world_camera @ start for name, start in starts.items() if start is not None}
+    *_, last = estimate_photo(models, [photo], names, rng, PhotoConfig(placed, config.loss))
+    scores = []
+    for found in last.found:
+        moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
+        write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
+        scores.append(_score(renderer, scene, moved))
+    return scores
+
+
+def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> PhotoScore:
+    """Compare an object, its pose in the camera's frame, with all that is known."""
+    name, pose = found.name, found.best.pose
     iou, depth_mm = _fit(renderer, scene, name, pose)
     position_mm = rotation_deg = None
     if (reference := scene.reference.get(name)) is not None:
         symmetry = CATALOGUE[name].symmetry
         rotation_deg = float(np.rad2deg(rotation_error(symmetry, pose.quaternion, reference.quaternion)))
         position_mm = 1e3 * float(np.linalg.norm(pose.position - reference.position))
-    write_sheet(
-        config.folder / f"{scene.name}-{name}-{case.number}.png", models, scene.photo, replace_best(found, pose)
-    )
     is_true = GROUND_TRUTH in scene.poses
     return PhotoScore(scene.name, name, is_true, iou, depth_mm, position_mm, rotation_deg, found.doubt,
                       min(found.ratio, 99.0), found.coarse_s, found.refine_s)  # fmt: skip
-
-
-def replace_best(found: PhotoObject, pose: Pose) -> PhotoObject:
-    """The same with the best pose in another frame."""
-    return replace(found, best=replace(found.best, pose=pose))
 
 
 def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from osfcore.photo.poses.pose_alignment import align
 from osfcore.photo.poses.pose_loss import LossKind, PoseLoss
 from osfcore.photo.poses.pose_search import cma_search, distinct, poses_around, poses_from_mask, super_fibonacci
 from osfcore.photo.poses.surfels import Surfels, surfels_of
+from osfcore.photo.poses.table_from_objects import TableGuess, table_from_objects
 from osfcore.photo.poses.table_prior import TablePrior
 from osfcore.progress import Progress
 
@@ -111,19 +112,56 @@ def estimate_photo(
 
     Raises:
         UnknownName: if an object has no field.
-        InvalidInput: without photographs or masks.
+        InvalidInput: without photographs or masks, or with several photographs that do not share a table.
     """
     config = config or PhotoConfig()
-    if not photos:
-        raise InvalidInput("number of photos", 0, "1 or more")
+    on_table = [photo.on_table for photo in photos]
+    if not photos or not (all(on_table) or len(photos) == 1):
+        given = f"{len(photos)}, {sum(on_table)} of them with a known table"
+        raise InvalidInput("number of photos", given, "1, or more that all show the board on the table")
     for name in names:
         models.check(name)
         object_windows(photos, name, _COARSE_SIDE)
     found: list[PhotoObject] = []
     for number, name in enumerate(names):
-        yield PhotoStep(Progress(number, len(names), f"Looking for {name}"), tuple(found))
+        yield PhotoStep(Progress(number, len(names) + 1, f"Looking for {name}"), tuple(found))
         found.append(find_object(models, photos, name, rng, config))
-    yield PhotoStep(Progress(len(names), len(names), "All objects were looked for"), tuple(found))
+    yield PhotoStep(Progress(len(names), len(names) + 1, "The table that they lie on"), tuple(found))
+    table = None
+    if not on_table[0]:
+        table = table_from_objects([models.table_prior(name) for name in names], [o.best.pose for o in found])
+        if table is not None:
+            lying = set(table.supported)
+            found = [_on_table(models, photos[0], o, table, config) if k in lying else o for k, o in enumerate(found)]
+    done = Progress(len(names) + 1, len(names) + 1, "All objects were looked for")
+    yield PhotoStep(done, tuple(found), table)
+
+
+def _on_table(
+    models: PhotoModels, photo: Photograph, found: PhotoObject, table: TableGuess, config: PhotoConfig
+) -> PhotoObject:
+    """An object aligned once more, now that it is known to lie on a table; its pose stays in the camera's frame."""
+    start = time.perf_counter()
+    seen = replace(photo, T_world_camera=table.T_world_camera, on_table=True)
+    sharp, plain = (
+        PoseLoss(
+            object_windows([shown], found.name, side),
+            models.surfels(found.name, FINE_ACROSS),
+            table=prior,
+            kind=config.loss,
+        )
+        for shown, side, prior in ((seen, _SHARP_SIDE, models.table_prior(found.name)), (photo, _FINE_SIDE, None))
+    )
+    pose = table.T_world_camera.inverse() @ align(sharp, table.T_world_camera @ found.best.pose)[0]
+    best = _photo_poses(pose[None], plain)[0]
+    return replace(found, best=best, refine_s=found.refine_s + time.perf_counter() - start)
+
+
+def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
+    """Poses with what the loss says of each."""
+    terms = loss.terms(poses)
+    parts = zip(terms.losses, terms.iou, terms.residual, terms.correlation, strict=True)
+    return [PhotoPose(poses[k], *(float(v) for v in values)) for k, values in enumerate(parts)]
 
 
 def find_object(
@@ -157,11 +195,7 @@ def find_object(
     poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
     ends = [align(sharp, poses[k])[0] for k in range(len(poses.position))]
     poses = Pose(np.stack([p.position for p in ends]), np.stack([p.quaternion for p in ends]))
-    terms = fine.terms(poses)
-    kept = distinct(poses, terms.losses, _ALIGNED, _APART_DEG)
-    best, *rivals = (
-        PhotoPose(poses[k], *(float(t[k]) for t in (terms.losses, terms.iou, terms.residual, terms.correlation)))
-        for k in kept
-    )
+    ready = _photo_poses(poses, fine)
+    best, *rivals = (ready[k] for k in distinct(poses, np.array([p.loss for p in ready]), _ALIGNED, _APART_DEG))
     doubt = doubt_of(name, best, rivals, fine)
     return PhotoObject(name, best, tuple(rivals), doubt, middle - start, time.perf_counter() - middle)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from osfcore.geometry.poses import Pose
+from osfcore.photo.poses.table_from_objects import TableGuess
 from osfcore.progress import Progress
 
 
@@ -58,8 +59,10 @@ class PhotoStep:
 
     Attributes:
         progress: how far the work is.
-        found: objects so far.
+        found: objects so far, in the photographs' world.
+        table: what objects were found to lie on, where no photograph tells; with the last step only.
     """
 
     progress: Progress
     found: tuple[PhotoObject, ...]
+    table: TableGuess | None = None

@@ -74,6 +74,11 @@ def test_an_object_without_a_field_is_told(models, taken):
         found_in(models, photo, "teapot")
 
 
+def test_photos_without_a_common_table_are_told(models, taken):
+    with pytest.raises(InvalidInput, match="number of photos is 2, 0 of them with a known table"):
+        next(estimate_photo(models, [taken.photo, taken.photo], [NAME], np.random.default_rng(0)))
+
+
 def test_no_photo_is_told(models):
     with pytest.raises(InvalidInput, match="number of photos is 0"):
         next(estimate_photo(models, [], [NAME], np.random.default_rng(0)))
