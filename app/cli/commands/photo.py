@@ -105,7 +105,7 @@ class PhotoEstimate:
             view = locate_board(raw.eight_bit, Board(), given)
         except InvalidInput as error:
             K, note = (given, "") if given is not None else guessed_intrinsics(raw)
-            unknown = f"The photo does not tell where the table is: {error}"
+            unknown = f"No board tells where the table is ({error})"
             return to_photograph(raw, K), [*raw.notes, *([note] if note else []), unknown]
         return to_photograph(raw, view.intrinsics, view.T_world_camera), list(raw.notes)
 
