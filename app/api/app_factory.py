@@ -34,6 +34,7 @@ from app.api.routes import (
     goals,
     jobs,
     objects,
+    photos,
     predictions,
     scenes,
     status,
@@ -55,6 +56,8 @@ from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
+from app.services.photos.photo_tables import PhotoTables
+from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
 from app.services.runner import DemoScene, Runner
 from app.services.service_settings import Settings
@@ -74,7 +77,7 @@ _DESCRIPTION = (
 )
 
 _ROUTES = (
-    status, objects, fields, scenes, presets, goals, episodes, neural, estimates, predictions, jobs,
+    status, objects, fields, scenes, presets, goals, photos, episodes, neural, estimates, predictions, jobs,
     driver, views, stories, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (objects.UPLOAD_PATH, fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
@@ -138,11 +141,15 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         predictor = ProcessClient(predictor_main, (settings.data_dir,), "predictor of pushes")
         stack.push_async_callback(run_in_threadpool, predictor.stop)
         prediction_service = Predictions(runner, fields.names, predictor)
-        photos = PhotoReader()
-        stack.push_async_callback(run_in_threadpool, photos.stop)
-        goal_service = Goals(runner, settings.data_dir, settings.max_goals, photos)
+        reader = PhotoReader()
+        stack.push_async_callback(run_in_threadpool, reader.stop)
+        goal_service = Goals(runner, settings.data_dir, settings.max_goals, reader)
         await run_in_threadpool(goal_service.start)
         checks = GoalChecks(runner, fields, goal_service, neural, objects.labels)
+        table_photos = TablePhotos(runner, fields, settings.data_dir, settings.max_photos)
+        stack.push_async_callback(run_in_threadpool, table_photos.stop)
+        await run_in_threadpool(table_photos.start)
+        photo_tables = PhotoTables(runner, table_photos, goal_service, neural)
         viewer = Viewer(runner, neural, fields.names, prediction_service, goal_service)
         stack.push_async_callback(run_in_threadpool, viewer.stop)
         await run_in_threadpool(viewer.start)
@@ -150,8 +157,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
         services = Services(
             settings, store, runner, viewer, objects, fields, neural, estimate_service, prediction_service,
-            goal_service, checks, Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish, GRACE_S),
-            OwnObjects(runner), thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()),
+            goal_service, checks, table_photos, photo_tables, Episodes(runner, fields, goal_service, checks),
+            Driver(runner.hub.publish, GRACE_S), OwnObjects(runner), thumbnails, Outliner(runner.library),
+            Disturber(runner, np.random.default_rng()),
         )  # fmt: skip
         app.state.services = services
         app.state.metrics.watch(runner)
@@ -163,7 +171,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 def _body_limit(settings: Settings, path: str) -> int:
     """How large a request to a path may be [bytes]: only uploads and many sequences of actions are large."""
     path = path.rstrip("/")
-    if path == goals.UPLOAD_PATH:
+    if path in (goals.UPLOAD_PATH, photos.UPLOAD_PATH):
         return max(settings.max_photo_bytes, settings.max_body_bytes)
     if path in _UPLOAD_PATHS:
         return settings.max_upload_bytes

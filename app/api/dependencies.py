@@ -23,6 +23,8 @@ from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
+from app.services.photos.photo_tables import PhotoTables
+from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.services.service_settings import Settings
@@ -93,6 +95,8 @@ class Services:
     predictions: Predictions
     goals: Goals
     goal_checks: GoalChecks
+    photos: TablePhotos
+    photo_tables: PhotoTables
     episodes: Episodes
     driver: Driver
     own_objects: OwnObjects

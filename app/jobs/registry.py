@@ -28,7 +28,7 @@ from osfcore.errors import OsfError
 
 _RETRY_S = 1.0  # after the job loop has failed
 _log = logging.getLogger(__name__)
-_ENDED_AT_ONCE = ("estimate",)  # they leave nothing that needs a grace to tidy up
+_ENDED_AT_ONCE = ("estimate", "photo")  # they leave nothing that needs a grace to tidy up
 
 
 class QueueFull(OsfError):

@@ -13,7 +13,7 @@ from app.jobs.job_process import WHO, JobProcess
 from app.jobs.worker import job_main
 from app.processes.process_client import ProcessClient
 
-_KINDS = ("episode", "estimate")  # what it has loaded the code of
+_KINDS = ("episode", "estimate", "photo")  # what it has loaded the code of
 _log = logging.getLogger(__name__)
 
 

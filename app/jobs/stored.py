@@ -55,6 +55,12 @@ class _Clip(Entry):
     title: Text
 
 
+class _Photo(Entry):
+    photo: Text
+    title: Text
+    names: list[Text]
+
+
 _PARAMS = {
     "collect_object": _Named,
     "add_object": _Adding,
@@ -62,6 +68,7 @@ _PARAMS = {
     "estimate": _Estimate,
     "episode": _Episode,
     "clip": _Clip,
+    "photo": _Photo,
 }
 
 

@@ -79,6 +79,12 @@ def _clip(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
     yield from clip_job(params, place)
 
 
+def _photo(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.photos import photo_job
+
+    yield from photo_job(params, place)
+
+
 KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "collect_pushes": _collect_pushes,
     "collect_object": _collect_object,
@@ -89,14 +95,16 @@ KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "estimate": _estimate,
     "episode": _episode,
     "clip": _clip,
+    "photo": _photo,
 }
-_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate", "clip")
+_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate", "clip", "photo")
 _NOT_EXTRA = ("done", "total", "note", "view")
 
 
 _LOADED = (  # by a process that waits for its job
     "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.scene_models",
-    "app.jobs.kinds.remote_world", "app.jobs.kinds.estimates", "app.episodes.record", "app.episodes.recording",
+    "app.jobs.kinds.remote_world", "app.jobs.kinds.estimates", "osfcore.photo.summary",
+    "app.episodes.record", "app.episodes.recording",
 )  # fmt: skip
 
 

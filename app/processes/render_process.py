@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
-from app.processes.messages.neural_messages import CheckPhoto, CompareView, Comparison, DrawnView, DrawView, Order
+from app.processes.messages.neural_messages import (
+    CheckPhoto,
+    CompareView,
+    Comparison,
+    DrawnView,
+    DrawPhoto,
+    DrawView,
+    Order,
+)
 from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.render_cameras import bands
 from osfcore.fields.field_library import TABLE_NAME, FieldLibrary
@@ -50,7 +58,7 @@ class NeuralRenderer:
 
     def render(
         self, order: Order, is_overtaken: IsOvertaken = lambda: False
-    ) -> DrawnView | Comparison | ContentCheck | None:
+    ) -> DrawnView | Comparison | ContentCheck | bytes | None:
         """What answers an order; None if it was overtaken on the way.
 
         Raises:
@@ -62,6 +70,8 @@ class NeuralRenderer:
                 return self._draw(order, is_overtaken)
             case CompareView():
                 return self._compare(order)
+            case DrawPhoto():
+                return self._photograph(order)
             case CheckPhoto():
                 return self._check(order)
             case _:
@@ -93,6 +103,23 @@ class NeuralRenderer:
         shown = to_uint8(rendered)
         side_by_side = np.concatenate([pixels, shown, difference], axis=1)
         return Comparison(encode_png(shown), encode_png(difference), encode_png(side_by_side), psnr(observed, rendered))
+
+    def _photograph(self, order: DrawPhoto) -> bytes:
+        import cv2
+
+        from osfcore.photo.camera_response import linear_from_encoded, srgb_of_linear
+        from osfcore.render.types import EXACT
+
+        def sized(picture: np.ndarray) -> np.ndarray:
+            return cv2.resize(picture, (order.camera.width, order.camera.height), interpolation=cv2.INTER_AREA)
+
+        quality = replace(EXACT, samples_per_side=2)
+        rgb, _ = self._picture(order.state, order.camera, quality, {"rgb"})
+        photo = linear_from_encoded(sized(_decoded(order.photo)) / 255, "srgb")
+        shown = np.any([sized(_decoded(mask))[..., 0] > 127 for mask in order.masks], axis=0)
+        if shown.any():  # neither exposure nor white balance of the photo is known
+            rgb = rgb * (np.median(photo[shown], axis=0) / np.maximum(np.median(rgb[shown], axis=0), 1e-3))
+        return encode_png(to_uint8(srgb_of_linear(np.clip(rgb, 0, 1))))
 
     def _check(self, order: CheckPhoto) -> ContentCheck:
         from osfcore.geometry.states import Observation

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -195,7 +195,10 @@ class Simulation:
                 world.arrange(command.seed)
             else:
                 light = command.light or Light.random(stream_rng(command.seed, Stream.LIGHT))
-                world.load(SceneState(command.names or (), command.poses, light, None))
+                state = SceneState(command.names or (), command.poses, light, None)
+                (world.load_measured if command.is_measured else world.load)(state)
+                if command.is_measured:
+                    deque(world.settle(), maxlen=0)
         except BaseException:
             world.close()
             raise
@@ -315,7 +318,7 @@ class Simulation:
             if command.seed is not None:
                 goal, _ = random_goal(world, command.seed, command.moved)
             else:
-                goal = arranged_goal(world, dict(command.poses))
+                goal = arranged_goal(world, dict(command.poses), is_measured=command.is_measured)
             if command.light is not None:
                 world.set_light(command.light)
             image = world.render((goal_camera(image_side(command.size)),), with_pusher=False).images[0]

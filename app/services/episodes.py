@@ -20,7 +20,7 @@ from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import GOAL_SIDE, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
-from app.storage.goal_store import Poses, poses_to_json
+from app.storage.goal_store import GoalRecord, Poses, poses_to_json
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.errors import InvalidInput, OsfError, check_seed
 from osfcore.geometry.cameras import goal_camera
@@ -175,9 +175,21 @@ class Episodes(EpisodeResults):
                 shutil.copyfile(prepared, folder / PREPARED_FILE)
         except OSError as error:
             raise CannotStore(folder, error.strerror or str(error)) from error
+        if goal.source == "photo" and goal.poses is not None:
+            return self._photographed(goal, goal.poses, asked, scene, names, folder)
         is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
         truth = poses_to_json(goal.poses) if is_known and goal.poses is not None else None
         return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": None, "truth": truth}
+
+    def _photographed(
+        self, goal: GoalRecord, poses: Poses, asked: AskedEpisode, scene: str, names: tuple[str, ...], folder: Path
+    ) -> dict[str, Any]:
+        """A goal whose poses were found in a photograph: nothing is left to be read from its image."""
+        given = _of_all(poses, names)
+        if asked.method == "paper":
+            return {**self._rendered(given, scene, folder), "id": goal.id}
+        found = poses_to_json(given)
+        return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": found, "truth": found}
 
     def _rendered(self, poses: Poses, scene: str, folder: Path) -> dict[str, Any]:
         """A goal that was given as poses, as the image that a method wants which knows of nothing else."""

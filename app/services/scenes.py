@@ -137,6 +137,7 @@ class Scenes:
         poses: tuple[tuple[str, Pose], ...] | None = None,
         image_size: int = DEFAULT_IMAGE_SIDE,
         *,
+        is_measured: bool = False,
         is_shown: bool = True,
     ) -> SceneRecord:
         """Make a scene; raises TooManyScenes, or an OsfError if it cannot be made: then nothing changes.
@@ -148,6 +149,7 @@ class Scenes:
             light: None for a random one.
             poses: T_world_object [m] by name; None for random ones at rest.
             image_size: side of its camera images [px].
+            is_measured: the poses may err: what penetrates is moved apart, and all comes to rest.
             is_shown: at once, in viewer and pages.
         """
         image_side(image_size)
@@ -163,7 +165,8 @@ class Scenes:
             self._scenes_in_the_making += 1
         seed = secrets.randbelow(MAX_SEED) if seed is None else seed
         stacked = None if poses is None else _stacked([pose for _, pose in poses])
-        command = CreateScene(uuid.uuid4().hex[:12], seed, now_utc(), image_size, names, count, light, stacked)
+        made = uuid.uuid4().hex[:12], seed, now_utc()
+        command = CreateScene(*made, image_size, names, count, light, stacked, is_measured)
         try:
             record: SceneRecord = self._simulation.call(command)
             with self._lock:

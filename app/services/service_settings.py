@@ -31,8 +31,9 @@ class Settings(BaseSettings):
     demo_scene: bool = Field(default=True, description="Whether a scene is made when there is none.")
     max_body_bytes: int = Field(default=4 << 20, ge=1024)  # a thousand sequences of thirty actions in full precision
     max_upload_bytes: int = Field(default=1 << 30, ge=1024, description="Of a zipped image set or observation.")
-    max_photo_bytes: int = Field(default=20 << 20, ge=1024, description="Of a goal image.")
+    max_photo_bytes: int = Field(default=20 << 20, ge=1024, description="Of a goal image or a photo of a table.")
     max_goals: int = Field(default=100, ge=1, description="Goal images kept at once.")
+    max_photos: int = Field(default=50, ge=1, description="Photos of tables kept at once.")
     max_image_sets: int = Field(default=20, ge=1, description="Uploaded image sets kept at once.")
     max_scenes: int = Field(default=32, ge=1, description="Scenes kept at once.")
     max_live_worlds: int = Field(default=4, ge=1, description="Scenes whose simulation stays in memory.")

@@ -23,7 +23,7 @@ from osfcore.io.files import read_json
 from osfcore.io.json_codec import Entry, Text, decode, encode
 from osfcore.io.scene_file import CameraJson, ObjectJson, camera_to_json
 
-Source = Literal["upload", "composed", "drawn"]
+Source = Literal["upload", "composed", "drawn", "photo"]
 Poses = tuple[tuple[str, Pose], ...]
 IMAGE, PHOTO, _FACTS = "goal.png", "photo.jpg", "goal.json"
 _TEMPORARY_PREFIX = ".new-"
@@ -59,7 +59,7 @@ class GoalRecord:
         id: identifier.
         name: for people.
         created_at: UTC, ISO 8601.
-        source: an uploaded photo, a layout by hand, or a random one.
+        source: an uploaded goal image, a layout by hand, a random one, or one that was found in a photograph.
         scene: that it was made from; None for an upload.
         camera: that took the image.
         poses: of the objects in it, where they are known.

@@ -20,6 +20,7 @@ FOLDERS = {  # kinds by their folder in the data directory; "other" is what else
     "fields": "fields",
     "paper_fields": "fields",
     "goals": "goals",
+    "photos": "photos",
     "sets": "sets",
     "collections": "jobs",
     "training": "training",
@@ -30,6 +31,7 @@ _DELETABLE = {
     "sets": "image sets",
     "training": "leftovers of training",
     "goals": "goals",
+    "photos": "photos of tables",
     "fields": "trained fields",
 }
 

@@ -32,7 +32,7 @@ from osfcore.control.events import (
     Planning,
     Stepped,
 )
-from osfcore.control.goal import GoalImage, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
+from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
 from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, offsets
 from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
@@ -70,7 +70,7 @@ class Episode:
     Args:
         world: cameras and pusher.
         models: of the objects.
-        goal: an image, or poses.
+        goal: an image, or poses, perhaps with a photograph of them.
         settings: may be replaced while the episode runs.
         rng: draws everything.
         start: what is known of the first frame already; without it, it is estimated from images with masks.
@@ -245,6 +245,8 @@ class Episode:
             estimate = prefer_current_poses(self._models.appearance, target, estimate, state)
             goal, doubts = PoseGoal(estimate.state.names, estimate.state.poses), estimate.reason
             light, camera, image = estimate.state.light, target.camera, target.image
+        elif isinstance(target, PhotoGoal):
+            goal, light, camera, image = target, state.light, target.photo.camera, target.photo.image
         else:
             goal, light, camera = target, state.light, goal_camera()
             image = self._rendered(replace(state, poses=target.poses_of(state.names)), camera, light)

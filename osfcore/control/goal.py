@@ -54,6 +54,13 @@ class GoalImage:
         return Observation((self.camera,), self.image[None], names, None, None, 0.0)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class PhotoGoal(PoseGoal):
+    """Poses that were found in a photograph, and that photograph, to compare with in pictures."""
+
+    photo: GoalImage
+
+
 def prefer_current_poses(
     models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now: SceneState
 ) -> EstimatedState:

@@ -91,13 +91,18 @@ def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneSta
     raise NoRoom(start.names, _GOALS)
 
 
-def arranged_goal(world: Tabletop, poses: Mapping[str, Pose]) -> SceneState:
+def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bool = False) -> SceneState:
     """The table at rest with some objects at given poses; the world is left like that, or anyhow if it cannot be.
+
+    Args:
+        world: with the objects.
+        poses: of some of them.
+        is_measured: the poses may err: objects that penetrate are moved apart first.
 
     Raises:
         UnknownName: if an object is not on the table.
         InvalidInput: if an object would not be over the table.
-        OverlappingObjects: if objects would overlap.
+        OverlappingObjects: if objects would overlap, unless poses are measured.
     """
     state = world.truth()
     for name in poses:
@@ -105,7 +110,7 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose]) -> SceneState:
             raise UnknownName("object on the table", name, state.names)
     every = [poses.get(name, state.pose(name)) for name in state.names]
     stacked = Pose(np.array([p.position for p in every]), np.array([p.quaternion for p in every]))
-    world.load(SceneState(state.names, stacked, state.light, None))
+    (world.load_measured if is_measured else world.load)(SceneState(state.names, stacked, state.light, None))
     for _ in world.settle():
         pass
     rests = world.truth()

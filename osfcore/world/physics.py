@@ -241,6 +241,13 @@ class Physics:
         other = self._pusher if second is None else self._bodies[second].uid
         return self._gap(self._bodies[first].uid, other, reach_m)
 
+    def separation(self, first: str, second: str) -> tuple[float, Float[np.ndarray, "3"]]:
+        """Gap between two objects [m], 0.05 if larger, and the unit vector along which the first one leaves."""
+        ids = self._bodies[first].uid, self._bodies[second].uid
+        points = pybullet.getClosestPoints(*ids, 0.05, physicsClientId=self._client)
+        nearest = min(points, key=lambda point: point[8], default=None)
+        return (0.05, np.array([0.0, 0.0, 1.0])) if nearest is None else (nearest[8], np.array(nearest[7]))
+
     def table_distance(self, name: str) -> float:
         """Gap between an object and the table [m]; negative if it sinks in; 0.05 if larger."""
         return self._gap(self._bodies[name].uid, self._table, 0.05)

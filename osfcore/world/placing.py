@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import NoRoom
+from osfcore.errors import NoRoom, OverlappingObjects
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, WORKSPACE_HALF_M
 from osfcore.objects.asset import ObjectAsset
@@ -15,11 +15,14 @@ from osfcore.world.physics import Physics, lowest_point
 
 GAP_M = 0.01  # between objects when placed
 PUSHER_GAP_M = 0.02
+OVERLAP_TOLERANCE_M = 0.002
 DROP_M = 0.001  # objects start this far above the table
 _TRIES_PER_OBJECT = 60
 _LAYOUTS = 60
 _SETTLE_LIMIT_STEPS = 480
 _CALM_STEPS = 12
+_MOVES = 60  # until nothing penetrates any more
+_UPWARD = 0.7  # of a contact's normal from which one object lies on the other
 CALM_SPEED_M_S = 2e-3
 CALM_TURN_RAD_S = 2e-2
 
@@ -61,6 +64,58 @@ def settle(physics: Physics, names: tuple[str, ...], limit_steps: int = _SETTLE_
         physics.step(np.zeros(3))
         calm = calm + 1 if is_calm(physics, names) else 0
     return limit_steps
+
+
+def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None = None) -> None:
+    """Raise if bodies penetrate by more than 2 mm.
+
+    Args:
+        physics: of the bodies.
+        names: of the objects.
+        moved: only pairs of which it is one are looked at; None for all.
+
+    Raises:
+        OverlappingObjects: if so.
+    """
+    for i, first in enumerate(names):
+        gaps = {second: physics.distance(first, second) for second in names[i + 1 :]}
+        gaps["the pusher"] = physics.distance(first, None)
+        gaps["the table"] = physics.table_distance(first)
+        for second, gap in gaps.items():
+            if gap < -OVERLAP_TOLERANCE_M and moved in (None, first, second):
+                raise OverlappingObjects(first, second, -gap)
+
+
+def move_apart(physics: Physics, names: tuple[str, ...]) -> None:
+    """Lift objects that sink into the table, and move apart those that penetrate each other, as little as needed.
+
+    Of two that lie on one another the upper one is lifted; of two side by side each gives way by half. Let go while
+    they penetrate, they would be thrown apart.
+    """
+    for _ in range(_MOVES):
+        is_moved = False
+        for i, first in enumerate(names):
+            if (gap := physics.table_distance(first)) < 0:
+                _shift(physics, first, np.array([0.0, 0.0, -gap]))
+                is_moved = True
+            for second in names[i + 1 :]:
+                gap, normal = physics.separation(first, second)
+                if gap >= 0:
+                    continue
+                is_moved = True
+                if abs(normal[2]) > _UPWARD:
+                    _shift(physics, first if normal[2] > 0 else second, np.array([0.0, 0.0, -gap]))
+                else:
+                    aside = np.array([*normal[:2], 0.0]) / np.linalg.norm(normal[:2])
+                    _shift(physics, first, -gap / 2 * aside)
+                    _shift(physics, second, gap / 2 * aside)
+        if not is_moved:
+            return
+
+
+def _shift(physics: Physics, name: str, by: Float[np.ndarray, "3"]) -> None:
+    pose = physics.pose(name)
+    physics.place(name, Pose(pose.position + by, pose.quaternion))
 
 
 def is_calm(physics: Physics, names: tuple[str, ...]) -> bool:

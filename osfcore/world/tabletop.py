@@ -27,11 +27,10 @@ from osfcore.world.imaging.ray_tracer import Picture, RayTracer, masks_of
 from osfcore.world.imaging.tiny_renderer import TinyScene
 from osfcore.world.imaging.traced_mesh import TracedMesh
 from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, body_model
-from osfcore.world.placing import is_calm, place_randomly
+from osfcore.world.placing import is_calm, move_apart, place_randomly, refuse_overlaps
 from osfcore.world.scene_request import SceneRequest, check_object, check_place, check_request
 
 Renderer = Literal["embree", "tiny"]
-OVERLAP_TOLERANCE_M = 0.002
 _SETTLE_LIMIT_S = 3.0
 
 
@@ -179,7 +178,7 @@ class Tabletop:
         before = (self._names, self.truth() if self._physics is not None else None)
         self._place_all(state)
         try:
-            self._refuse_overlaps()
+            refuse_overlaps(self._bodies, self._names)
         except OverlappingObjects:
             if before[1] is not None:
                 self._place_all(before[1])
@@ -187,6 +186,17 @@ class Tabletop:
                 self.close()
             raise
         self._steps = 0
+
+    def load_measured(self, state: SceneState) -> None:
+        """Like `load` for poses that were measured: what sinks in is lifted, what penetrates is moved apart.
+
+        Raises:
+            UnknownName, MissingAssets, InvalidInput: as `load`.
+        """
+        for name in state.names:
+            check_place(name, state.pose(name).position)
+        self.restore(state)
+        move_apart(self._bodies, self._names)
 
     def restore(self, state: SceneState) -> None:
         """Put back a state that a world has told before.
@@ -263,7 +273,7 @@ class Tabletop:
         before = bodies.pose(name)
         bodies.place(name, Pose(position, quaternion))
         try:
-            self._refuse_overlaps(name)
+            refuse_overlaps(bodies, self._names, name)
         except OverlappingObjects:
             bodies.place(name, before)
             raise
@@ -337,14 +347,3 @@ class Tabletop:
         parked = np.array([PUSHER_REACH_M, PUSHER_REACH_M, PUSHER_CENTRE_Z_M])
         self._bodies.place_pusher(parked if state.pusher is None else state.pusher)
         self._light = state.light
-
-    def _refuse_overlaps(self, moved: str | None = None) -> None:
-        """Raise OverlappingObjects if bodies penetrate; with `moved`, only pairs of which it is one are looked at."""
-        bodies = self._bodies
-        for i, first in enumerate(self._names):
-            gaps = {second: bodies.distance(first, second) for second in self._names[i + 1 :]}
-            gaps["the pusher"] = bodies.distance(first, None)
-            gaps["the table"] = bodies.table_distance(first)
-            for second, gap in gaps.items():
-                if gap < -OVERLAP_TOLERANCE_M and moved in (None, first, second):
-                    raise OverlappingObjects(first, second, -gap)

@@ -26,6 +26,7 @@ from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals.goals import DraftChanged, GoalsChanged
+from app.services.photos.table_photos import PhotosChanged
 from app.services.visitors.driver import DriverChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking
@@ -39,7 +40,7 @@ LOOK_INTERVAL_S = 0.3
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
-Letter = JobChanged | JobForgotten | Notice | GoalsChanged | DriverChanged
+Letter = JobChanged | JobForgotten | Notice | GoalsChanged | PhotosChanged | DriverChanged
 
 
 async def _counted(services: ServicesDep) -> AsyncIterator[None]:
@@ -81,7 +82,7 @@ class Mailbox:
 
     def _put(self, event: object) -> None:
         match event:
-            case JobChanged() | JobForgotten() | Notice() | GoalsChanged() | DriverChanged():
+            case JobChanged() | JobForgotten() | Notice() | GoalsChanged() | PhotosChanged() | DriverChanged():
                 self.letters.append(event)
             case DraftChanged():
                 self.draft = event
@@ -107,7 +108,7 @@ async def stream(
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: "job", "look", "forgotten", "scene", "frame", "goals", "draft", "driver", "notice"."""
+    """Follow what happens: "job", "look", "forgotten", "scene", "frame", "goals", "photos", "draft", "driver", "notice"."""
     del counted
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)
@@ -154,6 +155,8 @@ async def _follow(
                     yield _notice_event(services, letter)
                 case GoalsChanged():
                     yield ServerSentEvent(event="goals", raw_data="null")
+                case PhotosChanged():
+                    yield ServerSentEvent(event="photos", raw_data="null")
                 case DriverChanged():
                     yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already

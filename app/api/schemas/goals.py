@@ -128,7 +128,9 @@ class GoalOut(BaseModel):
     id: str
     name: str
     created_at: str = Field(description="UTC, ISO 8601.")
-    source: Source = Field(description="An uploaded photo, a layout by hand, or a random one.")
+    source: Source = Field(
+        description="An uploaded photo, a layout by hand or at random, or found in a photo of a table."
+    )
     scene: str | None = Field(description="That it was made from; null for an upload.")
     width: int = Field(description="[px]")
     height: int = Field(description="[px]")

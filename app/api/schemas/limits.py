@@ -58,6 +58,14 @@ REPLAY_SPEED = (0.1, 16)
 # Predictions
 SEQUENCES = (1, 1000)
 
+# Photos of tables
+PIXEL = (0, 100_000)
+CLICKS = (0, 50)
+STROKES = (0, 50)
+STROKE_POINTS = (1, 500)
+TOGETHER = (0, 8)
+POSE_CHOICE = (0, 100)
+
 # Jobs
 PUSH_EPISODES = (1, 100_000)
 PUSH_STEPS = (1, 1000)

@@ -224,13 +224,17 @@ def settings_of(given: Mapping[str, Any]) -> EpisodeSettings:
 
 
 def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:
-    """The goal image among the inputs, or the poses in the parameters."""
+    """The goal image among the inputs, or the poses in the parameters, with a photograph of them if there is one."""
     from app.episodes.request import read_goal
+    from osfcore.control.goal import PhotoGoal
     from osfcore.planning.pose_cost import PoseGoal
 
+    image = None if given["camera"] is None else read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
     if given["poses"] is None:
-        return read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
-    return PoseGoal(names, _poses(given["poses"], names))
+        assert image is not None, "the service gives one or the other"
+        return image
+    poses = _poses(given["poses"], names)
+    return PoseGoal(names, poses) if image is None else PhotoGoal(names, poses, image)
 
 
 def _prepared(path: Path) -> PreparedLooks | None:

@@ -86,6 +86,26 @@ class Comparison:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class DrawPhoto:
+    """Render what a photograph of a table shows, as bright as that. Answered by PNG, encoded as sRGB.
+
+    Attributes:
+        key: different for every order, since none is to be left out.
+        state: what was found.
+        camera: that took the photo, perhaps with fewer pixels.
+        photo: JPEG.
+        masks: PNGs of the photo's size, which together show the objects.
+    """
+
+    key: str
+    state: SceneState
+    camera: Camera
+    photo: bytes
+    masks: tuple[bytes, ...]
+    patience: ClassVar[int] = 1
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class CheckPhoto:
     """Look whether a photo shows the objects of a scene. Answered by a ContentCheck.
 
@@ -135,5 +155,5 @@ class Predicted:
     took_s: float
 
 
-Order = DrawView | CompareView | CheckPhoto | PredictPushes
-NeuralAnswer = DrawnView | Comparison | ContentCheck | Predicted | None
+Order = DrawView | CompareView | DrawPhoto | CheckPhoto | PredictPushes
+NeuralAnswer = DrawnView | Comparison | ContentCheck | Predicted | bytes | None

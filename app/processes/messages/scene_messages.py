@@ -44,7 +44,10 @@ class SceneRecord:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CreateScene:
-    """Make a scene: random from the seed, or with exact poses. Answered by a SceneRecord."""
+    """Make a scene: random from the seed, or with given poses. Answered by a SceneRecord.
+
+    Measured poses may err: objects that penetrate are moved apart, and all come to rest as if let go.
+    """
 
     id: str
     seed: int
@@ -54,6 +57,7 @@ class CreateScene:
     count: int
     light: Light | None
     poses: Pose | None  # of `names`; None for random ones
+    is_measured: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -173,6 +177,7 @@ class ComposeGoal:
         moved: objects that a random layout moves; as the seed will have it if None.
         light: in which it is seen; None for the scene's.
         size: side of the image [px].
+        is_measured: the poses may err: objects that penetrate are moved apart first.
     """
 
     id: str
@@ -181,6 +186,7 @@ class ComposeGoal:
     moved: int | None = None
     light: Light | None = None
     size: int = DEFAULT_IMAGE_SIDE
+    is_measured: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)

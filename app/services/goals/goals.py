@@ -219,6 +219,10 @@ class Goals:
         command = ComposeGoal(self._scene(scene), seed=seed, moved=moved, light=light, size=GOAL_SIDE)
         return self._made("drawn", command, name)
 
+    def keep_photographed(self, name: str, scene: str, camera: Camera, poses: Poses, png: bytes) -> GoalRecord:
+        """Keep a layout that was found in a photograph, with that as its image; raises as `receive`."""
+        return self._keep("photo", name, scene, camera, poses, png)
+
     def _made(self, source: Source, command: ComposeGoal, name: str, example: str | None = None) -> GoalRecord:
         made = self._runner.compose(command)
         return self._keep(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png, example)

@@ -1,0 +1,177 @@
+"""Photos of tables: send one, mark objects in it, let them be found, make it a table or a goal."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response, status
+from fastapi.responses import FileResponse
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from app.api.bodies import BoundedRoute, kind_of, whole_body
+from app.api.dependencies import Services, ServicesDep
+from app.api.lanes import slow
+from app.api.open_file import OpenFile
+from app.api.problems import named_in_path
+from app.api.routes import JPEG, PNG, problems
+from app.api.schemas.goals import GoalOut
+from app.api.schemas.limits import GOAL_NAME, NAME, PIXEL, sized
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
+from app.api.schemas.photos import (
+    ChoiceIn,
+    FindIn,
+    GoalMadeOut,
+    MakeGoalIn,
+    MakeTableIn,
+    MarkIn,
+    PhotoList,
+    PhotoPatch,
+    TableMadeOut,
+    TablePhotoOut,
+    facts_of,
+)
+from app.storage.table_photos import TablePhoto
+
+UPLOAD_PATH = "/api/photos"
+_ANY_FILE = "application/octet-stream"  # what browsers call formats that they do not know
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "A photo.",
+        "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+router = APIRouter(prefix=UPLOAD_PATH, tags=["photos"], responses=problems(), route_class=BoundedRoute)
+ObjectPath = Annotated[str, Path(**sized(NAME), description="Name of an object.", examples=["025_mug"])]
+
+
+def _known_photo(
+    services: ServicesDep, photo: Annotated[str, Path(description="Identifier of a photo.")]
+) -> TablePhoto:
+    with named_in_path():
+        return services.photos.get(photo)
+
+
+PhotoDep = Annotated[TablePhoto, Depends(_known_photo)]
+
+
+@router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409, 415, 503, 507), openapi_extra=_BODY)
+async def create(
+    services: ServicesDep,
+    request: Request,
+    response: Response,
+    name: Annotated[str, Query(**sized(GOAL_NAME), description="For people.")] = "Photo",
+    focal_px: Annotated[
+        float | None, Query(gt=0, le=PIXEL[1], description="Focal length in pixels, if it is known.")
+    ] = None,
+) -> TablePhotoOut:
+    """Keep a photo of a table, of any size and usual format; its camera is found if the printed board is in view."""
+    kind = kind_of(request)
+    if not (kind.startswith("image/") or kind == _ANY_FILE):
+        raise HTTPException(status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, "Send a photo, such as a JPEG or PNG file.")
+    try:
+        data = await whole_body(request, services.settings.max_photo_bytes)
+    except ClientDisconnect:
+        raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
+    photo = await run_in_threadpool(services.photos.receive, data, name, focal_px)
+    response.headers["Location"] = f"{UPLOAD_PATH}/{photo.id}"
+    return _out(services, photo)
+
+
+@router.get("")
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> PhotoList:
+    """List photos of tables, newest first."""
+    shown, total, following = page(services.photos.all(), limit, after, newest_first=True)
+    return PhotoList(photos=[facts_of(photo) for photo in shown], total=total, next=following)
+
+
+@router.get("/{photo}", responses=problems(404))
+def get(services: ServicesDep, photo: PhotoDep) -> TablePhotoOut:
+    """Tell what is marked in a photo, and what was found."""
+    return _out(services, photo)
+
+
+@router.patch("/{photo}", responses=problems(404, 503, 507))
+@slow
+def set_focal(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> TablePhotoOut:
+    """Give a photo another focal length."""
+    return _out(services, services.photos.set_focal(photo.id, body.focal_px))
+
+
+@router.delete("/{photo}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))
+def remove(services: ServicesDep, photo: PhotoDep) -> None:
+    """Delete a photo; tables and goals that were made of it stay."""
+    services.photos.remove(photo.id)
+
+
+@router.put("/{photo}/objects/{name}", responses=problems(404, 503, 507))
+@slow
+def mark(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: MarkIn) -> TablePhotoOut:
+    """Point at an object, or anew; its mask is found."""
+    return _out(services, services.photos.mark(photo.id, name, body.mark()))
+
+
+@router.delete("/{photo}/objects/{name}", responses=problems(404, 507))
+@slow
+def unmark(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> TablePhotoOut:
+    """Forget what was marked of an object."""
+    with named_in_path():
+        return _out(services, services.photos.unmark(photo.id, name))
+
+
+@router.post("/{photo}/objects/{name}/choice", responses=problems(404, 409, 507))
+@slow
+def choose(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: ChoiceIn) -> TablePhotoOut:
+    """Take one of the poses that were found of an object."""
+    return _out(services, services.photos.choose(photo.id, name, body.choice))
+
+
+@router.post("/{photo}/find", status_code=status.HTTP_202_ACCEPTED, responses=problems(404, 409, 429, 507))
+@slow
+def find(services: ServicesDep, photo: PhotoDep, body: FindIn) -> TablePhotoOut:
+    """Find the marked objects and the lamp; `job` tells how far that is."""
+    return _out(services, services.photos.find(photo.id, body.together, body.seed))
+
+
+@router.post("/{photo}/table", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 503, 507))
+@slow
+def make_table(services: ServicesDep, photo: PhotoDep, body: MakeTableIn) -> TableMadeOut:
+    """Make a table whose objects lie as in the photo, under its lamp, and show it."""
+    made = services.photo_tables.make_table(photo.id, despite_doubts=body.despite_doubts)
+    return TableMadeOut(scene=services.scene_out(made.scene), notes=list(made.notes))
+
+
+@router.post("/{photo}/goal", status_code=status.HTTP_201_CREATED, responses=problems(404, 409, 503, 507))
+@slow
+def make_goal(services: ServicesDep, photo: PhotoDep, body: MakeGoalIn) -> GoalMadeOut:
+    """Make a goal in which objects lie as in the photo."""
+    made = services.photo_tables.make_goal(photo.id, body.scene, despite_doubts=body.despite_doubts)
+    scene = services.scene_out(made.scene)
+    return GoalMadeOut(scene=scene, notes=list(made.notes), goal=GoalOut.of(made.goal))
+
+
+@router.get("/{photo}/photo.jpg", response_class=FileResponse, responses={**problems(404), **JPEG})
+def picture(services: ServicesDep, photo: PhotoDep) -> OpenFile:
+    """Show a photo, upright, no side longer than 2048 px."""
+    return OpenFile(services.photos.picture(photo.id), f"{photo.name} has been deleted.", media_type="image/jpeg")
+
+
+@router.get("/{photo}/objects/{name}/mask.png", response_class=FileResponse, responses={**problems(404), **PNG})
+def mask(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> OpenFile:
+    """Show the mask of a marked object."""
+    with named_in_path():
+        photo.marked(name)
+    return OpenFile(services.photos.mask(photo.id, name), f"{name} is not marked.", media_type="image/png")
+
+
+@router.get("/{photo}/drawing.png", response_class=Response, responses={**problems(404, 409, 503), **PNG})
+@slow
+def drawing(services: ServicesDep, photo: PhotoDep) -> Response:
+    """Show how the scene that was found looks from the photo's camera, with its shadows."""
+    png = services.photo_tables.drawing(photo.id)
+    return Response(png, media_type="image/png", headers={"Cache-Control": "no-store"})
+
+
+def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:
+    job = services.photos.job(photo)
+    found = services.photos.found(photo) if job is not None and job.state == "done" else None
+    return TablePhotoOut.of(photo, job, found, services.objects.labels())

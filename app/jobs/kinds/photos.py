@@ -1,0 +1,120 @@
+"""The job that finds objects and lamp in photographs of one table.
+
+Its inputs: for photo K `K`, the file as it was sent, and `K_NAME.png`, the masks of marked objects; cameras stand in
+the parameters. It leaves `found.json` and a sheet `NAME.J.png` of each pose that explains the first photo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from app.jobs.job import INPUTS
+from osfcore.io.files import write_json
+from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, decode, encode
+from osfcore.random_streams import Stream, stream_rng
+
+if TYPE_CHECKING:
+    from app.jobs.context import JobContext
+    from osfcore.photo.photograph import Photograph
+    from osfcore.photo.poses.estimate_photo import PhotoModels
+    from osfcore.photo.poses.photo_steps import PhotoObject
+
+FOUND = "found.json"
+
+
+class PhotoOrder(Entry):
+    """One photograph of the job.
+
+    Attributes:
+        K: intrinsics [px].
+        T_world_camera: pose over the printed board; None if the photo shows none.
+        names: of the objects that are marked in it.
+    """
+
+    K: Matrix3
+    T_world_camera: Matrix4 | None
+    names: list[Text]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """How far the job is.
+
+    Attributes:
+        done: parts finished.
+        total: parts in all.
+        note: what is being done.
+        found: how many objects were found so far.
+    """
+
+    done: int
+    total: int
+    note: str
+    found: int = 0
+
+
+def sheet_name(name: str, choice: int) -> str:
+    """The file with the sheet of one of an object's poses."""
+    return f"{name}.{choice}.png"
+
+
+def photo_job(params: dict[str, Any], place: JobContext) -> Iterator[Finding]:
+    """Find the objects.
+
+    Raises:
+        OsfError: if an object has no field, nothing can be found, or the disk refuses.
+    """
+    from osfcore.fields.field_library import FieldLibrary
+    from osfcore.photo.poses.estimate_photo import PhotoModels, estimate_photo
+    from osfcore.photo.summary import summarised
+
+    yield Finding(0, 0, "Loading fields")
+    names, folder = tuple(params["names"]), place.folder / INPUTS
+    orders = [decode(PhotoOrder, order, "photo") for order in params["photos"]]
+    photos = [_photograph(folder, number, order) for number, order in enumerate(orders)]
+    fields = FieldLibrary(place.data_dir)
+    models = PhotoModels({name: fields.load(name) for name in names})
+    rng = stream_rng(params["seed"], Stream.PHOTO_SEARCH)
+    step = None
+    for step in estimate_photo(models, photos, names, rng):
+        yield Finding(step.progress.done, step.progress.total + 1, step.progress.note, len(step.found))
+    assert step is not None
+    yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
+    write_json(place.folder / FOUND, encode(summarised(photos[0], step, models, params["notes"])))
+    for found in step.found:
+        if found.name in photos[0].masks:
+            _draw_sheets(place.folder, models, photos[0], found)
+    yield Finding(step.progress.total + 1, step.progress.total + 1, "Done", len(step.found))
+
+
+def inputs_of(number: int, sent: Path, masks: Mapping[str, Path]) -> dict[str, Path]:
+    """What the inputs of one photograph are called, and what is copied there."""
+    return {str(number): sent, **{f"{number}_{name}.png": path for name, path in masks.items()}}
+
+
+def _photograph(folder: Path, number: int, order: PhotoOrder) -> Photograph:
+    from osfcore.geometry.poses import Pose
+    from osfcore.photo.read_photograph import read_photograph, to_photograph
+
+    T = None if order.T_world_camera is None else Pose.from_matrix(np.array(order.T_world_camera))
+    masks = {name: _mask(folder / f"{number}_{name}.png") for name in order.names}
+    return to_photograph(read_photograph(folder / str(number)), np.array(order.K), T, masks)
+
+
+def _mask(path: Path) -> np.ndarray:
+    decoded = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert decoded is not None
+    return decoded > 127
+
+
+def _draw_sheets(folder: Path, models: PhotoModels, photo: Photograph, found: PhotoObject) -> None:
+    from osfcore.inspection.photo_sheet import write_sheet
+
+    for choice, pose in enumerate((found.best, *found.rivals)):
+        write_sheet(folder / sheet_name(found.name, choice), models, photo, replace(found, best=pose))

@@ -1,0 +1,110 @@
+"""Orders to the process that looks at photographs of tables, and their answers. Places are pixels of the picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from osfcore.geometry.poses import Pose
+
+CameraSource = Literal["board", "given", "file", "assumed"]
+Points = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadPhoto:
+    """Decode a photograph and find its camera. Answered by a PhotoRead.
+
+    Attributes:
+        data: the file as it was sent.
+        focal_px: focal length in pixels of the photo as it was sent; None where nobody knows.
+    """
+
+    data: bytes
+    focal_px: float | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PhotoRead:
+    """A decoded photograph.
+
+    Attributes:
+        jpeg: the picture, no side longer than 2048 px.
+        width: of the picture [px].
+        height: of the picture [px].
+        sent_width: of the photo as it was sent [px].
+        K: intrinsics [px].
+        source: who tells the focal length.
+        T_world_camera: pose over the printed board; None if the photo shows none.
+        notes: sentences for the user.
+    """
+
+    jpeg: bytes
+    width: int
+    height: int
+    sent_width: int
+    K: tuple[tuple[float, ...], ...]
+    source: CameraSource
+    T_world_camera: Pose | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """A line of the brush.
+
+    Attributes:
+        adds: whether what it covers belongs to the object; else it does not.
+        radius: of the brush [px].
+        points: that it runs through.
+    """
+
+    adds: bool
+    radius: float
+    points: Points
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """How a person points at an object.
+
+    Attributes:
+        box: left, top, right, bottom, around the object.
+        on: clicks on it.
+        off: clicks beside it.
+        strokes: of the brush, in their order.
+    """
+
+    box: tuple[float, float, float, float]
+    on: Points = ()
+    off: Points = ()
+    strokes: tuple[Stroke, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FindMask:
+    """Find which pixels show an object. Answered by a MaskFound.
+
+    Attributes:
+        jpeg: the picture.
+        mark: where the object is.
+    """
+
+    jpeg: bytes
+    mark: Mark
+
+
+@dataclass(frozen=True, slots=True)
+class MaskFound:
+    """A mask.
+
+    Attributes:
+        png: 255 where the object is.
+        outline: closed polygons around it, and around its holes.
+    """
+
+    png: bytes
+    outline: tuple[Points, ...]
+
+
+PhotoOrder = ReadPhoto | FindMask

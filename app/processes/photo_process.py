@@ -1,0 +1,89 @@
+"""The process that decodes photographs of tables, finds their cameras and the masks of objects in them.
+
+Decoders have defects, so strangers' files are looked at here only: it may die or be ended without hurting the service.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from app.processes.child_process import limit_memory
+from app.processes.messages.photo_messages import FindMask, Mark, MaskFound, PhotoOrder, PhotoRead, ReadPhoto
+from app.processes.process_server import ProcessServer
+from osfcore.errors import CorruptFile, OsfError
+
+_MEMORY_BYTES = 3 << 29  # sound photos take two thirds of it
+_JPEG_QUALITY = 95
+_OUTLINE_PX = 0.7  # by which the outline that is drawn may differ from the mask's
+
+
+class PhotoRefused(OsfError):
+    """A photo that cannot be used."""
+
+
+def photo_main(server: ProcessServer) -> None:
+    """Look at the photographs that are sent."""
+    limit_memory(_MEMORY_BYTES)
+    server.serve(lambda order, _: carry_out(order))
+
+
+def carry_out(order: PhotoOrder) -> PhotoRead | MaskFound:
+    """Do what an order says.
+
+    Raises:
+        PhotoRefused: if the photo cannot be used.
+        InvalidInput: if the focal length or a mark makes no sense.
+    """
+    return _read(order) if isinstance(order, ReadPhoto) else _mask(order)
+
+
+def _read(order: ReadPhoto) -> PhotoRead:
+    from osfcore.photo.located import locate
+    from osfcore.photo.read_photograph import read_photograph
+
+    try:
+        raw = read_photograph(order.data)
+    except CorruptFile as error:
+        raise PhotoRefused(str(error)) from None
+    found = locate(raw, order.focal_px)
+    height, width = raw.encoded.shape[:2]
+    K = tuple(tuple(float(value) for value in row) for row in found.intrinsics)
+    return PhotoRead(
+        _jpeg(raw.eight_bit), width, height, raw.sent_size[0], K, found.source, found.T_world_camera, found.notes
+    )
+
+
+def _jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    done, encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    assert done
+    return encoded.tobytes()
+
+
+def _mask(order: FindMask) -> MaskFound:
+    from osfcore.io.image_file import encode_png
+    from osfcore.photo.segmentation import propose_mask
+
+    decoded = cv2.imdecode(np.frombuffer(order.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    picture, mark = np.ascontiguousarray(decoded[..., ::-1]), order.mark
+    add, remove = _painted(mark, picture.shape[:2])
+    clicks = (np.reshape(np.array(points, float), (-1, 2)) for points in (mark.on, mark.off))
+    mask = propose_mask(picture, mark.box, *clicks, add=add, remove=remove)
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    plain = [cv2.approxPolyDP(line, _OUTLINE_PX, True)[:, 0] + 0.5 for line in outlines]
+    polygons = tuple(tuple((float(x), float(y)) for x, y in line) for line in plain if len(line) > 2)
+    return MaskFound(encode_png(np.where(mask, 255, 0).astype(np.uint8)), polygons)
+
+
+def _painted(mark: Mark, shape: tuple[int, int]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """What the brush adds and what it takes away; of strokes that cross the last one counts."""
+    canvas = np.zeros(shape, np.uint8)
+    for stroke in mark.strokes:
+        value, thickness = (1 if stroke.adds else 2), max(round(2 * stroke.radius), 1)
+        points = np.floor(np.array(stroke.points)).astype(np.int32)
+        cv2.polylines(canvas, [points], False, value, thickness)
+        for x, y in points[[0, -1]].tolist():
+            cv2.circle(canvas, (x, y), max(round(stroke.radius), 1), value, -1)
+    return canvas == 1, canvas == 2

@@ -1,0 +1,235 @@
+"""What becomes of a photographed table: a table of the simulation, or a goal of one; and how it looks when drawn."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from app.processes.messages.neural_messages import DrawPhoto
+from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
+from app.processes.process_client import ProcessClient
+from app.services.goals.goals import Goals
+from app.services.photos.table_photos import TablePhotos
+from app.services.runner import Runner
+from app.storage.goal_store import GoalRecord, Poses
+from app.storage.photo_crop import GOAL_SIDE
+from app.storage.table_photos import TablePhoto
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, rotate, rotation_angle
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import WORKSPACE_HALF_M
+from osfcore.io.image_file import encode_png
+from osfcore.photo.found_scene import FoundLight, FoundScene
+from osfcore.photo.table_layout import place_on_table
+
+_DRAWN_SIDE = 640  # [px]
+_STAYED_M, _STAYED_RAD = 0.02, np.deg2rad(20.0)  # by which an object may move when it is let go where it was found
+_LOWEST = np.sin(np.deg2rad(5.5))  # of a unit vector toward a lamp
+_OVERHEAD = Light(np.array([0.0, 0.0, 1.0]))
+
+
+class NoPhotographedTable(OsfError):
+    """A photograph that does not tell where the table is."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "The photo does not tell where the table is; mark a second object that stands on it, or photograph it with "
+            "the printed board in view."
+        )
+
+
+class PhotoDoubtful(OsfError):
+    """A photograph in which something was not found for certain."""
+
+    def __init__(self, doubts: list[str]) -> None:
+        super().__init__(f"{' '.join(doubts)} Nothing was changed; choose a picture of each, or mark it anew.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TableMade:
+    """A table that was made of a photograph.
+
+    Attributes:
+        scene: the table.
+        notes: sentences about what does not lie as in the photo.
+    """
+
+    scene: SceneRecord
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GoalMade(TableMade):
+    """A goal that was made of a photograph, and the table that it is for.
+
+    Attributes:
+        goal: the goal.
+    """
+
+    goal: GoalRecord
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Layout:
+    """Objects and camera on our table."""
+
+    poses: Poses
+    T_table_photo: Pose
+    T_table_camera: Pose
+    light: Light
+
+
+class PhotoTables:
+    """Makes tables and goals of photographs. Methods block; any thread may call.
+
+    Args:
+        runner: makes tables.
+        photos: tells what was found.
+        goals: keeps goals.
+        link: to the process that renders fields.
+    """
+
+    def __init__(self, runner: Runner, photos: TablePhotos, goals: Goals, link: ProcessClient) -> None:
+        self._runner, self._photos, self._goals, self._link = runner, photos, goals, link
+
+    def make_table(self, photo: str, *, despite_doubts: bool = False) -> TableMade:
+        """A new table whose objects lie as in a photograph, under its lamp.
+
+        Raises:
+            UnknownName: if there is no such photo.
+            NotFoundYet, NoPhotographedTable, PhotoDoubtful: if it is not known how they lie.
+            InvalidInput: if they lie too far apart.
+            TooManyScenes, MissingAssets, OsfError: as tables are made.
+        """
+        record = self._photos.get(photo)
+        layout = self._layout(record, despite_doubts=despite_doubts)
+        scene = self._runner.create_scene(poses=layout.poses, light=layout.light, is_measured=True)
+        self._photos.keep(replace(record, scene=scene.id, T_table_photo=layout.T_table_photo))
+        return TableMade(scene, _moved(layout.poses, scene.initial))
+
+    def make_goal(self, photo: str, scene: str | None = None, *, despite_doubts: bool = False) -> GoalMade:
+        """A goal in which objects lie as in a photograph.
+
+        Args:
+            photo: identifier.
+            scene: that the goal is for; None for the current one if it holds the photo's objects, else a new one with
+                these in random places.
+            despite_doubts: whether what was not found for certain counts all the same.
+
+        Raises:
+            UnknownName: if there is no such photo or scene, or the scene lacks one of its objects.
+            NotFoundYet, NoPhotographedTable, PhotoDoubtful: if it is not known how they lie.
+            InvalidInput: if they lie too far apart.
+            SceneHeld, TooManyScenes, TooManyGoals, OsfError: as tables and goals are made.
+        """
+        record = self._photos.get(photo)
+        layout = self._layout(record, scene or self._runner.current, despite_doubts=despite_doubts)
+        table = self._table(scene, tuple(name for name, _ in layout.poses))
+        made = self._runner.compose(ComposeGoal(table.id, layout.poses, is_measured=True))
+        camera = record.camera(layout.T_table_camera, GOAL_SIDE)
+        png = self._reduced(record, camera.width, camera.height)
+        goal = self._goals.keep_photographed(record.name, table.id, camera, made.poses, png)
+        return GoalMade(table, _moved(layout.poses, dict(made.poses)), goal)
+
+    def drawing(self, photo: str) -> bytes:
+        """PNG of how the found scene looks from the photograph's camera, with its shadows.
+
+        Raises:
+            UnknownName: if there is no such photo.
+            NotFoundYet, NoPhotographedTable: if it is not known how the objects lie.
+            ProcessUnavailable: if what renders died.
+        """
+        record = self._photos.get(photo)
+        found = self._photos.found(record)
+        if found.table is None:
+            raise NoPhotographedTable
+        poses = _chosen(record, found)
+        stacked = Pose(np.array([pose.position for _, pose in poses]), np.array([pose.quaternion for _, pose in poses]))
+        state = SceneState(tuple(name for name, _ in poses), stacked, _light(found.light, Pose.identity()), None)
+        camera = record.camera(_camera_pose(found), _DRAWN_SIDE)
+        masks = tuple(self._photos.mask(photo, entry.name).read_bytes() for entry in record.objects)
+        return self._link.call(
+            DrawPhoto(uuid.uuid4().hex, state, camera, self._photos.picture(photo).read_bytes(), masks)
+        )
+
+    def _layout(self, record: TablePhoto, scene: str | None = None, *, despite_doubts: bool) -> _Layout:
+        found = self._photos.found(record)
+        if found.table is None:
+            raise NoPhotographedTable
+        doubts = [each.doubt for each in found.objects if each.doubt and not _is_settled(record, each.name)]
+        if doubts and not despite_doubts:
+            raise PhotoDoubtful(doubts)
+        poses = _chosen(record, found)
+        T = self._shared_frame(record, scene) if found.table == "board" else None
+        T = T or place_on_table(_camera_pose(found), [pose for _, pose in poses])
+        placed = tuple((name, T @ pose) for name, pose in poses)
+        for name, pose in placed:
+            if np.abs(pose.position[:2]).max() > WORKSPACE_HALF_M + 1e-6:
+                side = f"{200 * WORKSPACE_HALF_M:.0f}"
+                raise InvalidInput(f"place of {name}", "too far aside", f"within the {side} cm square of the pusher")
+        return _Layout(placed, T, T @ _camera_pose(found), _light(found.light, T))
+
+    def _shared_frame(self, record: TablePhoto, scene: str | None) -> Pose | None:
+        """Where the board lies on a table that was made of another photograph of it; None if that cannot be told."""
+        for other in (record, *self._photos.all()):
+            if scene is not None and other.scene == scene and other.T_world_camera is not None:
+                return other.T_table_photo
+        return None
+
+    def _table(self, scene: str | None, names: tuple[str, ...]) -> SceneRecord:
+        if scene is not None:
+            return self._runner.scene(scene)
+        current = None if self._runner.current is None else self._runner.scene(self._runner.current)
+        if current is not None and set(current.state.names) == set(names):
+            return current
+        return self._runner.create_scene(names=names)
+
+    def _reduced(self, record: TablePhoto, width: int, height: int) -> bytes:
+        pixels = cv2.imread(str(self._photos.picture(record.id)), cv2.IMREAD_COLOR)
+        assert pixels is not None
+        return encode_png(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1])
+
+
+def _camera_pose(found: FoundScene) -> Pose:
+    return Pose.from_matrix(np.array(found.camera.T_world_camera))
+
+
+def _is_settled(record: TablePhoto, name: str) -> bool:
+    """Whether a person has chosen a pose of an object."""
+    return any(entry.name == name and entry.choice is not None for entry in record.objects)
+
+
+def _chosen(record: TablePhoto, found: FoundScene) -> Poses:
+    """The objects in the poses that were chosen, in the photograph's table frame."""
+    choices = {entry.name: entry.choice or 0 for entry in record.objects}
+    return tuple((each.name, each.poses()[choices.get(each.name, 0)].pose()) for each in found.objects)
+
+
+def _light(found: FoundLight | None, T: Pose) -> Light:
+    """The lamp, in another frame; overhead where nothing speaks for one, and never below the least height."""
+    if found is None or found.diffuse:
+        return _OVERHEAD
+    x, y, z = rotate(T.quaternion, np.array(found.direction))
+    flat = max(float(np.hypot(x, y)), 1e-9)
+    z = max(float(z), _LOWEST)
+    level = np.sqrt(1 - min(z, 1.0) ** 2) / flat
+    return Light(np.array([level * x, level * y, z]))
+
+
+def _moved(asked: Poses, rests: SceneState | Mapping[str, Pose]) -> tuple[str, ...]:
+    """A sentence for each object that did not stay where it was found."""
+    notes = []
+    for name, pose in asked:
+        there = rests.pose(name) if isinstance(rests, SceneState) else rests[name]
+        shift = float(np.linalg.norm((there.position - pose.position)[:2]))
+        if shift > _STAYED_M:
+            notes.append(f"{name} did not stay where the photo shows it: it moved by {100 * shift:.0f} cm.")
+        elif (turn := float(rotation_angle(there.quaternion, pose.quaternion))) > _STAYED_RAD:
+            turned = f"it turned by {np.rad2deg(turn):.0f} degrees"
+            notes.append(f"{name} did not stay as the photo shows it: {turned} when it was let go.")
+    return tuple(notes)

@@ -1,0 +1,54 @@
+"""The summary of an estimation: poses on the table where one is known, lamp, camera, and sentences for the user."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose, rotate
+from osfcore.io.scene_file import CameraJson
+from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundScene
+from osfcore.photo.light.photo_light import photo_light
+from osfcore.photo.photograph import Photograph
+from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels
+from osfcore.photo.poses.photo_steps import PhotoObject, PhotoPose, PhotoStep
+
+
+def summarised(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: Sequence[str]) -> FoundScene:
+    """The result of an estimation.
+
+    Args:
+        photo: with masks.
+        step: the last one.
+        models: of the objects.
+        notes: sentences for the user about the photo.
+    """
+    T_table_world, table, notes = Pose.identity(), "board" if photo.on_table else None, list(notes)
+    if step.table is not None:
+        T_table_world, table = step.table.T_world_camera, "objects"
+        seen = f"{len(step.table.supported)} objects lie, whose verticals differ by {step.table.spread_deg:.1f} degrees"
+        notes.append(f"The table was found from how {seen}; it may be off by a few.")
+    light = None
+    try:
+        fit = photo_light(photo, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
+        toward = rotate(T_table_world.quaternion, fit.direction)
+        light = FoundLight(direction=toward.tolist(), std_deg=float(np.rad2deg(fit.std)), diffuse=fit.is_diffuse)
+    except InvalidInput as error:
+        notes.append(f"The light cannot be told: {error}")
+    camera = Camera("photo", T_table_world @ photo.T_world_camera, photo.intrinsics, photo.width, photo.height)
+    objects = [_found(T_table_world, each) for each in step.found]
+    return FoundScene(table=table, objects=objects, light=light, camera=CameraJson.of(camera), notes=notes)
+
+
+def _found(T_table_world: Pose, found: PhotoObject) -> FoundObject:
+    def entry(pose: PhotoPose) -> FoundPose:
+        there = T_table_world @ pose.pose
+        return FoundPose(
+            position=there.position.tolist(), quaternion=there.quaternion.tolist(), loss=pose.loss, iou=pose.iou
+        )
+
+    best, rivals = entry(found.best), [entry(pose) for pose in found.rivals]
+    return FoundObject(**best.model_dump(), name=found.name, doubt=found.doubt, rivals=rivals)
