@@ -117,8 +117,8 @@ class NeuralRenderer:
         rgb, _ = self._picture(order.state, order.camera, quality, {"rgb"})
         photo = linear_from_encoded(sized(_decoded(order.photo)) / 255, "srgb")
         shown = np.any([sized(_decoded(mask))[..., 0] > 127 for mask in order.masks], axis=0)
-        if shown.any():  # neither exposure nor white balance of the photo is known
-            rgb = rgb * (np.median(photo[shown], axis=0) / np.maximum(np.median(rgb[shown], axis=0), 1e-3))
+        if shown.any():  # the exposure of the photo is not known
+            rgb = rgb * (np.median(photo[shown]) / max(float(np.median(rgb[shown])), 1e-3))
         return encode_png(to_uint8(srgb_of_linear(np.clip(rgb, 0, 1))))
 
     def _check(self, order: CheckPhoto) -> ContentCheck:

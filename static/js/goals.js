@@ -68,7 +68,7 @@ export async function uploadGoal(file) {
 
 // Drawing
 
-const ORIGINS = { drawn: "Drawn at random", composed: "Composed by hand" };
+const ORIGINS = { drawn: "Drawn at random", composed: "Composed by hand", photo: "Your photo; where things lie was found in it" };
 
 function originText(goal, scene) {
   const origin = ORIGINS[goal.source] ?? "Uploaded; where things go is read from the photo";

@@ -9,7 +9,7 @@ import { act, tellFailure } from "./toasts.js";
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
   add_object: "New object",
-  train_field: "Field", estimate: "Estimate", episode: "Episode", clip: "Clip",
+  train_field: "Field", estimate: "Estimate", episode: "Episode", clip: "Clip", photo: "Photo",
 };
 export const LIVE = new Set(["queued", "running", "paused"]);
 const number = (name, label, value, min, max) => ({ name, label, value, min, max, type: "number" });
@@ -33,7 +33,7 @@ const FIELDS = {
     number("seed", "Seed", 0, 0, 2147483647),
   ],
 };
-const LATEST = { train_field: "training", estimate: "estimate", episode: "episode", fetch_assets: "objectWork", add_object: "objectWork", clip: "clip" }; // what the page knows of a kind
+const LATEST = { train_field: "training", estimate: "estimate", episode: "episode", fetch_assets: "objectWork", add_object: "objectWork", clip: "clip", photo: "photoJob" }; // what the page knows of a kind
 const jobs = new Map();
 const nodes = new Map();
 let older = null; // where the jobs that are not shown yet begin
@@ -93,7 +93,7 @@ function orderText({ kind, params: p }) {
   if (kind === "fetch_assets") return p.names?.length ? p.names.map(labelOf).join(", ") : "all from the package index";
   if (kind === "add_object") return `from ${p.file_name}`;
   if (kind === "train_field") return `${p.minutes} min from ${p.source.mesh ? `${p.images} images of its mesh` : "an uploaded set"}, seed ${p.seed}`;
-  if (kind === "clip") return `of ${p.title}`;
+  if (kind === "clip" || kind === "photo") return `of ${p.title}`;
   if (kind === "estimate") return `${p.mode} frame of ${p.of.file_name ?? "a scene"}, ${p.names.length} objects, seed ${p.seed}`;
   if (kind === "episode") return `${p.names.map(labelOf).join(", ")}; ${p.settings.cost} cost, at most ${p.settings.steps} steps`;
   return `${p.images} images of ${p.size} px, seed ${p.seed}`;

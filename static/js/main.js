@@ -29,6 +29,7 @@ import { setUpNumbers } from "./numbers.js";
 import { setUpObjectWork } from "./object-work.js";
 import { refreshObjects, setUpObjects } from "./objects.js";
 import { setUpOwnObject } from "./own-object.js";
+import { refreshPhotos, setUpPhoto } from "./photo.js";
 import { setUpPresets } from "./presets.js";
 import { setUpPush } from "./push.js";
 import { setUpResults } from "./results.js";
@@ -100,6 +101,7 @@ setUpPresets();
 setUpGoals();
 setUpCrop();
 setUpGoalCheck();
+setUpPhoto();
 setUpCompose();
 setUpDrop();
 setUpEpisodeView();
@@ -116,6 +118,7 @@ setUpKeyboard();
 refreshObjects();
 refreshSets();
 refreshGoals();
+refreshPhotos();
 
 listen(VISITOR, {
   open(again) {
@@ -129,6 +132,7 @@ listen(VISITOR, {
       refreshObjects();
       refreshSets();
       refreshGoals();
+      refreshPhotos();
       refreshSettings();
       refreshEpisodes();
       refreshShown();
@@ -145,6 +149,7 @@ listen(VISITOR, {
   },
   draft: (draft) => set("draft", draft),
   goals: () => refreshGoals(),
+  photos: () => refreshPhotos(),
   driver: (driver) => set("driver", driver),
   notice({ level, text }) {
     toast(text, level);

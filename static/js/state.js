@@ -2,14 +2,15 @@
 
 // The scene is undefined until the service has told, and null when there is none.
 // `training` is the job that trains a field now, or the latest one that did; `estimate` and `episode` likewise,
-// `objectWork` the one that fetches or makes objects, `clip` the one that makes a clip.
+// `objectWork` the one that fetches or makes objects, `clip` the one that makes a clip, `photoJob` the one
+// that looks at a photo of a table.
 // `goal` is the one that was chosen on this page; `draft` the one that is being composed, null when there is none.
 // `check` is what the service says of the goal and the table, null while it says nothing.
 // `driver` tells which visitor drives; `opened` is an episode that somebody wants to see, `report`
 // the one that was fetched last; `settings` what the form says, null if that cannot be used.
 const state = {
   scene: undefined, objects: [], fields: undefined, training: undefined, estimate: undefined, episode: undefined,
-  objectWork: undefined, clip: undefined,
+  objectWork: undefined, clip: undefined, photoJob: undefined,
   goals: [], goal: null, check: null, draft: null, driver: null, opened: null, report: null, settings: null,
 };
 const listeners = Object.fromEntries(Object.keys(state).map((what) => [what, []]));

@@ -108,7 +108,7 @@ async def stream(
     ] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: "job", "look", "forgotten", "scene", "frame", "goals", "photos", "draft", "driver", "notice"."""
+    """Follow what happens: job, look, forgotten, scene, frame, goals, photos, draft, driver, notice."""
     del counted
     mailbox = Mailbox(services.runner.current)
     leave = services.runner.hub.subscribe(mailbox.put)

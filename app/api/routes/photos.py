@@ -30,6 +30,8 @@ from app.api.schemas.photos import (
     facts_of,
 )
 from app.storage.table_photos import TablePhoto
+from osfcore.photo.board import Board
+from osfcore.photo.board_page import board_pdf
 
 UPLOAD_PATH = "/api/photos"
 _ANY_FILE = "application/octet-stream"  # what browsers call formats that they do not know
@@ -82,6 +84,12 @@ def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEnt
     """List photos of tables, newest first."""
     shown, total, following = page(services.photos.all(), limit, after, newest_first=True)
     return PhotoList(photos=[facts_of(photo) for photo in shown], total=total, next=following)
+
+
+@router.get("/board.pdf", response_class=Response, responses={200: {"content": {"application/pdf": {}}}})
+def board() -> Response:
+    """The board to print, an A4 page; laid on the table it tells where the camera was."""
+    return Response(board_pdf(Board()), media_type="application/pdf")
 
 
 @router.get("/{photo}", responses=problems(404))

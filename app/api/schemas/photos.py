@@ -20,9 +20,7 @@ from osfcore.photo.found_scene import FoundLight, FoundPose, FoundScene, TableSo
 Pixel = Annotated[FiniteFloat, Field(**within(PIXEL))]
 PointIn = Annotated[list[Pixel], Field(min_length=2, max_length=2)]
 Clicks = Annotated[list[PointIn], Field(**sized(CLICKS))]
-Focal = Annotated[
-    FiniteFloat, Field(gt=0, le=PIXEL[1], description="Focal length in pixels of the photo as sent.")
-]
+Focal = Annotated[FiniteFloat, Field(gt=0, le=PIXEL[1], description="Focal length in pixels of the photo as sent.")]
 
 
 class StrokeIn(Input):
@@ -39,7 +37,7 @@ class MarkIn(Input):
     box: Annotated[list[Pixel], Field(min_length=4, max_length=4, description="Left, top, right, bottom [px].")]
     on: Clicks = Field(default=[], description="Clicks on the object.")
     off: Clicks = Field(default=[], description="Clicks beside it.")
-    strokes: Annotated[list[StrokeIn], Field(**sized(STROKES))] = []
+    strokes: list[StrokeIn] = Field(default=[], **sized(STROKES))
 
     def mark(self) -> Mark:
         """Unchecked."""
@@ -57,8 +55,8 @@ class PhotoPatch(Input):
 class FindIn(Input):
     """How to look for what is marked."""
 
-    together: Annotated[list[str], Field(**sized(TOGETHER))] = Field(
-        default=[], description="Further photos of the same table; the board must be in view of all."
+    together: list[str] = Field(
+        default=[], **sized(TOGETHER), description="Further photos of the same table; the board must be in view of all."
     )
     seed: Seed = 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord, Poses
 from app.storage.photo_crop import GOAL_SIDE
 from app.storage.table_photos import TablePhoto
-from osfcore.errors import InvalidInput, OsfError
+from osfcore.errors import InvalidInput, NoRoom, OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from osfcore.geometry.states import SceneState
@@ -118,7 +119,7 @@ class PhotoTables:
         Args:
             photo: identifier.
             scene: that the goal is for; None for the current one if it holds the photo's objects, else a new one with
-                these in random places.
+                these, lying as in the photo but in other places.
             despite_doubts: whether what was not found for certain counts all the same.
 
         Raises:
@@ -129,7 +130,7 @@ class PhotoTables:
         """
         record = self._photos.get(photo)
         layout = self._layout(record, scene or self._runner.current, despite_doubts=despite_doubts)
-        table = self._table(scene, tuple(name for name, _ in layout.poses))
+        table = self._table(scene, layout)
         made = self._runner.compose(ComposeGoal(table.id, layout.poses, is_measured=True))
         camera = record.camera(layout.T_table_camera, GOAL_SIDE)
         png = self._reduced(record, camera.width, camera.height)
@@ -181,13 +182,27 @@ class PhotoTables:
                 return other.T_table_photo
         return None
 
-    def _table(self, scene: str | None, names: tuple[str, ...]) -> SceneRecord:
+    def _table(self, scene: str | None, layout: _Layout) -> SceneRecord:
+        """The table that a goal is for; a new one has the objects as they lie in the photo, but elsewhere."""
         if scene is not None:
             return self._runner.scene(scene)
+        names = {name for name, _ in layout.poses}
         current = None if self._runner.current is None else self._runner.scene(self._runner.current)
-        if current is not None and set(current.state.names) == set(names):
+        if current is not None and set(current.state.names) == names:
             return current
-        return self._runner.create_scene(names=names)
+        draft = self._runner.create_scene(poses=layout.poses, light=layout.light, is_measured=True, is_shown=False)
+        try:
+            elsewhere = self._elsewhere(draft)
+        finally:
+            self._runner.delete_scene(draft.id)
+        return self._runner.create_scene(poses=elsewhere, light=layout.light, seed=draft.seed)
+
+    def _elsewhere(self, draft: SceneRecord) -> Poses:
+        """A random layout: all objects shifted, or as many as there is room for."""
+        count = len(draft.state.names)
+        with contextlib.suppress(NoRoom):
+            return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed, moved=count)).poses
+        return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed)).poses
 
     def _reduced(self, record: TablePhoto, width: int, height: int) -> bytes:
         pixels = cv2.imread(str(self._photos.picture(record.id)), cv2.IMREAD_COLOR)

@@ -1,0 +1,277 @@
+// Photos of tables: sent, marked, looked at; then one becomes the goal, or the table.
+import { get, getAll, patch, post, put, remove, upload } from "./api.js";
+import { byId, el } from "./dom.js";
+import { doubted } from "./doubt.js";
+import { mayDrive } from "./driver.js";
+import { takeGoal } from "./goals.js";
+import { LIVE, stateText } from "./jobs.js";
+import { drawMarks, setBrush, setBusy, setDrawing, setTool, setUpMarks, wipeTo } from "./photo-marks.js";
+import { refreshScenes } from "./scenes.js";
+import { inWords, known, labelOf, set, watch } from "./state.js";
+import { showTab } from "./tabs.js";
+import { act, tellFailure, toast } from "./toasts.js";
+
+const NAME_MAX = 100;
+const CHOSEN = "osf-photo"; // what this page has chosen outlives a reload of it
+let photos = [];
+let photo = null;
+let chosen = ""; // the object that is marked next
+let seen = ""; // the state of the search that was drawn last
+
+const path = (rest = "") => `photos/${encodeURIComponent(photo.id)}${rest}`;
+const objectPath = (name, rest = "") => path(`/objects/${encodeURIComponent(name)}${rest}`);
+const marked = (name = chosen) => photo?.objects.find((object) => object.name === name);
+const isFound = () => Boolean(photo?.objects.some(({ found }) => found));
+
+// What is on view
+
+function toolOf() {
+  return document.querySelector('input[name="photo-tool"]:checked').value;
+}
+
+function chooseTool(name) {
+  document.querySelector(`input[name="photo-tool"][value="${name}"]`).checked = true;
+  setTool(name);
+  tell();
+}
+
+function tell() {
+  const name = labelOf(chosen);
+  const words = {
+    box: `Drag a box around the ${name.toLowerCase()} in the photo.`,
+    add: `Click on the ${name.toLowerCase()}, or paint over what its outline lacks.`,
+    remove: `Click beside the ${name.toLowerCase()}, or paint over what does not belong to it.`,
+  };
+  byId("photo-told").textContent = chosen ? words[toolOf()] : "No object has a field yet; train one under Fields.";
+}
+
+function choose(name) {
+  chosen = name;
+  byId("photo-object").value = name;
+  chooseTool(marked(name) ? "add" : "box");
+  drawMarks(photo, chosen);
+  for (const item of byId("photo-objects").children) item.classList.toggle("chosen", item.dataset.object === name);
+}
+
+function drawChoices() {
+  const names = (known("fields") ?? []).map(({ name }) => name);
+  byId("photo-object").replaceChildren(...names.map((name) => el("option", { value: name, textContent: labelOf(name) })));
+  if (!names.includes(chosen)) chosen = names.find((name) => !marked(name)) ?? names[0] ?? "";
+  byId("photo-object").value = chosen;
+  tell();
+}
+
+function poseButton(object, pose, number) {
+  const isTaken = number === (object.choice ?? 0);
+  const likely = number ? `orientation ${number + 1}` : "most likely";
+  const button = el(
+    "button", { type: "button", attributes: { "aria-pressed": String(isTaken), "aria-label": `${object.label}, ${likely}` } },
+    pose.picture ? el("img", { src: pose.picture.slice(1), alt: "Photo, outlines, and the object as it would lie", loading: "lazy" }) : null,
+    el("span", { textContent: `${likely}, outline fits by ${(100 * pose.iou).toFixed(0)} %` }),
+  );
+  button.addEventListener("click", () => act(button, async () => show(await post(objectPath(object.name, "/choice"), { choice: number }))));
+  return button;
+}
+
+function posesOf({ found, choice, ...object }) {
+  const doubtful = found.doubt && choice === null;
+  const all = found.poses.map((pose, number) => poseButton({ choice, ...object }, pose, number));
+  const others = el("details", { open: Boolean(doubtful) }, el("summary", { className: "hint", textContent: `Other orientations (${all.length - 1})` }), el("div", { className: "photo-poses" }, ...all.slice(1)));
+  return [
+    doubtful ? el("p", { className: "missing", textContent: inWords(found.doubt) }) : null,
+    el("div", { className: "photo-poses" }, all[0]), all.length > 1 ? others : null,
+  ];
+}
+
+function entry(object) {
+  const pick = el("button", { type: "button", className: "plain", textContent: object.label });
+  pick.addEventListener("click", () => choose(object.name));
+  const drop = el("button", { type: "button", className: "plain danger", textContent: "Remove", attributes: { "aria-label": `Remove: ${object.label}` } });
+  drop.addEventListener("click", () => act(drop, async () => show(await remove(objectPath(object.name)))));
+  const item = el("li", {}, el("div", { className: "marked" }, pick, drop), ...(object.found ? posesOf(object) : []));
+  item.dataset.object = object.name;
+  item.classList.toggle("chosen", object.name === chosen);
+  return item;
+}
+
+function drawTogether() {
+  const others = photo.on_board ? photos.filter((other) => other.on_board && other.id !== photo.id) : [];
+  byId("photo-together").replaceChildren(...others.map((other) =>
+    el("label", { title: "Another photo of the same, unmoved objects and board" }, el("input", { type: "checkbox", value: other.id }), `together with ${other.name}`)));
+}
+
+function drawResult() {
+  const isDoubtful = photo.objects.some(({ found, choice }) => found?.doubt && choice === null);
+  byId("photo-result").hidden = !isFound();
+  byId("photo-doubts").hidden = !isDoubtful;
+  const { light } = photo;
+  byId("photo-light").textContent = !light ? "" : light.diffuse ? "The light is diffuse: nothing speaks for one lamp."
+    : `Lamp ${((Math.asin(Math.min(Math.max(light.direction[2], -1), 1)) * 180) / Math.PI).toFixed(0)}° above the table, ± ${light.std_deg.toFixed(1)}°.`;
+  for (const id of ["photo-goal", "photo-table"]) byId(id).disabled = !photo.table;
+  const choices = photo.objects.map(({ choice }) => choice ?? 0).join("-");
+  setDrawing(isFound() && photo.table ? `api/${path(`/drawing.png?${new URLSearchParams({ job: photo.job.id, choices })}`)}` : "");
+}
+
+function drawJob(job) {
+  const isLive = LIVE.has(job?.state);
+  byId("photo-finding").hidden = !isLive;
+  byId("photo-finding-bar").value = job?.total ? job.done / job.total : 0;
+  byId("photo-finding-state").textContent = isLive ? inWords(stateText(job)) : "";
+  byId("photo-error").hidden = job?.state !== "failed";
+  byId("photo-error").textContent = inWords(job?.error ?? "");
+  byId("find-objects").disabled = isLive || !photo?.objects.length;
+}
+
+function show(next) {
+  photo = next;
+  if (photo) sessionStorage.setItem(CHOSEN, photo.id);
+  byId("photo-card").hidden = !photo;
+  drawMarks(photo, chosen);
+  drawStage();
+  byId("photo-select").value = photo?.id ?? "";
+  if (!photo) return;
+  seen = `${photo.job?.id} ${photo.job?.state}`;
+  byId("photo-name").textContent = photo.name;
+  byId("photo-notes").replaceChildren(...photo.notes.map((note) => el("li", { textContent: inWords(note) })));
+  byId("photo-camera").hidden = photo.focal_source === "board";
+  byId("photo-camera").elements.focal.value = Math.round(photo.focal_px);
+  byId("photo-objects").replaceChildren(...photo.objects.map(entry));
+  drawTogether();
+  drawJob(photo.job);
+  drawResult();
+  tell();
+}
+
+/** The photo lies over the 3D view while its tab is open. */
+function drawStage() {
+  byId("photo-stage").hidden = !photo || byId("panel-photo").hidden;
+}
+
+// Doing
+
+async function send(file) {
+  if (!mayDrive()) return;
+  const bar = byId("table-photo-bar");
+  bar.hidden = false;
+  bar.value = 0;
+  await tellFailure(async () => {
+    const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
+    const sent = await upload(`photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
+    await refreshPhotos();
+    show(sent);
+    choose(chosen);
+  }, byId("upload-table-photo"));
+  bar.hidden = true;
+}
+
+async function mark(body) {
+  if (!chosen || !mayDrive()) return;
+  setBusy(true);
+  byId("photo-told").textContent = "Finding its outline";
+  const name = chosen;
+  const next = await tellFailure(() => put(objectPath(name), body), byId("photo-told"));
+  setBusy(false);
+  if (next) show(next);
+  if (next) choose(name);
+  tell();
+}
+
+const middle = ([left, top, right, bottom]) => [(left + right) / 2, (top + bottom) / 2];
+const isInside = ([x, y], [left, top, right, bottom]) => x >= left && x < right && y >= top && y < bottom;
+const markOf = ({ box, on, off, strokes }) => ({ box, on, off, strokes });
+
+function mend(change) {
+  const object = marked();
+  if (object) return mark(change(markOf(object)));
+  byId("photo-told").textContent = `Drag a box around the ${labelOf(chosen).toLowerCase()} first.`;
+  chooseTool("box");
+  return undefined;
+}
+
+function click(point, tool) {
+  if (tool === "box") { // a click on another object chooses it
+    const hit = photo.objects.find(({ box }) => isInside(point, box));
+    return hit ? choose(hit.name) : undefined;
+  }
+  return mend((mark) => {
+    if (tool === "remove") return { ...mark, off: [...mark.off, point] };
+    if (isInside(point, mark.box)) return { ...mark, on: [...mark.on, point] };
+    return { ...mark, strokes: [...mark.strokes, { adds: true, radius: 3, points: [point] }] };
+  });
+}
+
+async function find() {
+  const together = [...byId("photo-together").querySelectorAll("input:checked")].map(({ value }) => value);
+  show(await post(path("/find"), { together, seed: 0 }));
+}
+
+async function make(what) {
+  const made = await post(path(`/${what}`), { despite_doubts: byId("photo-despite").checked });
+  set("scene", { ...made.scene, is_current: true });
+  await refreshScenes();
+  if (made.goal) takeGoal(made.goal);
+  for (const note of made.notes) toast(note, "warning");
+  showTab("episode");
+  drawStage();
+}
+
+export async function refreshPhotos() {
+  const all = await tellFailure(() => getAll("photos", "photos"));
+  if (!all) return;
+  photos = all;
+  byId("photo-earlier").hidden = photos.length < 2;
+  byId("photo-select").replaceChildren(...photos.map(({ id, name }) => el("option", { value: id, textContent: name })));
+  const wanted = photo?.id ?? sessionStorage.getItem(CHOSEN);
+  const there = photos.find(({ id }) => id === wanted) ?? (photo ? photos[0] : null);
+  if (there?.id !== photo?.id) show(there ? await tellFailure(() => get(`photos/${encodeURIComponent(there.id)}`)) ?? null : null);
+  byId("photo-select").value = photo?.id ?? "";
+}
+
+export function setUpPhoto() {
+  setUpMarks({
+    onBox: (box) => mark({ box, on: [middle(box)], off: [], strokes: [] }),
+    onClick: click,
+    onStroke: (points, radius, tool) => mend((mark) => ({ ...mark, strokes: [...mark.strokes, { adds: tool === "add", radius, points }] })),
+  });
+  const file = byId("table-photo-file");
+  byId("upload-table-photo").addEventListener("click", () => file.click());
+  file.addEventListener("change", () => {
+    const [first] = file.files;
+    if (first) act(byId("upload-table-photo"), () => send(first));
+    file.value = "";
+  });
+  byId("photo-select").addEventListener("change", ({ target }) => tellFailure(async () => {
+    show(await get(`photos/${encodeURIComponent(target.value)}`));
+    choose(chosen);
+  }));
+  doubted(byId("delete-photo"), "Really delete", async () => {
+    await remove(path());
+    photo = null;
+    show(null);
+    await refreshPhotos();
+  });
+  byId("photo-camera").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const { focal } = event.target.elements;
+    act(event.submitter, async () => show(await patch(path(), { focal_px: focal.value ? Number(focal.value) : null })));
+  });
+  byId("photo-object").addEventListener("change", ({ target }) => choose(target.value));
+  for (const radio of document.getElementsByName("photo-tool")) radio.addEventListener("change", () => chooseTool(radio.value));
+  byId("photo-brush").addEventListener("input", ({ target }) => setBrush(Number(target.value)));
+  byId("find-objects").addEventListener("click", () => act(byId("find-objects"), find));
+  byId("cancel-finding").addEventListener("click", () => act(byId("cancel-finding"), () => remove(`jobs/${photo.job.id}`)));
+  byId("photo-goal").addEventListener("click", () => act(byId("photo-goal"), () => make("goal")));
+  byId("photo-table").addEventListener("click", () => act(byId("photo-table"), () => make("table")));
+  new MutationObserver(drawStage).observe(byId("panel-photo"), { attributes: true, attributeFilter: ["hidden"] });
+  watch("objects", drawChoices);
+  watch("fields", drawChoices);
+  watch("photoJob", (job) => {
+    if (!photo || job?.params.photo !== photo.id || job.id !== photo.job?.id) return;
+    if (LIVE.has(job.state)) return drawJob(job);
+    if (seen === `${job.id} ${job.state}`) return undefined;
+    return tellFailure(async () => {
+      show(await get(path()));
+      if (isFound() && photo.table) wipeTo(50);
+    });
+  });
+}
