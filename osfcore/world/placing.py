@@ -22,7 +22,9 @@ _LAYOUTS = 60
 _SETTLE_LIMIT_STEPS = 480
 _CALM_STEPS = 12
 _MOVES = 60  # until nothing penetrates any more
-_UPWARD = 0.7  # of a contact's normal from which one object lies on the other
+_TOUCH_M = 5e-4  # so little is no penetration: shapes have a margin
+_STANDS_M = 0.01  # above the table at most, for what stands on it
+_SIDEWAYS = 0.3  # of a contact's normal from which it tells a direction
 CALM_SPEED_M_S = 2e-3
 CALM_TURN_RAD_S = 2e-2
 
@@ -89,28 +91,36 @@ def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None 
 def move_apart(physics: Physics, names: tuple[str, ...]) -> None:
     """Lift objects that sink into the table, and move apart those that penetrate each other, as little as needed.
 
-    Of two that lie on one another the upper one is lifted; of two side by side each gives way by half. Let go while
-    they penetrate, they would be thrown apart.
+    Of two that both stand on the table each gives way by half; of others the one that lies on the other is lifted.
+    Let go while they penetrate, they would be thrown apart.
     """
     for _ in range(_MOVES):
         is_moved = False
         for i, first in enumerate(names):
-            if (gap := physics.table_distance(first)) < 0:
+            if (gap := physics.table_distance(first)) < -_TOUCH_M:
                 _shift(physics, first, np.array([0.0, 0.0, -gap]))
                 is_moved = True
             for second in names[i + 1 :]:
                 gap, normal = physics.separation(first, second)
-                if gap >= 0:
-                    continue
-                is_moved = True
-                if abs(normal[2]) > _UPWARD:
-                    _shift(physics, first if normal[2] > 0 else second, np.array([0.0, 0.0, -gap]))
-                else:
-                    aside = np.array([*normal[:2], 0.0]) / np.linalg.norm(normal[:2])
-                    _shift(physics, first, -gap / 2 * aside)
-                    _shift(physics, second, gap / 2 * aside)
+                if gap < -_TOUCH_M:
+                    _separate(physics, first, second, -gap, normal)
+                    is_moved = True
         if not is_moved:
             return
+
+
+def _separate(physics: Physics, first: str, second: str, depth_m: float, normal: Float[np.ndarray, "3"]) -> None:
+    """Move two objects along the normal that the first one leaves by; horizontally if both stand on the table."""
+    if all(physics.table_distance(name) < _STANDS_M for name in (first, second)):
+        apart = physics.pose(first).position - physics.pose(second).position
+        aside = normal[:2] if np.linalg.norm(normal[:2]) > _SIDEWAYS else apart[:2]
+        by = depth_m / 2 * np.array([*aside, 0.0]) / max(float(np.linalg.norm(aside)), 1e-9)
+        _shift(physics, first, by)
+        _shift(physics, second, -by)
+    elif abs(normal[2]) > _SIDEWAYS:
+        _shift(physics, first if normal[2] > 0 else second, np.array([0.0, 0.0, depth_m]))
+    else:
+        _shift(physics, first, depth_m * normal)
 
 
 def _shift(physics: Physics, name: str, by: Float[np.ndarray, "3"]) -> None:

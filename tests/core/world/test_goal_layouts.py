@@ -1,4 +1,5 @@
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,9 +28,12 @@ def away(before, after):
     return {name for name, distance in zip(before.names, shift_m, strict=True) if distance > 0.01}
 
 
-def aside(state, name, x_m=0.0, z_m=0.0):
-    pose = state.pose(name)
+def aside_of(pose, x_m=0.0, z_m=0.0):
     return Pose(pose.position + [x_m, 0, z_m], pose.quaternion)
+
+
+def aside(state, name, x_m=0.0, z_m=0.0):
+    return aside_of(state.pose(name), x_m, z_m)
 
 
 def test_what_is_put_down_in_the_air_comes_to_rest_and_the_others_stay(table):
@@ -107,3 +111,30 @@ def test_every_try_begins_where_things_are_now_and_there_is_an_end_to_them(table
         random_goal(table, 0, 2)
     assert len(begun) > 5
     assert set(map(repr, begun)) == {repr((2, set()))}
+
+
+def test_measured_objects_inside_each_other_and_the_table_are_moved_apart_a_little(table):
+    before = table.truth()
+    bottle, box = before.pose(BOTTLE), before.pose(BOX)
+    away = (bottle.position - box.position) * [1, 1, 0] / np.linalg.norm((bottle.position - box.position)[:2])
+    for distance in np.arange(0.2, 0.0, -0.002):  # until the box is a few millimetres in the bottle
+        into = Pose(bottle.position * [1, 1, 0] - distance * away + box.position * [0, 0, 1], box.quaternion)
+        poses = Pose(np.array([bottle.position, into.position]), np.array([bottle.quaternion, into.quaternion]))
+        table.restore(replace(before.reordered((BOTTLE, BOX)), poses=poses))
+        if table.gap_m(BOX) < -0.006:
+            break
+    table.restore(before)
+    goal = arranged_goal(table, {BOX: aside_of(into, z_m=-0.004)}, is_measured=True)
+    assert table.gap_m(BOX) > -1e-3
+    for name, asked in ((BOX, into), (BOTTLE, bottle)):
+        shift = goal.pose(name).position - asked.position
+        assert np.linalg.norm(shift[:2]) < 0.02, name
+        assert abs(shift[2]) < 3e-3, name
+
+
+def test_an_object_measured_a_little_inside_the_one_it_lies_on_is_lifted(table):
+    before = table.truth()
+    box = before.pose(BOX)
+    top = Pose(box.position + [0.0, 0.0, 0.04], box.quaternion)
+    rests = arranged_goal(table, {BOX: box, CAN: Pose(top.position, before.pose(CAN).quaternion)}, is_measured=True)
+    assert np.linalg.norm((rests.pose(BOX).position - box.position)[:2]) < 5e-3  # it was not thrown aside
