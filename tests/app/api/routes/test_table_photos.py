@@ -1,0 +1,159 @@
+"""Photos of tables as a program uses them: sent, marked, looked at, made a goal and a table."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from osfcore.geometry.cameras import goal_camera
+from osfcore.photo.camera_response import srgb_of_linear
+from tests.app.api.test_problems import is_problem
+from tests.app.conftest import until
+
+BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"
+SIDE = 512
+FOCAL = goal_camera(SIDE).intrinsics[0, 0]
+WAIT_S = 300.0
+ANY = {"Content-Type": "application/octet-stream"}
+
+
+@pytest.fixture(autouse=True)
+def tidy(service):
+    yield
+    for photo in service.get("/api/photos").json()["photos"]:
+        service.delete(f"/api/photos/{photo['id']}")
+
+
+def picture(service, scene, camera="goal"):
+    """What a camera of the scene sees, as a camera that people carry writes it: encoded as sRGB."""
+    query = {"size": SIDE, "pusher": False}
+    linear = Image.open(io.BytesIO(service.get(f"/api/scenes/{scene['id']}/images/{camera}.png", params=query).content))
+    encoded = srgb_of_linear(np.asarray(linear.convert("RGB")) / 255)
+    data = io.BytesIO()
+    Image.fromarray(np.round(255 * encoded).astype(np.uint8)).save(data, "JPEG", quality=95)
+    return data.getvalue()
+
+
+def box_of(service, scene, name, camera="goal"):
+    path = f"/api/scenes/{scene['id']}/masks/{camera}/{name}.png"
+    mask = np.asarray(Image.open(io.BytesIO(service.get(path, params={"size": SIDE}).content))) > 127
+    ys, xs = np.nonzero(mask)
+    return [float(v) for v in (xs.min() - 5, ys.min() - 5, xs.max() + 5, ys.max() + 5)]
+
+
+def send(service, data, **params):
+    answer = service.post("/api/photos", content=data, headers=ANY, params=params)
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def mark(service, photo, name, box):
+    on = [[(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]]
+    return service.put(f"/api/photos/{photo['id']}/objects/{name}", json={"box": box, "on": on})
+
+
+def refuses(answer, status, words):
+    """Whether a sentence with these words refuses what was asked for."""
+    assert words in is_problem(answer, status)["detail"]
+
+
+def gray(width=64, height=48):
+    data = io.BytesIO()
+    Image.new("RGB", (width, height), (120, 120, 120)).save(data, "PNG")
+    return data.getvalue()
+
+
+def test_a_photo_is_kept_with_what_its_file_tells(service):
+    photo = send(service, gray(), name="My table", focal_px=80)
+    assert (photo["name"], photo["width"], photo["height"], photo["focal_px"]) == ("My table", 64, 48, 80)
+    assert (photo["focal_source"], photo["on_board"], photo["objects"], photo["job"]) == ("given", False, [], None)
+    assert service.get(f"/api/photos/{photo['id']}").json() == photo
+    assert [entry["id"] for entry in service.get("/api/photos").json()["photos"]] == [photo["id"]]
+    shown = Image.open(io.BytesIO(service.get(f"/api/photos/{photo['id']}/photo.jpg").content))
+    assert shown.size == (64, 48)
+    changed = service.patch(f"/api/photos/{photo['id']}", json={"focal_px": 100}).json()
+    assert changed["focal_px"] == 100
+    assert service.delete(f"/api/photos/{photo['id']}").status_code == 204
+    refuses(service.get(f"/api/photos/{photo['id']}"), 404, photo["id"])
+
+
+def test_the_board_can_be_printed(service):
+    answer = service.get("/api/photos/board.pdf")
+    assert answer.headers["content-type"] == "application/pdf"
+    assert answer.content.startswith(b"%PDF")
+
+
+def test_what_makes_no_sense_is_told(service):
+    refuses(service.post("/api/photos", content=b"a text", headers=ANY), 422, "no picture that can be read")
+    refuses(service.post("/api/photos", content=b"{}", headers={"Content-Type": "application/json"}), 415, "photo")
+    refuses(service.post("/api/photos?focal_px=2", content=gray(), headers=ANY), 422, "focal length")
+    photo = send(service, gray())
+    path = f"/api/photos/{photo['id']}"
+    refuses(service.post(f"{path}/find", json={}), 409, "No object is marked")
+    refuses(service.post(f"{path}/goal", json={}), 409, "have not been found yet")
+    refuses(service.get(f"{path}/drawing.png"), 409, "have not been found yet")
+    refuses(mark(service, photo, "teapot", [5.0, 5.0, 40.0, 40.0]), 422, "teapot")
+    refuses(mark(service, photo, BOX, [100.0, 5.0, 140.0, 40.0]), 422, "64 x 48")
+    refuses(service.delete(f"{path}/objects/{BOX}"), 404, BOX)
+    refuses(service.post(f"{path}/objects/{BOX}/choice", json={"choice": 0}), 409, "have not been found yet")
+    assert service.get(path).json()["objects"] == []
+
+
+@pytest.mark.slow
+def test_a_photo_becomes_a_goal_and_a_table(service):
+    made = {"seed": 5, "objects": [BOX, MUSTARD], "light": {"position": [0.1, -0.1, 1.0]}}
+    scene = service.post("/api/scenes", json=made).json()
+    photo = send(service, picture(service, scene), name="Arranged", focal_px=FOCAL)
+    path = f"/api/photos/{photo['id']}"
+    for name in (BOX, MUSTARD):
+        assert mark(service, photo, name, box_of(service, scene, name)).status_code == 200
+    assert all(entry["outline"] for entry in service.get(path).json()["objects"])
+    assert service.post(f"{path}/find", json={}).status_code == 202
+    found = until(
+        lambda: (now := service.get(path).json())["job"]["state"] not in ("queued", "running") and now, WAIT_S
+    )
+    assert found["job"]["state"] == "done", found["job"]["error"]
+    assert found["table"] == "objects"
+    for entry in found["objects"]:
+        assert entry["found"]["poses"][0]["iou"] > 0.9
+        sheet = service.get(entry["found"]["poses"][0]["picture"])
+        assert Image.open(io.BytesIO(sheet.content)).width > 100
+    drawn = service.get(f"{path}/drawing.png")
+    assert Image.open(io.BytesIO(drawn.content)).size == (SIDE, SIDE)
+    goal = service.post(f"{path}/goal", json={"scene": scene["id"], "despite_doubts": True}).json()["goal"]
+    assert (goal["source"], goal["scene"], goal["name"]) == ("photo", scene["id"], "Arranged")
+    assert distance(goal["objects"]) == pytest.approx(distance(scene["objects"]), abs=0.03)
+    table = service.post(f"{path}/table", json={"despite_doubts": True}).json()["scene"]
+    assert distance(table["objects"]) == pytest.approx(distance(scene["objects"]), abs=0.03)
+    choice = service.post(f"{path}/objects/{BOX}/choice", json={"choice": 0}).json()
+    assert next(entry for entry in choice["objects"] if entry["name"] == BOX)["choice"] == 0
+    refuses(service.post(f"{path}/objects/{BOX}/choice", json={"choice": 50}), 422, "number of the pose")
+    marked = mark(service, photo, BOX, box_of(service, scene, BOX)).json()
+    assert marked["job"] is None, "what was found of other marks no longer counts"
+    assert all(entry["choice"] is None for entry in marked["objects"])
+
+
+@pytest.mark.slow
+def test_a_goal_for_no_table_yet_gets_one_whose_objects_lie_elsewhere(service):
+    scene = service.post("/api/scenes", json={"seed": 5, "objects": [BOX, MUSTARD]}).json()
+    photo = send(service, picture(service, scene), focal_px=FOCAL)
+    for name in (BOX, MUSTARD):
+        mark(service, photo, name, box_of(service, scene, name))
+    path = f"/api/photos/{photo['id']}"
+    service.post("/api/scenes", json={"seed": 1, "objects": ["005_tomato_soup_can"]})
+    service.post(f"{path}/find", json={})
+    until(lambda: service.get(path).json()["job"]["state"] == "done", WAIT_S)
+    made = service.post(f"{path}/goal", json={"despite_doubts": True}).json()
+    assert made["scene"]["is_current"]
+    starts = {entry["name"]: np.array(entry["position"]) for entry in made["scene"]["objects"]}
+    ends = {entry["name"]: np.array(entry["position"]) for entry in made["goal"]["objects"]}
+    assert set(starts) == set(ends) == {BOX, MUSTARD}
+    assert max(np.linalg.norm((starts[name] - ends[name])[:2]) for name in starts) > 0.05
+    for name in starts:
+        assert starts[name][2] == pytest.approx(ends[name][2], abs=0.01), "it lies on the same side"
+
+
+def distance(objects):
+    first, second = (np.array(entry["position"]) for entry in objects)
+    return float(np.linalg.norm((first - second)[:2]))
