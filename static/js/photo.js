@@ -45,10 +45,10 @@ function tell() {
   byId("photo-told").textContent = chosen ? words[toolOf()] : "No object has a field yet; train one under Fields.";
 }
 
-function choose(name) {
+function choose(name, tool = marked(name) ? "add" : "box") {
   chosen = name;
   byId("photo-object").value = name;
-  chooseTool(marked(name) ? "add" : "box");
+  chooseTool(tool);
   drawMarks(photo, chosen);
   for (const item of byId("photo-objects").children) item.classList.toggle("chosen", item.dataset.object === name);
 }
@@ -142,6 +142,11 @@ function show(next) {
   tell();
 }
 
+async function open(id) {
+  show(await get(`photos/${encodeURIComponent(id)}`));
+  choose(chosen);
+}
+
 /** The photo lies over the 3D view while its tab is open. */
 function drawStage() {
   byId("photo-stage").hidden = !photo || byId("panel-photo").hidden;
@@ -158,8 +163,7 @@ async function send(file) {
     const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
     const sent = await upload(`photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
     await refreshPhotos();
-    show(sent);
-    choose(chosen);
+    await open(sent.id);
   }, byId("upload-table-photo"));
   bar.hidden = true;
 }
@@ -171,9 +175,9 @@ async function mark(body) {
   const name = chosen;
   const next = await tellFailure(() => put(objectPath(name), body), byId("photo-told"));
   setBusy(false);
-  if (next) show(next);
-  if (next) choose(name);
-  tell();
+  if (!next) return tell();
+  show(next);
+  return choose(name, toolOf() === "box" ? "add" : toolOf());
 }
 
 const middle = ([left, top, right, bottom]) => [(left + right) / 2, (top + bottom) / 2];
@@ -223,7 +227,8 @@ export async function refreshPhotos() {
   byId("photo-select").replaceChildren(...photos.map(({ id, name }) => el("option", { value: id, textContent: name })));
   const wanted = photo?.id ?? sessionStorage.getItem(CHOSEN);
   const there = photos.find(({ id }) => id === wanted) ?? (photo ? photos[0] : null);
-  if (there?.id !== photo?.id) show(there ? await tellFailure(() => get(`photos/${encodeURIComponent(there.id)}`)) ?? null : null);
+  if (!there) show(null);
+  else if (there.id !== photo?.id) await tellFailure(() => open(there.id));
   byId("photo-select").value = photo?.id ?? "";
 }
 
@@ -240,15 +245,14 @@ export function setUpPhoto() {
     if (first) act(byId("upload-table-photo"), () => send(first));
     file.value = "";
   });
-  byId("photo-select").addEventListener("change", ({ target }) => tellFailure(async () => {
-    show(await get(`photos/${encodeURIComponent(target.value)}`));
-    choose(chosen);
-  }));
+  byId("photo-select").addEventListener("change", ({ target }) => tellFailure(() => open(target.value)));
   doubted(byId("delete-photo"), "Really delete", async () => {
     await remove(path());
+    sessionStorage.removeItem(CHOSEN);
     photo = null;
-    show(null);
     await refreshPhotos();
+    if (photos.length) await open(photos[0].id);
+    else show(null);
   });
   byId("photo-camera").addEventListener("submit", (event) => {
     event.preventDefault();
