@@ -81,7 +81,8 @@ def test_rest_examples_run(data_dir, tmp_path):
     assert "trusted: " in done.stdout
     assert "'light_deg': " in done.stdout
     assert "episode: done The table looks like the goal." in done.stdout
-    for image in ("goal.png", "compared.png", "photo.png"):
+    assert "the table was found by the objects" in done.stdout
+    for image in ("goal.png", "compared.png", "photo.png", "drawing.png"):
         assert (tmp_path / image).read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "video.mp4").read_bytes()[4:8] == b"ftyp"
 
