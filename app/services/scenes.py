@@ -143,8 +143,8 @@ class Scenes:
         """Make a scene; raises TooManyScenes, or an OsfError if it cannot be made: then nothing changes.
 
         Args:
-            names: its objects; None for those of the poses, or random ones.
-            count: of random objects.
+            names: its objects; None for those of the poses, or `count` random ones.
+            count: see there.
             seed: decides whatever is left open; None for a random one.
             light: None for a random one.
             poses: T_world_object [m] by name; None for random ones at rest.
@@ -153,20 +153,15 @@ class Scenes:
             is_shown: at once, in viewer and pages.
         """
         image_side(image_size)
-        if poses is not None:
-            posed = tuple(name for name, _ in poses)
-            if names is not None and set(names) != set(posed):
-                raise InvalidInput("list of objects", ", ".join(names), "the objects that have poses, or left out")
-            names = posed
-        self._check_names(names)
+        names = self._check_names(names if poses is None else _posed(names, poses))
         with self._lock:
             if len(self._records) + self._scenes_in_the_making >= self._settings.max_scenes:
                 raise TooManyScenes(self._settings.max_scenes)
             self._scenes_in_the_making += 1
         seed = secrets.randbelow(MAX_SEED) if seed is None else seed
         stacked = None if poses is None else _stacked([pose for _, pose in poses])
-        made = uuid.uuid4().hex[:12], seed, now_utc()
-        command = CreateScene(*made, image_size, names, count, light, stacked, is_measured)
+        facts = uuid.uuid4().hex[:12], seed, now_utc(), image_size
+        command = CreateScene(*facts, names, count, light, stacked, is_measured)
         try:
             record: SceneRecord = self._simulation.call(command)
             with self._lock:
@@ -194,8 +189,7 @@ class Scenes:
             self._store.delete_scene(scene)
             del self._records[scene]
             self._simulation.submit(DropScene(scene))
-            was_current = self._current == scene
-            if was_current:
+            if self._current == scene:
                 self._show(next(reversed(self._records), None))
 
     def activate(self, scene: str) -> SceneRecord:
@@ -304,15 +298,14 @@ class Scenes:
         self._simulation.submit(ShowScene(scene))
         self.hub.publish(CurrentScene(None if scene is None else self._records[scene]))
 
-    def _check_names(self, names: tuple[str, ...] | None) -> None:
-        if names is None:
-            return
-        if not 1 <= len(names) <= MAX_OBJECTS:
+    def _check_names(self, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if names is not None and not 1 <= len(names) <= MAX_OBJECTS:
             raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
-        if len(set(names)) != len(names):
-            raise InvalidInput("list of objects", ", ".join(names), "without repetition")
-        for name in names:
+        if len(set(names or ())) != len(names or ()):
+            raise InvalidInput("list of objects", ", ".join(names or ()), "without repetition")
+        for name in names or ():
             self._check_object(name)
+        return names
 
     def _check_object(self, name: str) -> None:
         if not self.library.has(name):
@@ -335,6 +328,13 @@ class Scenes:
                 if event.record.id in self._records:
                     self._records[event.record.id] = event.record
         self.hub.publish(event)
+
+
+def _posed(names: tuple[str, ...] | None, poses: tuple[tuple[str, Pose], ...]) -> tuple[str, ...]:
+    posed = tuple(name for name, _ in poses)
+    if names is not None and set(names) != set(posed):
+        raise InvalidInput("list of objects", ", ".join(names), "the objects that have poses, or left out")
+    return posed
 
 
 def _check_poses(poses: tuple[tuple[str, Pose], ...]) -> None:
