@@ -14,7 +14,7 @@ import numpy as np
 from app.jobs.job import Job
 from app.jobs.kinds.photos import FOUND, inputs_of
 from app.processes.messages.photo_messages import FindMask, Mark, MaskFound, PhotoRead, ReadPhoto
-from app.processes.photo_process import PhotoRefused, photo_main
+from app.processes.pictures.photo_process import PhotoRefused, photo_main
 from app.processes.process_client import ProcessClient, ProcessHangs
 from app.services.fields import FieldCatalogue
 from app.services.runner import Runner
