@@ -17,8 +17,12 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import SceneState, shifted_poses
-from osfcore.io.files import reading_png
+from osfcore.io.files import read_json, reading_png
+from osfcore.io.json_codec import decode
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.photo.found_scene import FoundScene
+from osfcore.photo.table_layout import TableLayout, layout_of
+from osfcore.planning.pose_cost import PoseGoal
 from osfcore.world.goal_layouts import arranged_goal, random_goal
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
@@ -37,6 +41,7 @@ class EpisodeOrder:
         objects: how many, where names are not given.
         seed: of the scene, its light, a random goal, and the searches.
         goal: PNG of how the table should look, from the goal camera; None for a random goal.
+        found: JSON of what was found in a photograph, instead: objects shall lie as there, and begin elsewhere.
         moved: how many objects a random goal moves; as the seed will have it if None.
         light: on the table; as the seed will have it if None.
         shifts_m: instead of a random goal: objects that lie elsewhere in it, and how far along x and y.
@@ -52,6 +57,7 @@ class EpisodeOrder:
     objects: int = 3
     seed: int = 0
     goal: Path | None = None
+    found: Path | None = None
     moved: int | None = None
     light: Light | None = None
     shifts_m: Mapping[str, tuple[float, float]] | None = None
@@ -67,13 +73,13 @@ class Given:
 
     Attributes:
         world: with the scene on the table.
-        goal: the image.
+        goal: the image, or poses.
         truth: how the table truly should be, where that is known.
         moved: objects that truly should move, where that is known.
     """
 
     world: Tabletop
-    goal: GoalImage
+    goal: GoalImage | PoseGoal
     truth: SceneState | None
     moved: tuple[str, ...]
 
@@ -104,15 +110,32 @@ def given(order: EpisodeOrder) -> Given:
         OsfError: if the objects, the image or the numbers are not as they must be.
     """
     assets, fields = AssetLibrary(order.data_dir / "objects"), FieldLibrary(order.data_dir)
-    for name in order.names or ():
+    layout = None if order.found is None else layout_of(read_json(order.found, _found))
+    names = order.names if layout is None else tuple(layout.poses)
+    for name in names or ():
         fields.info(name)
     among = tuple(name for name in fields.names() if assets.has(name))
-    world = Tabletop(assets, request=SceneRequest(order.names, order.objects, order.light, among))
+    world = Tabletop(assets, request=SceneRequest(names, order.objects, order.light, among))
     try:
-        return _begun(order, world)
+        return _begun(order, world) if layout is None else _photographed(order, layout, world)
     except BaseException:
         world.close()
         raise
+
+
+def _found(data: object) -> FoundScene:
+    return decode(FoundScene, data, "found objects")
+
+
+def _photographed(order: EpisodeOrder, layout: TableLayout, world: Tabletop) -> Given:
+    """The goal is the layout at rest; the table is a random one in which the objects lie on the same sides."""
+    if order.goal is not None:
+        raise InvalidInput("goal image", str(order.goal), "left out with what was found in a photo, which is the goal")
+    world.arrange(order.seed)
+    world.set_light(order.light or layout.light)
+    goal = replace(arranged_goal(world, layout.poses, is_measured=True), pusher=None)
+    _, moved = random_goal(world, order.seed, order.moved)
+    return Given(world, PoseGoal(goal.names, goal.poses), goal, moved)
 
 
 def _begun(order: EpisodeOrder, world: Tabletop) -> Given:

@@ -2,15 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose, quaternion_exp, rotate
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
+from osfcore.photo.found_scene import FoundLight, FoundScene
 
 _LEAST_HORIZONTAL = 1e-3  # of a viewing direction: a camera that looks straight down has its image's top ahead
+_LOWEST = float(np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG + 0.5)))  # of a unit vector toward a lamp
+_FIRST: Mapping[str, int] = MappingProxyType({})
+
+
+class NoPhotographedTable(OsfError):
+    """A photograph that does not tell where the table is."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "The photo does not tell where the table is; mark a second object that stands on it, or photograph it with "
+            "the printed board in view."
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TableLayout:
+    """What was found in a photograph, on our table.
+
+    Attributes:
+        poses: of the objects, by name.
+        T_table_photo: where the photograph's table frame lies.
+        T_table_camera: pose of the camera.
+        light: the lamp; overhead where nothing speaks for one.
+    """
+
+    poses: Mapping[str, Pose]
+    T_table_photo: Pose
+    T_table_camera: Pose
+    light: Light
+
+
+def layout_of(found: FoundScene, choices: Mapping[str, int] = _FIRST, T_table_photo: Pose | None = None) -> TableLayout:
+    """Where objects, camera and lamp of a photograph are on our table.
+
+    Args:
+        found: in the photograph.
+        choices: which of an object's poses is taken, by name; the best otherwise.
+        T_table_photo: where the photograph's table lies; None to put the objects in the middle.
+
+    Raises:
+        NoPhotographedTable: if it is not known where the photograph's table is.
+        InvalidInput: if an object lies where the pusher does not reach.
+    """
+    if found.table is None:
+        raise NoPhotographedTable
+    camera = Pose.from_matrix(np.array(found.camera.T_world_camera))
+    poses = {each.name: each.poses()[choices.get(each.name, 0)].pose() for each in found.objects}
+    T = place_on_table(camera, list(poses.values())) if T_table_photo is None else T_table_photo
+    placed = {name: T @ pose for name, pose in poses.items()}
+    for name, pose in placed.items():
+        if np.abs(pose.position[:2]).max() > WORKSPACE_HALF_M + 1e-6:
+            allowed = f"within the {200 * WORKSPACE_HALF_M:.0f} cm square that the pusher reaches"
+            raise InvalidInput(f"place of {name} in the photo", "too far aside", allowed)
+    return TableLayout(placed, T, T @ camera, _light(found.light, T))
+
+
+def _light(found: FoundLight | None, T_table_photo: Pose) -> Light:
+    """The lamp on our table, never below the least height; overhead where nothing speaks for one."""
+    if found is None or found.diffuse:
+        return Light(np.array([0.0, 0.0, 1.0]))
+    x, y, z = rotate(T_table_photo.quaternion, np.array(found.direction))
+    z = max(float(z), _LOWEST)
+    level = np.sqrt(1 - min(z, 1.0) ** 2) / max(float(np.hypot(x, y)), 1e-9)
+    return Light(np.array([level * x, level * y, z]))
 
 
 def place_on_table(T_photo_camera: Pose, objects: Sequence[Pose]) -> Pose:
@@ -31,20 +99,8 @@ def place_on_table(T_photo_camera: Pose, objects: Sequence[Pose]) -> Pose:
     turn = quaternion_exp(np.array([0.0, 0.0, np.pi / 2 - np.arctan2(y, x)]))
     turned = rotate(turn, np.array([pose.position for pose in objects]))[:, :2]
     low, high = turned.min(axis=0), turned.max(axis=0)
-    refuse_wide(high - low)
-    return Pose(np.array([*-(low + high) / 2, 0.0]), turn)
-
-
-def refuse_wide(extent: np.ndarray) -> None:
-    """Refuse a layout that does not fit into the workspace.
-
-    Args:
-        extent: of the centres along x and y [m].
-
-    Raises:
-        InvalidInput: if so.
-    """
-    width = 2 * WORKSPACE_HALF_M
-    if extent.max() > width:
+    width, extent = 2 * WORKSPACE_HALF_M, float((high - low).max())
+    if extent > width:
         allowed = f"at most {100 * width:.0f} cm: the pusher reaches no farther; photograph objects that lie closer"
-        raise InvalidInput("distance between the objects in the photo", f"{100 * extent.max():.0f} cm", allowed)
+        raise InvalidInput("distance between the objects in the photo", f"{100 * extent:.0f} cm", allowed)
+    return Pose(np.array([*-(low + high) / 2, 0.0]), turn)

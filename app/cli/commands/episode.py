@@ -21,6 +21,8 @@ class RunEpisode:
     """Folder for report.json, steps.csv, goal.png, frames/, video.mp4 and episode.viser."""
     goal: Path | None = None
     """PNG of how the table should look, taken by the goal camera without the pusher; a random goal without it."""
+    found: Path | None = None
+    """What `osf photo estimate` has found, instead: the objects shall lie as in that photo, and begin elsewhere."""
     names: tuple[str, ...] | None = None
     """Objects; a random choice without them."""
     objects: int = 3
@@ -65,7 +67,7 @@ class RunEpisode:
         settings = EpisodeSettings(self.steps, self.replan_every, self.cost, plan, despite_doubts=self.despite_doubts)
         check_place(self.out / REPORT_FILE)
         order = EpisodeOrder(
-            self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.moved,
+            self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.found, self.moved,
             settings=settings, device=str(pick_device(self.device)),
         )  # fmt: skip
         last = follow(run_episode(order))

@@ -19,29 +19,14 @@ from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord, Poses
 from app.storage.photo_crop import GOAL_SIDE
 from app.storage.table_photos import TablePhoto
-from osfcore.errors import InvalidInput, NoRoom, OsfError
-from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose, rotate, rotation_angle
+from osfcore.errors import NoRoom, OsfError
+from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.io.image_file import encode_png
-from osfcore.photo.found_scene import FoundLight, FoundScene
-from osfcore.photo.table_layout import place_on_table
+from osfcore.photo.table_layout import TableLayout, layout_of
 
 _DRAWN_SIDE = 640  # [px]
 _STAYED_M, _STAYED_RAD = 0.02, np.deg2rad(20.0)  # by which an object may move when it is let go where it was found
-_LOWEST = np.sin(np.deg2rad(5.5))  # of a unit vector toward a lamp
-_OVERHEAD = Light(np.array([0.0, 0.0, 1.0]))
-
-
-class NoPhotographedTable(OsfError):
-    """A photograph that does not tell where the table is."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "The photo does not tell where the table is; mark a second object that stands on it, or photograph it with "
-            "the printed board in view."
-        )
 
 
 class PhotoDoubtful(OsfError):
@@ -75,16 +60,6 @@ class GoalMade(TableMade):
     goal: GoalRecord
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Layout:
-    """Objects and camera on our table."""
-
-    poses: Poses
-    T_table_photo: Pose
-    T_table_camera: Pose
-    light: Light
-
-
 class PhotoTables:
     """Makes tables and goals of photographs. Methods block; any thread may call.
 
@@ -109,7 +84,7 @@ class PhotoTables:
         """
         record = self._photos.get(photo)
         layout = self._layout(record, despite_doubts=despite_doubts)
-        scene = self._runner.create_scene(poses=layout.poses, light=layout.light, is_measured=True)
+        scene = self._runner.create_scene(poses=tuple(layout.poses.items()), light=layout.light, is_measured=True)
         self._photos.keep(replace(record, scene=scene.id, T_table_photo=layout.T_table_photo))
         return TableMade(scene, _moved(layout.poses, scene.initial))
 
@@ -131,7 +106,7 @@ class PhotoTables:
         record = self._photos.get(photo)
         layout = self._layout(record, scene or self._runner.current, despite_doubts=despite_doubts)
         table = self._table(scene, layout)
-        made = self._runner.compose(ComposeGoal(table.id, layout.poses, is_measured=True))
+        made = self._runner.compose(ComposeGoal(table.id, tuple(layout.poses.items()), is_measured=True))
         camera = record.camera(layout.T_table_camera, GOAL_SIDE)
         png = self._reduced(record, camera.width, camera.height)
         goal = self._goals.keep_photographed(record.name, table.id, camera, made.poses, png)
@@ -146,34 +121,21 @@ class PhotoTables:
             ProcessUnavailable: if what renders died.
         """
         record = self._photos.get(photo)
-        found = self._photos.found(record)
-        if found.table is None:
-            raise NoPhotographedTable
-        poses = _chosen(record, found)
-        stacked = Pose(np.array([pose.position for _, pose in poses]), np.array([pose.quaternion for _, pose in poses]))
-        state = SceneState(tuple(name for name, _ in poses), stacked, _light(found.light, Pose.identity()), None)
-        camera = record.camera(_camera_pose(found), _DRAWN_SIDE)
+        layout = layout_of(self._photos.found(record), _choices(record))
+        state = SceneState(tuple(layout.poses), _stacked(layout.poses), layout.light, None)
+        camera = record.camera(layout.T_table_camera, _DRAWN_SIDE)
         masks = tuple(self._photos.mask(photo, entry.name).read_bytes() for entry in record.objects)
         return self._link.call(
             DrawPhoto(uuid.uuid4().hex, state, camera, self._photos.picture(photo).read_bytes(), masks)
         )
 
-    def _layout(self, record: TablePhoto, scene: str | None = None, *, despite_doubts: bool) -> _Layout:
+    def _layout(self, record: TablePhoto, scene: str | None = None, *, despite_doubts: bool) -> TableLayout:
         found = self._photos.found(record)
-        if found.table is None:
-            raise NoPhotographedTable
         doubts = [each.doubt for each in found.objects if each.doubt and not _is_settled(record, each.name)]
         if doubts and not despite_doubts:
             raise PhotoDoubtful(doubts)
-        poses = _chosen(record, found)
-        T = self._shared_frame(record, scene) if found.table == "board" else None
-        T = T or place_on_table(_camera_pose(found), [pose for _, pose in poses])
-        placed = tuple((name, T @ pose) for name, pose in poses)
-        for name, pose in placed:
-            if np.abs(pose.position[:2]).max() > WORKSPACE_HALF_M + 1e-6:
-                side = f"{200 * WORKSPACE_HALF_M:.0f}"
-                raise InvalidInput(f"place of {name}", "too far aside", f"within the {side} cm square of the pusher")
-        return _Layout(placed, T, T @ _camera_pose(found), _light(found.light, T))
+        shared = self._shared_frame(record, scene) if found.table == "board" else None
+        return layout_of(found, _choices(record), shared)
 
     def _shared_frame(self, record: TablePhoto, scene: str | None) -> Pose | None:
         """Where the board lies on a table that was made of another photograph of it; None if that cannot be told."""
@@ -182,15 +144,16 @@ class PhotoTables:
                 return other.T_table_photo
         return None
 
-    def _table(self, scene: str | None, layout: _Layout) -> SceneRecord:
+    def _table(self, scene: str | None, layout: TableLayout) -> SceneRecord:
         """The table that a goal is for; a new one has the objects as they lie in the photo, but elsewhere."""
         if scene is not None:
             return self._runner.scene(scene)
-        names = {name for name, _ in layout.poses}
         current = None if self._runner.current is None else self._runner.scene(self._runner.current)
-        if current is not None and set(current.state.names) == names:
+        if current is not None and set(current.state.names) == set(layout.poses):
             return current
-        draft = self._runner.create_scene(poses=layout.poses, light=layout.light, is_measured=True, is_shown=False)
+        draft = self._runner.create_scene(
+            poses=tuple(layout.poses.items()), light=layout.light, is_measured=True, is_shown=False
+        )
         try:
             elsewhere = self._elsewhere(draft)
         finally:
@@ -210,36 +173,24 @@ class PhotoTables:
         return encode_png(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1])
 
 
-def _camera_pose(found: FoundScene) -> Pose:
-    return Pose.from_matrix(np.array(found.camera.T_world_camera))
-
-
 def _is_settled(record: TablePhoto, name: str) -> bool:
     """Whether a person has chosen a pose of an object."""
     return any(entry.name == name and entry.choice is not None for entry in record.objects)
 
 
-def _chosen(record: TablePhoto, found: FoundScene) -> Poses:
-    """The objects in the poses that were chosen, in the photograph's table frame."""
-    choices = {entry.name: entry.choice or 0 for entry in record.objects}
-    return tuple((each.name, each.poses()[choices.get(each.name, 0)].pose()) for each in found.objects)
+def _choices(record: TablePhoto) -> dict[str, int]:
+    return {entry.name: entry.choice or 0 for entry in record.objects}
 
 
-def _light(found: FoundLight | None, T: Pose) -> Light:
-    """The lamp, in another frame; overhead where nothing speaks for one, and never below the least height."""
-    if found is None or found.diffuse:
-        return _OVERHEAD
-    x, y, z = rotate(T.quaternion, np.array(found.direction))
-    flat = max(float(np.hypot(x, y)), 1e-9)
-    z = max(float(z), _LOWEST)
-    level = np.sqrt(1 - min(z, 1.0) ** 2) / flat
-    return Light(np.array([level * x, level * y, z]))
+def _stacked(poses: Mapping[str, Pose]) -> Pose:
+    positions, quaternions = ([getattr(pose, part) for pose in poses.values()] for part in ("position", "quaternion"))
+    return Pose(np.array(positions), np.array(quaternions))
 
 
-def _moved(asked: Poses, rests: SceneState | Mapping[str, Pose]) -> tuple[str, ...]:
+def _moved(asked: Mapping[str, Pose], rests: SceneState | Mapping[str, Pose]) -> tuple[str, ...]:
     """A sentence for each object that did not stay where it was found."""
     notes = []
-    for name, pose in asked:
+    for name, pose in asked.items():
         there = rests.pose(name) if isinstance(rests, SceneState) else rests[name]
         shift = float(np.linalg.norm((there.position - pose.position)[:2]))
         if shift > _STAYED_M:

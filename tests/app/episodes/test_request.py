@@ -1,4 +1,5 @@
 import contextlib
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,9 @@ from app.episodes.request import EpisodeOrder, read_goal
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, NoRoom, OsfError, UnknownName
 from osfcore.experiments.estimation.tasks import SHIFT_M
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, goal_camera
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
+from osfcore.io.scene_file import camera_to_json
+from osfcore.photo.table_layout import NoPhotographedTable
 from osfcore.world import goal_layouts
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
@@ -166,3 +169,40 @@ def test_a_refusal_leaves_no_simulation_behind(order, tmp_path, monkeypatch, cha
     (world,) = worlds
     with pytest.raises(OsfError, match="table is empty"):
         world.truth()
+
+
+def found_file(order, place, table="board", apart_m=0.2):
+    """What was found in a photograph of a box and a can that stand on a table somewhere else."""
+    camera = Camera.look_at("photo", np.array([1.3, 2.0, 0.6]), np.array([1.0, 2.6, 0.0]))
+    objects = [
+        {"name": name, "position": [1.0 + shift, 2.6, height], "quaternion": [1.0, 0, 0, 0], "loss": 0.1, "iou": 0.95,
+         "doubt": "", "rivals": []}
+        for name, shift, height in (("009_gelatin_box", 0.0, 0.06), ("005_tomato_soup_can", apart_m, 0.051))
+    ]  # fmt: skip
+    path = place / "found.json"
+    light = {"direction": [0.0, 0.6, 0.8], "std_deg": 1.0, "diffuse": False}
+    facts = {"table": table, "objects": objects, "light": light, "camera": camera_to_json(camera), "notes": []}
+    path.write_text(json.dumps(facts))
+    return replace(order, names=None, found=path)
+
+
+def test_what_was_found_in_a_photo_is_the_goal_and_objects_begin_elsewhere_on_the_same_side(order, tmp_path):
+    with begun(replace(found_file(order, tmp_path), moved=2)) as begin:
+        start, goal = begin.world.truth(), begin.goal
+        assert set(begin.moved) == {"009_gelatin_box", "005_tomato_soup_can"}
+        apart = goal.pose("005_tomato_soup_can").position - goal.pose("009_gelatin_box").position
+        assert np.linalg.norm(apart[:2]) == pytest.approx(0.2, abs=0.02)
+        np.testing.assert_allclose(goal.poses.position[:, :2].mean(axis=0), 0, atol=0.02)
+        assert start.light.direction[2] == pytest.approx(0.8, abs=1e-6)
+        for name in start.names:
+            assert np.linalg.norm((start.pose(name).position - goal.pose(name).position)[:2]) > 0.05
+            assert start.pose(name).position[2] == pytest.approx(goal.pose(name).position[2], abs=0.005)
+
+
+def test_a_photo_that_tells_no_table_or_a_layout_too_wide_is_no_goal(order, tmp_path):
+    with pytest.raises(NoPhotographedTable, match="printed board"):
+        orders.given(found_file(order, tmp_path, table=None))
+    with pytest.raises(InvalidInput, match="at most 44 cm"):
+        orders.given(found_file(order, tmp_path, apart_m=0.6))
+    with pytest.raises(InvalidInput, match="left out"):
+        orders.given(replace(found_file(order, tmp_path), goal=tmp_path / "goal.png"))
