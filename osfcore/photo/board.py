@@ -32,7 +32,7 @@ _STRAY_MARKERS = 2  # that are read by mistake in other things
 _MIN_SIDE = 64
 _TAG_POINTS = 4
 _WORKING_SIDES = (1920, 3840)  # [px]; photographs are reduced to the first, or the second if the print is small in them
-_ACCURACY_PX = 0.05  # of points in a real photograph; lenses are not perfect
+ACCURACY_PX = 0.05  # of points in a real photograph; lenses are not perfect
 _MAX_RMS_PX = 2.0
 _MAX_BLUR_PX = 1.6  # sharp photographs have 0.6 to 1.3, and markers of 15 px are lost above
 
@@ -142,11 +142,28 @@ def locate_board(
         InvalidInput: if the image is no photograph, no board or too little of it is found, the view is too steep to
             tell the focal length, or the points do not fit the camera.
     """
-    grey, given = _grey(image), None if intrinsics is None else _checked_intrinsics(intrinsics)
+    found = board_points(image, board)
+    return board_view(found, (image.shape[1], image.shape[0]), intrinsics)
+
+
+def board_points(image: UInt8[np.ndarray, "h w *channels"], board: Board) -> FoundPoints:
+    """Corners of the board's squares in a photograph.
+
+    Raises:
+        InvalidInput: if the image is no photograph, or no board or too little of it is found.
+    """
+    grey = _grey(image)
     found = _search_scales(grey, lambda small: _board_points(small, board), _MIN_CORNERS)
     if len(found.points_m) < _MIN_CORNERS:
         raise _not_found(grey, "board", len(found.points_m))
-    return _view(found, grey.shape[::-1], given)
+    return found
+
+
+def board_view(
+    found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None = None
+) -> BoardView:
+    """The camera that fits points best, in a photograph of this width and height [px]; see `locate_board`."""
+    return _view(found, size, None if intrinsics is None else _checked_intrinsics(intrinsics))
 
 
 def locate_tag(
@@ -265,7 +282,7 @@ def _view(found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarra
     scale = max(1.0, max(size) / _WORKING_SIDES[0])
     matrix, deviation = intrinsics, 0.0
     if matrix is None:
-        focal, deviation = focal_length(found.points_m, found.points_px, size, _ACCURACY_PX * scale)
+        focal, deviation = focal_length(found.points_m, found.points_px, size, ACCURACY_PX * scale)
         matrix = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     pose, rms = planar_pose(found.points_m, found.points_px, matrix)
     if rms > _MAX_RMS_PX * scale:

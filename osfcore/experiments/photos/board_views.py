@@ -36,6 +36,7 @@ _REFLECTANCES = (0.04, 0.85)  # of ink and paper
 _BLUR_PX = 0.7
 _NOISE = 0.02
 _JPEG_QUALITY = 80
+_NEWTON_STEPS = 6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,6 +109,7 @@ def photograph(
     size: tuple[int, int],
     rng: np.random.Generator,
     blur_px: float = _BLUR_PX,
+    radial: float = 0.0,
 ) -> Photograph:
     """A photograph of a print that lies on a table, its centre at the origin and its top along +y.
 
@@ -118,12 +120,14 @@ def photograph(
         size: width and height of the photograph [px].
         rng: draws the table, the light and the noise.
         blur_px: standard deviation of the lens's blur [px].
+        radial: k1 of the lens, as OpenCV counts it; negative for a barrel.
     """
     width, height = size[0] * _SAMPLES, size[1] * _SAMPLES
     warp = _raster_to_image(paper.shape, pixels_per_m, *camera)
     ink, white = _REFLECTANCES
-    cover = cv2.warpPerspective(np.ones(paper.shape, np.float32), warp, (width, height))
-    print_light = cv2.warpPerspective((ink + (white - ink) * paper).astype(np.float32), warp, (width, height))
+    lens = _lens(size, camera[1], radial)
+    cover = _seen(np.ones(paper.shape, np.float32), warp, (width, height), lens)
+    print_light = _seen((ink + (white - ink) * paper).astype(np.float32), warp, (width, height), lens)
     texture = rng.uniform(0.6, 1.4, (24, 32)).astype(np.float32)
     table = (1 - cover) * cv2.resize(texture, (width, height), interpolation=cv2.INTER_CUBIC)
     layers = [_reduced(layer, size, blur_px)[..., None] for layer in (print_light, table)]
@@ -152,12 +156,13 @@ def board_photograph(
     board: Board | None = None,
     camera: tuple[Pose, Float[np.ndarray, "3 3"]] | None = None,
     blur_px: float = _BLUR_PX,
+    radial: float = 0.0,
 ) -> Photograph:
     """A photograph of the page with a board on it, by a random camera if none is given."""
     pose, intrinsics = camera or random_camera(rng, size)
     resolution = _PAGE_STEP * math.ceil(4 * intrinsics[0, 0] / _DISTANCES_M[0] / _PAGE_STEP)
     page = page_image(board or Board(), resolution)
-    return photograph(page, resolution, (pose, intrinsics), size, rng, blur_px)
+    return photograph(page, resolution, (pose, intrinsics), size, rng, blur_px, radial)
 
 
 def board_errors(
@@ -225,6 +230,36 @@ def _error(found: BoardView, true: Photograph) -> Float[np.ndarray, "7"]:
             found.corner_count,
         ]
     )
+
+
+def _seen(
+    layer: Float[np.ndarray, "H W"], warp: Float[np.ndarray, "3 3"], size: tuple[int, int],
+    lens: Float[np.ndarray, "h w 2"] | None,
+) -> Float[np.ndarray, "h w"]:
+    """A flat layer as a camera of this finely sampled size sees it, through its lens."""
+    if lens is None:
+        return cv2.warpPerspective(layer, warp, size)
+    low = np.floor(np.minimum(lens.min(axis=(0, 1)), 0))
+    columns, rows = (np.ceil(lens.max(axis=(0, 1))) - low + 2).astype(int).tolist()
+    shift = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
+    straight = cv2.warpPerspective(layer, shift @ warp, (columns, rows))
+    return cv2.remap(straight, (lens - low).astype(np.float32), None, cv2.INTER_LINEAR)  # pyright: ignore
+
+
+def _lens(
+    size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"], radial: float
+) -> Float[np.ndarray, "h w 2"] | None:
+    """For each sample of the image the place where it would be without distortion [samples]; None without any."""
+    if radial == 0:
+        return None
+    fine = np.diag([_SAMPLES, _SAMPLES, 1.0]) @ intrinsics
+    columns, rows = np.meshgrid(np.arange(size[0] * _SAMPLES) + 0.5, np.arange(size[1] * _SAMPLES) + 0.5)
+    bent = (np.stack([columns, rows], axis=-1) - fine[:2, 2]) / fine[[0, 1], [0, 1]]
+    distance = np.linalg.norm(bent, axis=-1, keepdims=True)
+    straight = distance.copy()
+    for _ in range(_NEWTON_STEPS):
+        straight -= (straight * (1 + radial * straight**2) - distance) / (1 + 3 * radial * straight**2)
+    return bent * (straight / np.maximum(distance, 1e-9)) * fine[[0, 1], [0, 1]] + fine[:2, 2] - 0.5
 
 
 def _raster_to_image(

@@ -1,0 +1,95 @@
+"""Radial distortion of a lens from one photograph of the board, and photographs without it.
+
+x' = x (1 + k1 r^2) for points x of the plane at distance 1 before the camera, r = |x| (OpenCV's model, one coefficient).
+Printed points are first looked for in the photograph as it is, then, with the distortion that they show, in one that is
+free of it, and so on, since straight lines are what finds them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from osfcore.photo.board import ACCURACY_PX, Board, BoardView, board_points, board_view
+from osfcore.photo.pattern import FoundPoints
+from osfcore.photo.planar_pose import calibrated
+
+_ROUNDS = 3
+_SURE = 4.0  # standard deviations
+_MOST = 0.5  # of |k1|
+_LEAST_PX = 0.5  # of distortion in the photograph's corners
+_BETTER = 0.8  # of the points' distance from where they should be, that remains
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lens:
+    """A camera with radial distortion.
+
+    Attributes:
+        intrinsics: 3 x 3 [px], pixel centres at +0.5.
+        radial: k1; 0 for none.
+        std: its standard deviation.
+    """
+
+    intrinsics: Float[np.ndarray, "3 3"]
+    radial: float
+    std: float = 0.0
+
+    def straightened(self, image: np.ndarray) -> np.ndarray:
+        """The same view without distortion, by the same intrinsics; what lies beyond the photograph repeats its edge."""
+        if not self.radial:
+            return image
+        centre = self.intrinsics.copy()
+        centre[:2, 2] -= 0.5  # OpenCV counts indices
+        size = image.shape[1], image.shape[0]
+        maps = cv2.initUndistortRectifyMap(centre, self._coefficients, np.eye(3), centre, size, cv2.CV_32FC1)
+        return cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def bent(self, points_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        """Where points of the straight photograph are in the one that was taken [px]."""
+        K = self.intrinsics
+        x = (points_px - K[:2, 2]) / K[[0, 1], [0, 1]]
+        return x * (1 + self.radial * (x**2).sum(axis=1, keepdims=True)) * K[[0, 1], [0, 1]] + K[:2, 2]
+
+    @property
+    def _coefficients(self) -> Float[np.ndarray, "4"]:
+        return np.array([self.radial, 0.0, 0.0, 0.0])
+
+
+def locate_board_through_lens(
+    image: UInt8[np.ndarray, "h w *channels"], board: Board, intrinsics: Float[np.ndarray, "3 3"] | None = None
+) -> tuple[BoardView, Lens]:
+    """The camera of a photograph that shows a board, and its lens; arguments and errors as of `locate_board`.
+
+    Returns:
+        The camera of the straightened photograph, and the lens that straightens it. Its radial coefficient is 0 where
+        the board's points do not tell of any: fewer than 4 standard deviations, or half a pixel in the corners.
+    """
+    size = image.shape[1], image.shape[0]
+    found = board_points(image, board)
+    lens: Lens | None = None
+    for _ in range(_ROUNDS):
+        seen = FoundPoints(found.points_m, found.points_px if lens is None else lens.bent(found.points_px))
+        fit = _fitted(seen, size, intrinsics)
+        if fit is None:
+            break
+        lens, found = fit, board_points(fit.straightened(image), board)
+    view = board_view(found, size, intrinsics)
+    return view, lens or Lens(view.intrinsics, 0.0)
+
+
+def _fitted(seen: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None) -> Lens | None:
+    """A lens with a distortion that the points are sure of; None without."""
+    accuracy = ACCURACY_PX * max(1.0, max(size) / 1920)
+    fit = calibrated(seen.points_m, seen.points_px, size, accuracy, intrinsics, has_radial=True)
+    plain = calibrated(seen.points_m, seen.points_px, size, accuracy, intrinsics, has_radial=False)
+    if fit is None or plain is None:
+        return None
+    reach = np.hypot(*size) / 2 / fit.intrinsics[0, 0]  # of the corners from the middle, at distance 1
+    is_seen = abs(fit.radial) * reach**3 * fit.intrinsics[0, 0] > _LEAST_PX
+    if not (_SURE * fit.radial_std < abs(fit.radial) < _MOST and is_seen):
+        return None
+    return Lens(fit.intrinsics, fit.radial, fit.radial_std)
