@@ -4,6 +4,7 @@ Every error is an `OsfError`, so a caller at the edge (command line, REST) can s
 the facts and write the sentence. Nothing here knows of exit codes or HTTP.
 """
 
+import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ MAX_SEED = 2**63 - 1
 _MOST_CHARACTERS = 2000  # of a sentence, however long the names in it are
 _VALUE_CHARACTERS = 300  # of a value that was given, which may be a path or a list
 _SHOWN_CHARACTERS = 100
+_MOST_NEAR = 3  # names that may have been meant
 
 
 def shown(value: object, most: int = _SHOWN_CHARACTERS) -> str:
@@ -69,7 +71,12 @@ class UnknownName(OsfError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"There is no {kind} named {shown(repr(name))}; known: {_listed(known)}.")
+        known = list(known)
+        near = [one for one in known if name.lower() in one.lower()] or difflib.get_close_matches(
+            name, known, cutoff=0.7
+        )
+        meant = f" did you mean {' or '.join(near[:_MOST_NEAR])}?" if name and near else ""
+        super().__init__(f"There is no {kind} named {shown(repr(name))};{meant} known: {_listed(known)}.")
 
 
 class MissingAssets(OsfError):

@@ -20,6 +20,7 @@ _FOCAL_FLAGS = (
     | cv2.CALIB_FIX_K2
     | cv2.CALIB_FIX_K3
 )
+UNTOLD = "focal length"  # of the error for a view that does not tell it
 _MAX_FOCAL_STD = 0.03  # of the focal length
 _FOCAL_RANGE = (0.3, 10.0)  # focal lengths of cameras, in longer sides of the image
 
@@ -82,7 +83,7 @@ def focal_length(
     fit = calibrated(points_m, points_px, size, accuracy_px)
     if fit is None or fit.focal_std > _MAX_FOCAL_STD * fit.intrinsics[0, 0]:
         raise InvalidInput(
-            "focal length", "unknown, and the print is too small in this view, or seen too steeply, to tell it",
+            UNTOLD, "unknown, and the print is too small in this view, or seen too steeply, to tell it",
             "given, or the photograph taken from near by and at a slant, 30 to 60 degrees above the table",
         )  # fmt: skip
     return float(fit.intrinsics[0, 0]), fit.focal_std

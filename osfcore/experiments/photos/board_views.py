@@ -233,7 +233,9 @@ def _error(found: BoardView, true: Photograph) -> Float[np.ndarray, "7"]:
 
 
 def _seen(
-    layer: Float[np.ndarray, "H W"], warp: Float[np.ndarray, "3 3"], size: tuple[int, int],
+    layer: Float[np.ndarray, "H W"],
+    warp: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
     lens: Float[np.ndarray, "h w 2"] | None,
 ) -> Float[np.ndarray, "h w"]:
     """A flat layer as a camera of this finely sampled size sees it, through its lens."""
