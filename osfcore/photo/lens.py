@@ -24,7 +24,7 @@ _TOLD, _MOST_OFF = (
     0.03,
     1.15,
 )  # deviation of a focal length that the board tells, and factor by which the given may differ
-_SURE = 4.0  # standard deviations
+_SURE, _AGREES = 4.0, 3.0  # standard deviations
 _MOST = 0.5  # of |k1|
 _LEAST_PX = 0.5  # of distortion in the photograph's corners
 _FINE_PX = 0.015  # of points, where the lens is modelled: they scatter by 0.01 px in VGA
@@ -89,11 +89,16 @@ def locate_board_through_lens(
 
 
 def _fitted(seen: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None) -> Lens | None:
-    """A lens with a distortion that the points are sure of; None without."""
+    """A lens with a distortion that the points are sure of; None without.
+
+    A focal length that is given counts only if the points agree with it: distortion would make up for a wrong one.
+    """
     accuracy = _FINE_PX * max(1.0, max(size) / 1920)
-    fit = calibrated(seen.points_m, seen.points_px, size, accuracy, intrinsics, has_radial=True)
-    plain = calibrated(seen.points_m, seen.points_px, size, accuracy, intrinsics, has_radial=False)
-    if fit is None or plain is None:
+    fit = calibrated(seen.points_m, seen.points_px, size, accuracy, has_radial=True)
+    if fit is not None and intrinsics is not None:
+        if abs(fit.intrinsics[0, 0] - intrinsics[0, 0]) < _AGREES * fit.focal_std:
+            fit = calibrated(seen.points_m, seen.points_px, size, accuracy, intrinsics, has_radial=True)
+    if fit is None:
         return None
     reach = np.hypot(*size) / 2 / fit.intrinsics[0, 0]  # of the corners from the middle, at distance 1
     is_seen = abs(fit.radial) * reach**3 * fit.intrinsics[0, 0] > _LEAST_PX
