@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.optimize import least_squares
 
 from osfcore.errors import InvalidInput
 from osfcore.photo.board import ACCURACY_PX, Board, BoardView, board_points, board_view
@@ -24,7 +25,11 @@ _TOLD, _MOST_OFF = (
     0.03,
     1.15,
 )  # deviation of a focal length that the board tells, and factor by which the given may differ
-_SURE, _AGREES = 4.0, 3.0  # standard deviations
+_SURE = 3.0  # standard deviations
+_CENTRE_SHARE, _FOCAL_SHARE = (
+    0.01,
+    0.01,
+)  # deviations of the principal point from the middle, and of a given focal length
 _MOST = 0.5  # of |k1|
 _LEAST_PX = 0.5  # of distortion in the photograph's corners
 _FINE_PX = 0.015  # of points, where the lens is modelled: they scatter by 0.01 px in VGA
@@ -72,7 +77,7 @@ def locate_board_through_lens(
 
     Returns:
         The camera of the straightened photograph, and the lens that straightens it. Its radial coefficient is 0 where
-        the board's points do not tell of any: fewer than 4 standard deviations, or half a pixel in the corners.
+        the board's points do not tell of any: fewer than 3 standard deviations, or half a pixel in the corners.
     """
     found, size = board_points(image, board), (image.shape[1], image.shape[0])
     lens: Lens | None = None
@@ -91,20 +96,32 @@ def locate_board_through_lens(
 def _fitted(seen: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None) -> Lens | None:
     """A lens with a distortion that the points are sure of; None without.
 
-    A focal length that is given counts only if the points agree with it: distortion would make up for a wrong one.
+    Pose, focal length, principal point and k1 are fitted together; a principal point beside the middle looks much like
+    distortion, so that it is left free within 1 % of the image, and a focal length that is given within 1 %.
     """
-    accuracy = _FINE_PX * max(1.0, max(size) / 1920)
-    fit = calibrated(seen.points_m, seen.points_px, size, accuracy, has_radial=True)
-    if fit is not None and intrinsics is not None:
-        if abs(fit.intrinsics[0, 0] - intrinsics[0, 0]) < _AGREES * fit.focal_std:
-            fit = calibrated(seen.points_m, seen.points_px, size, accuracy, intrinsics, has_radial=True)
-    if fit is None:
+    accuracy, middle = _FINE_PX * max(1.0, max(size) / 1920), np.array(size) / 2
+    start = calibrated(seen.points_m, seen.points_px, size, accuracy)
+    if start is None:
         return None
-    reach = np.hypot(*size) / 2 / fit.intrinsics[0, 0]  # of the corners from the middle, at distance 1
-    is_seen = abs(fit.radial) * reach**3 * fit.intrinsics[0, 0] > _LEAST_PX
-    if not (_SURE * fit.radial_std < abs(fit.radial) < _MOST and is_seen):
+    points = np.pad(seen.points_m, ((0, 0), (0, 1)))
+    focal = start.focal if intrinsics is None else float(intrinsics[0, 0])
+    spread = np.array([_FOCAL_SHARE if intrinsics is not None else 1.0, *[_CENTRE_SHARE * max(size)] * 2, 1.0])
+
+    def residuals(p: Float[np.ndarray, "10"]) -> Float[np.ndarray, "M"]:
+        f, centre, bend = focal * np.exp(p[6]), middle + p[7:9], np.array([p[9], 0.0, 0.0, 0.0])
+        K = np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1]])
+        at = cv2.projectPoints(points, p[:3], p[3:6], K, bend)[0].reshape(-1, 2)
+        return np.concatenate([(at - seen.points_px).ravel() / accuracy, p[6:] / spread])
+
+    first = np.concatenate([start.rotation, start.translation, [np.log(start.focal / focal)], np.zeros(3)])
+    fit = least_squares(residuals, first, x_scale="jac", method="lm")
+    scatter = max(1.0, float(np.sqrt(2 * fit.cost / max(fit.fun.size - first.size, 1))))
+    std = scatter * float(np.sqrt(np.linalg.pinv(fit.jac.T @ fit.jac)[-1, -1]))
+    f, centre, radial = focal * np.exp(fit.x[6]), middle + fit.x[7:9], float(fit.x[9])
+    reach = np.hypot(*size) / 2 / f  # of the corners from the middle, at distance 1
+    if not (_SURE * std < abs(radial) < _MOST and abs(radial) * reach**3 * f > _LEAST_PX):
         return None
-    return Lens(fit.intrinsics, fit.radial, fit.radial_std)
+    return Lens(np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1]]), radial, std)
 
 
 def _check_focal(found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"]) -> None:
@@ -112,7 +129,7 @@ def _check_focal(found: FoundPoints, size: tuple[int, int], intrinsics: Float[np
     free = calibrated(found.points_m, found.points_px, size, ACCURACY_PX * max(1.0, max(size) / 1920))
     if free is None:
         return
-    given, seen = intrinsics[0, 0], free.intrinsics[0, 0]
+    given, seen = intrinsics[0, 0], free.focal
     if free.focal_std < _TOLD * seen and not 1 / _MOST_OFF < given / seen < _MOST_OFF:
         share = seen / given
         raise InvalidInput(

@@ -81,12 +81,12 @@ def focal_length(
             long lens from afar as through a short one from near by.
     """
     fit = calibrated(points_m, points_px, size, accuracy_px)
-    if fit is None or fit.focal_std > _MAX_FOCAL_STD * fit.intrinsics[0, 0]:
+    if fit is None or fit.focal_std > _MAX_FOCAL_STD * fit.focal:
         raise InvalidInput(
             UNTOLD, "unknown, and the print is too small in this view, or seen too steeply, to tell it",
             "given, or the photograph taken from near by and at a slant, 30 to 60 degrees above the table",
         )  # fmt: skip
-    return float(fit.intrinsics[0, 0]), fit.focal_std
+    return fit.focal, fit.focal_std
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,60 +94,38 @@ class Calibration:
     """A camera with square pixels and a centred principal point that fits one view of a plane.
 
     Attributes:
-        intrinsics: 3 x 3 [px].
-        focal_std: standard deviation of the focal length [px]; 0 if it was given.
-        radial: k1.
-        radial_std: its standard deviation; 0 if none was asked for.
+        focal: length [px].
+        focal_std: its standard deviation [px].
+        rotation: of the table in the camera's frame, a rotation vector [rad].
+        translation: of the table's origin in it [m].
     """
 
-    intrinsics: Float[np.ndarray, "3 3"]
+    focal: float
     focal_std: float
-    radial: float
-    radial_std: float
+    rotation: Float[np.ndarray, "3"]
+    translation: Float[np.ndarray, "3"]
 
 
 def calibrated(
-    points_m: Float[np.ndarray, "N 2"],
-    points_px: Float[np.ndarray, "N 2"],
-    size: tuple[int, int],
-    accuracy_px: float,
-    intrinsics: Float[np.ndarray, "3 3"] | None = None,
-    *,
-    has_radial: bool = False,
+    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], size: tuple[int, int], accuracy_px: float
 ) -> Calibration | None:
-    """Focal length, where it is not given, and k1, where asked for; None if no usual focal length fits.
-
-    Args:
-        points_m: x, y of the points on the table [m].
-        points_px: where they appear [px].
-        size: width and height of the image [px].
-        accuracy_px: the least error that is expected of the points, whatever their scatter [px].
-        intrinsics: of the camera [px].
-        has_radial: whether the lens may distort.
-    """
+    """The camera whose focal length fits best; None if no usual focal length fits. Arguments as of `focal_length`."""
     points = [np.pad(points_m, ((0, 0), (0, 1))).astype(np.float32)]
     pixels = [np.ascontiguousarray(points_px, np.float32)]
-    flags, low, high = _FOCAL_FLAGS, *np.multiply(_FOCAL_RANGE, max(size))
-    if intrinsics is None:
-        guess = cv2.initCameraMatrix2D(points, pixels, size)[0, 0]
-        start = float(guess) if low < guess < high else float(max(size))
-        matrix = np.array([[start, 0, size[0] / 2], [0, start, size[1] / 2], [0, 0, 1]])
-    else:
-        matrix, flags = intrinsics.copy(), flags | cv2.CALIB_FIX_FOCAL_LENGTH
-    if has_radial:
-        flags &= ~cv2.CALIB_FIX_K1
-    _, matrix, lens, rotations, translations = cv2.calibrateCamera(
-        points, pixels, size, matrix, np.zeros(5), flags=flags
+    guess = cv2.initCameraMatrix2D(points, pixels, size)[0, 0]
+    low, high = np.multiply(_FOCAL_RANGE, max(size))
+    start = float(guess) if low < guess < high else float(max(size))
+    matrix = np.array([[start, 0, size[0] / 2], [0, start, size[1] / 2], [0, 0, 1]])
+    _, matrix, _, rotations, translations = cv2.calibrateCamera(
+        points, pixels, size, matrix, np.zeros(5), flags=_FOCAL_FLAGS
     )
-    seen, jacobian = cv2.projectPoints(points[0], rotations[0], translations[0], matrix, lens)
-    focal = [] if intrinsics is not None else [jacobian[:, 6] + jacobian[:, 7]]
-    columns = np.column_stack([jacobian[:, :6], *focal, *([jacobian[:, 10]] if has_radial else [])])
+    seen, jacobian = cv2.projectPoints(points[0], rotations[0], translations[0], matrix, None)
+    # The last pivot says how far the points move with the focal length in ways that no motion of the camera explains.
+    columns = np.column_stack([jacobian[:, :6], jacobian[:, 6] + jacobian[:, 7]])
+    pivot = abs(np.linalg.qr(columns).R[-1, -1])
     scatter_px = np.linalg.norm(seen.reshape(-1, 2) - pixels[0]) / np.sqrt(max(columns.shape[0] - columns.shape[1], 1))
-    error_px = float(max(scatter_px, accuracy_px))
-    if intrinsics is None and not low < matrix[0, 0] < high:
+    focal = float(matrix[0, 0])
+    if not low < focal < high:
         return None
-    # The last pivot says how far the points move with a parameter in ways that no other explains.
-    radial_std = error_px / max(abs(np.linalg.qr(columns).R[-1, -1]), 1e-12) if has_radial else 0.0
-    order = [*range(6), *range(7, columns.shape[1]), 6] if focal else []
-    focal_std = error_px / max(abs(np.linalg.qr(columns[:, order]).R[-1, -1]), 1e-12) if focal else 0.0
-    return Calibration(matrix, float(focal_std), float(lens.ravel()[0]), float(radial_std))
+    deviation = float(max(scatter_px, accuracy_px) / max(pivot, 1e-12))
+    return Calibration(focal, deviation, rotations[0].ravel(), translations[0].ravel())

@@ -22,6 +22,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.board import TAG_DICTIONARY, Board, BoardView, locate_board, locate_tag
 from osfcore.photo.board_page import page_image
+from osfcore.photo.lens import locate_board_through_lens
 from osfcore.photo.markers import marker_dictionary
 
 _DISTANCES_M = (0.4, 1.0)
@@ -172,6 +173,7 @@ def board_errors(
     *,
     is_focal_known: bool = True,
     board: Board | None = None,
+    radial: float | None = None,
 ) -> ViewErrors:
     """Errors of cameras found with the board, in random views.
 
@@ -181,12 +183,17 @@ def board_errors(
         size: width and height of the photographs [px].
         is_focal_known: whether the intrinsics are told.
         board: that lies on the table; the default one if not given.
+        radial: k1 of a lens, which is looked for as well; None for a lens without distortion that is taken for such.
     """
     board = board or Board()
-    return _errors(
-        (board_photograph(rng, size, board) for _ in range(count)),
-        lambda view: locate_board(view.image, board, view.intrinsics if is_focal_known else None),
-    )
+
+    def locate(view: Photograph) -> BoardView:
+        intrinsics = view.intrinsics if is_focal_known else None
+        if radial is None:
+            return locate_board(view.image, board, intrinsics)
+        return locate_board_through_lens(view.image, board, intrinsics)[0]
+
+    return _errors((board_photograph(rng, size, board, radial=radial or 0.0) for _ in range(count)), locate)
 
 
 def tag_errors(count: int, rng: np.random.Generator, size: tuple[int, int], *, side_m: float = 0.08) -> ViewErrors:
