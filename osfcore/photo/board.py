@@ -29,6 +29,7 @@ _CELL_PIXELS = 32  # of a cell of a tag, when drawn
 _GUESS_PX = 2.0  # by which corners of markers may be off
 _PLACE_PX = 3.0  # from where a marker should be
 _STRAY_MARKERS = 2  # that are read by mistake in other things
+_ALIKE = 0.15  # of a marker's side, and of a square's
 _MIN_SIDE = 64
 _TAG_POINTS = 4
 _WORKING_SIDES = (1920, 3840)  # [px]; photographs are reduced to the first, or the second if the print is small in them
@@ -229,7 +230,8 @@ def _search_scales(
 def _board_points(grey: UInt8[np.ndarray, "h w"], board: Board) -> FoundPoints:
     """Corners of a board; the patch around each is as large as a square."""
     markers_m = board.markers_m()
-    read = [m for m in find_markers(grey, marker_dictionary(board.dictionary)) if m.number < len(markers_m)]
+    markers = find_markers(grey, marker_dictionary(board.dictionary))
+    read = [marker for marker in markers if marker.number < len(markers_m)]
     if not read:
         return NOTHING
     plane = np.concatenate([markers_m[marker.number] for marker in read])
@@ -240,7 +242,25 @@ def _board_points(grey: UInt8[np.ndarray, "h w"], board: Board) -> FoundPoints:
     found = find_points(grey, pattern, guess)
     if len(found.points_m):
         _check_layout(board, read, found)
+        _check_extent(board, [marker for marker in markers if marker.number >= len(markers_m)], found)
     return found
+
+
+def _check_extent(board: Board, others: list[Marker], found: FoundPoints) -> None:
+    """Refuse a board with more rows: markers that this one lacks continue its squares."""
+    homography, _ = cv2.findHomography(found.points_px, found.points_m)
+    corners = transform(homography, np.reshape([marker.corners_px for marker in others], (-1, 4, 2)))
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    squares = (corners.mean(axis=1) + np.array(board.size_m) / 2) / board.square_m - 0.5  # whole in a square's middle
+    continue_it = np.all(np.abs(sides / board.marker_m - 1) < _ALIKE, axis=1)
+    continue_it &= np.all(np.abs(squares - np.round(squares)) < _ALIKE, axis=1)
+    if continue_it.sum() >= _STRAY_MARKERS:
+        raise _another_board(board)
+
+
+def _another_board(board: Board) -> InvalidInput:
+    told = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
+    return InvalidInput("board in the photograph", "another one", f"the one that was told, which has {told}")
 
 
 def _check_layout(board: Board, markers: list[Marker], found: FoundPoints) -> None:
@@ -250,8 +270,7 @@ def _check_layout(board: Board, markers: list[Marker], found: FoundPoints) -> No
     distances = np.abs(expected - [marker.corners_px for marker in markers]).max(axis=(1, 2))
     in_place = int((distances < _PLACE_PX).sum())
     if len(markers) - in_place > max(_STRAY_MARKERS, in_place / 3):
-        told = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
-        raise InvalidInput("board in the photograph", "another one", f"the one that was told, which has {told}")
+        raise _another_board(board)
 
 
 def _tag_points(grey: UInt8[np.ndarray, "h w"], dictionary: cv2.aruco.Dictionary, side_m: float) -> FoundPoints:
