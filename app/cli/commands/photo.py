@@ -53,8 +53,7 @@ class PhotoEstimate:
     out: Path
     """JSON to write."""
     boxes: tuple[str, ...] = ()
-    """NAME:LEFT,TOP,RIGHT,BOTTOM in pixels of the photo, for each object in one photo or more; PHOTO:NAME:... for another
-    than the first."""
+    """NAME:LEFT,TOP,RIGHT,BOTTOM [px] for each object; PHOTO:NAME:... if it is in another photo than the first."""
     masks: tuple[Path, ...] = ()
     """Folder with a mask of each object, NAME.png or mask_NAME.png or BOP's mask_visib; one for each photo."""
     poses: Path | None = None
@@ -66,8 +65,7 @@ class PhotoEstimate:
     pose_source: str | None = None
     """Whose poses in a photo.json; which variable of a .mat, such as poses_icp."""
     pose_frame: Literal["bop", "ycb_video", "google_16k"] | None = None
-    """Where the origin of objects lies: centre of the box, models of YCB-Video, meshes of YCB; by default as usual in
-    such a file."""
+    """Origin of objects: box's centre, YCB-Video's models, or YCB's meshes; by default what such files usually have."""
     focal: float | None = None
     """Focal length in pixels; by default what the board or the camera tells."""
     images: Path | None = None

@@ -83,6 +83,8 @@ def read_inputs(asked: Asked, known: Collection[str]) -> Ready:
     Raises:
         OsfError: with a sentence that says what is wrong.
     """
+    if not asked.photos:
+        raise InvalidInput("number of photos", 0, "1 or more")
     for what, given in (("folders of masks", asked.masks), ("numbers of images", asked.images)):
         if len(given) not in (0, len(asked.photos)):
             raise InvalidInput(f"number of {what}", len(given), f"{len(asked.photos)}, one for each photo")

@@ -130,8 +130,11 @@ def _only(what: str, asked: int | str | None, there: set[int] | set[str]) -> Any
 
 
 def _csv_rows(path: Path) -> list[_Row]:
-    text = _content(path).decode("utf-8", errors="replace")
-    lines = [line for line in csv.reader(io.StringIO(text.replace("\0", "?"))) if line]
+    text = _content(path).decode("utf-8-sig", errors="replace").replace("\0", "?")
+    try:
+        lines = [line for line in csv.reader(io.StringIO(text)) if line]
+    except csv.Error:
+        raise CorruptFile(shown(path), "it is no table of values with commas between them") from None
     if lines and lines[0][0].strip() == _COLUMNS[0]:
         lines = lines[1:]
     if not lines:
@@ -207,8 +210,8 @@ def _bop_pose(rotation: np.ndarray, shift_mm: np.ndarray) -> Pose:
             "pose", f"{rotation.size} and {shift_mm.size} numbers", "9 for the rotation and 3 for the position"
         )
     matrix = rotation.reshape(3, 3)
-    skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    if not skew < _MOST_SKEW or np.linalg.det(matrix) < 0:  # also for NaN
+    bounded = np.all(np.abs(matrix) < 1 + _MOST_SKEW)  # false for NaN
+    if not bounded or np.abs(matrix @ matrix.T - np.eye(3)).max() > _MOST_SKEW or np.linalg.det(matrix) < 0:
         raise InvalidInput("rotation", matrix.round(3).tolist(), "a rotation matrix, row by row")
     left, _, right = np.linalg.svd(matrix)
     return Pose(_before_camera(1e-3 * shift_mm, "mm"), quaternion_from_matrix(left @ right))

@@ -63,8 +63,9 @@ def _show(folder: Path, report: dict[str, Any]) -> None:
     if report["objects_total"]:
         print(
             f"{report['objects_total']} objects: IoU median {report['iou_median']:.3f}, least {report['iou_min']:.3f}; "
-            f"{report['coarse_s_median']:.1f} + {report['refine_s_median']:.1f} s each. Masks agree with the given ones "
-            f"by {report['mask_iou_median']:.3f} in the median, {report['mask_iou_min']:.3f} at least."
+            f"{report['coarse_s_median']:.1f} + {report['refine_s_median']:.1f} s each. "
+            f"Masks agree with the given ones by {report['mask_iou_median']:.3f} in the median, "
+            f"{report['mask_iou_min']:.3f} at least."
         )
     if report["light_deg_median"] is not None:
         print(f"Lamps: median error {report['light_deg_median']:.1f} deg, most {report['light_deg_max']:.1f} deg.")

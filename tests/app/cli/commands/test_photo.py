@@ -105,6 +105,10 @@ def test_a_text_file_is_no_photo(tmp_path, capsys):
     assert "it is no picture that can be read here" in refusal(capsys, tmp_path, "--photo", str(text), "--boxes", BOX)
 
 
+def test_no_photo_is_told(tmp_path, capsys):
+    assert "number of photos is 0" in refusal(capsys, tmp_path, "--boxes", BOX, "--photo")
+
+
 def test_a_photo_that_is_missing_is_told(tmp_path, capsys):
     assert "none.jpg" in refusal(capsys, tmp_path, "--photo", str(tmp_path / "none.jpg"), "--boxes", BOX)
 
