@@ -36,6 +36,14 @@ def _rebuilt(kind: type["OsfError"], sentence: str, facts: dict[str, object]) ->
     return error
 
 
+def _meant(name: str, known: list[str]) -> str:
+    """A question for names that hold what was given, or are spelt nearly so."""
+    if not isinstance(name, str) or not 0 < len(name) <= _SHOWN_CHARACTERS:
+        return ""
+    near = [one for one in known if name.lower() in one.lower()] or difflib.get_close_matches(name, known, cutoff=0.7)
+    return f" did you mean {' or '.join(near[:_MOST_NEAR])}?" if near else ""
+
+
 class OsfError(ValueError):
     """A mistake in an input, told in one sentence that a user can act on."""
 
@@ -72,10 +80,7 @@ class UnknownName(OsfError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         known = list(known)
-        near = [one for one in known if name.lower() in one.lower()] or difflib.get_close_matches(
-            name, known, cutoff=0.7
-        )
-        meant = f" did you mean {' or '.join(near[:_MOST_NEAR])}?" if name and near else ""
+        meant = _meant(name, known)
         super().__init__(f"There is no {kind} named {shown(repr(name))};{meant} known: {_listed(known)}.")
 
 
