@@ -4,6 +4,7 @@ Every error is an `OsfError`, so a caller at the edge (command line, REST) can s
 the facts and write the sentence. Nothing here knows of exit codes or HTTP.
 """
 
+import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ MAX_SEED = 2**63 - 1
 _MOST_CHARACTERS = 2000  # of a sentence, however long the names in it are
 _VALUE_CHARACTERS = 300  # of a value that was given, which may be a path or a list
 _SHOWN_CHARACTERS = 100
+_MOST_NEAR = 3  # names that may have been meant
 
 
 def shown(value: object, most: int = _SHOWN_CHARACTERS) -> str:
@@ -32,6 +34,14 @@ def _rebuilt(kind: type["OsfError"], sentence: str, facts: dict[str, object]) ->
     error = kind.__new__(kind, sentence)
     error.__dict__.update(facts)
     return error
+
+
+def _meant(name: str, known: list[str]) -> str:
+    """A question for names that hold what was given, or are spelt nearly so."""
+    if not isinstance(name, str) or not 0 < len(name) <= _SHOWN_CHARACTERS:
+        return ""
+    near = [one for one in known if name.lower() in one.lower()] or difflib.get_close_matches(name, known, cutoff=0.7)
+    return f" did you mean {' or '.join(near[:_MOST_NEAR])}?" if near else ""
 
 
 class OsfError(ValueError):
@@ -69,7 +79,9 @@ class UnknownName(OsfError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"There is no {kind} named {shown(repr(name))}; known: {_listed(known)}.")
+        known = list(known)
+        meant = _meant(name, known)
+        super().__init__(f"There is no {kind} named {shown(repr(name))};{meant} known: {_listed(known)}.")
 
 
 class MissingAssets(OsfError):

@@ -29,10 +29,11 @@ _CELL_PIXELS = 32  # of a cell of a tag, when drawn
 _GUESS_PX = 2.0  # by which corners of markers may be off
 _PLACE_PX = 3.0  # from where a marker should be
 _STRAY_MARKERS = 2  # that are read by mistake in other things
+_ALIKE = 0.15  # of a marker's side, and of a square's
 _MIN_SIDE = 64
 _TAG_POINTS = 4
 _WORKING_SIDES = (1920, 3840)  # [px]; photographs are reduced to the first, or the second if the print is small in them
-_ACCURACY_PX = 0.05  # of points in a real photograph; lenses are not perfect
+ACCURACY_PX = 0.05  # of points in a real photograph; lenses are not perfect
 _MAX_RMS_PX = 2.0
 _MAX_BLUR_PX = 1.6  # sharp photographs have 0.6 to 1.3, and markers of 15 px are lost above
 
@@ -142,11 +143,28 @@ def locate_board(
         InvalidInput: if the image is no photograph, no board or too little of it is found, the view is too steep to
             tell the focal length, or the points do not fit the camera.
     """
-    grey, given = _grey(image), None if intrinsics is None else _checked_intrinsics(intrinsics)
+    found = board_points(image, board)
+    return board_view(found, (image.shape[1], image.shape[0]), intrinsics)
+
+
+def board_points(image: UInt8[np.ndarray, "h w *channels"], board: Board) -> FoundPoints:
+    """Corners of the board's squares in a photograph.
+
+    Raises:
+        InvalidInput: if the image is no photograph, or no board or too little of it is found.
+    """
+    grey = _grey(image)
     found = _search_scales(grey, lambda small: _board_points(small, board), _MIN_CORNERS)
     if len(found.points_m) < _MIN_CORNERS:
         raise _not_found(grey, "board", len(found.points_m))
-    return _view(found, grey.shape[::-1], given)
+    return found
+
+
+def board_view(
+    found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None = None
+) -> BoardView:
+    """The camera that fits points best, in a photograph of this width and height [px]; see `locate_board`."""
+    return _view(found, size, None if intrinsics is None else _checked_intrinsics(intrinsics))
 
 
 def locate_tag(
@@ -212,7 +230,8 @@ def _search_scales(
 def _board_points(grey: UInt8[np.ndarray, "h w"], board: Board) -> FoundPoints:
     """Corners of a board; the patch around each is as large as a square."""
     markers_m = board.markers_m()
-    read = [m for m in find_markers(grey, marker_dictionary(board.dictionary)) if m.number < len(markers_m)]
+    markers = find_markers(grey, marker_dictionary(board.dictionary))
+    read = [marker for marker in markers if marker.number < len(markers_m)]
     if not read:
         return NOTHING
     plane = np.concatenate([markers_m[marker.number] for marker in read])
@@ -223,7 +242,25 @@ def _board_points(grey: UInt8[np.ndarray, "h w"], board: Board) -> FoundPoints:
     found = find_points(grey, pattern, guess)
     if len(found.points_m):
         _check_layout(board, read, found)
+        _check_extent(board, [marker for marker in markers if marker.number >= len(markers_m)], found)
     return found
+
+
+def _check_extent(board: Board, others: list[Marker], found: FoundPoints) -> None:
+    """Refuse a board with more rows: markers that this one lacks continue its squares."""
+    homography, _ = cv2.findHomography(found.points_px, found.points_m)
+    corners = transform(homography, np.reshape([marker.corners_px for marker in others], (-1, 4, 2)))
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    squares = (corners.mean(axis=1) + np.array(board.size_m) / 2) / board.square_m - 0.5  # whole in a square's middle
+    continue_it = np.all(np.abs(sides / board.marker_m - 1) < _ALIKE, axis=1)
+    continue_it &= np.all(np.abs(squares - np.round(squares)) < _ALIKE, axis=1)
+    if continue_it.sum() >= _STRAY_MARKERS:
+        raise _another_board(board)
+
+
+def _another_board(board: Board) -> InvalidInput:
+    told = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
+    return InvalidInput("board in the photograph", "another one", f"the one that was told, which has {told}")
 
 
 def _check_layout(board: Board, markers: list[Marker], found: FoundPoints) -> None:
@@ -233,8 +270,7 @@ def _check_layout(board: Board, markers: list[Marker], found: FoundPoints) -> No
     distances = np.abs(expected - [marker.corners_px for marker in markers]).max(axis=(1, 2))
     in_place = int((distances < _PLACE_PX).sum())
     if len(markers) - in_place > max(_STRAY_MARKERS, in_place / 3):
-        told = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
-        raise InvalidInput("board in the photograph", "another one", f"the one that was told, which has {told}")
+        raise _another_board(board)
 
 
 def _tag_points(grey: UInt8[np.ndarray, "h w"], dictionary: cv2.aruco.Dictionary, side_m: float) -> FoundPoints:
@@ -265,7 +301,7 @@ def _view(found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarra
     scale = max(1.0, max(size) / _WORKING_SIDES[0])
     matrix, deviation = intrinsics, 0.0
     if matrix is None:
-        focal, deviation = focal_length(found.points_m, found.points_px, size, _ACCURACY_PX * scale)
+        focal, deviation = focal_length(found.points_m, found.points_px, size, ACCURACY_PX * scale)
         matrix = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     pose, rms = planar_pose(found.points_m, found.points_px, matrix)
     if rms > _MAX_RMS_PX * scale:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +20,7 @@ _FOCAL_FLAGS = (
     | cv2.CALIB_FIX_K2
     | cv2.CALIB_FIX_K3
 )
+UNTOLD = "focal length"  # of the error for a view that does not tell it
 _MAX_FOCAL_STD = 0.03  # of the focal length
 _FOCAL_RANGE = (0.3, 10.0)  # focal lengths of cameras, in longer sides of the image
 
@@ -77,6 +80,36 @@ def focal_length(
         InvalidInput: if the standard deviation is above 3 %: seen from straight above, a plane looks the same through a
             long lens from afar as through a short one from near by.
     """
+    fit = calibrated(points_m, points_px, size, accuracy_px)
+    if fit is None or fit.focal_std > _MAX_FOCAL_STD * fit.focal:
+        raise InvalidInput(
+            UNTOLD, "unknown, and the print is too small in this view, or seen too steeply, to tell it",
+            "given, or the photograph taken from near by and at a slant, 30 to 60 degrees above the table",
+        )  # fmt: skip
+    return fit.focal, fit.focal_std
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Calibration:
+    """A camera with square pixels and a centred principal point that fits one view of a plane.
+
+    Attributes:
+        focal: length [px].
+        focal_std: its standard deviation [px].
+        rotation: of the table in the camera's frame, a rotation vector [rad].
+        translation: of the table's origin in it [m].
+    """
+
+    focal: float
+    focal_std: float
+    rotation: Float[np.ndarray, "3"]
+    translation: Float[np.ndarray, "3"]
+
+
+def calibrated(
+    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], size: tuple[int, int], accuracy_px: float
+) -> Calibration | None:
+    """The camera whose focal length fits best; None if no usual focal length fits. Arguments as of `focal_length`."""
     points = [np.pad(points_m, ((0, 0), (0, 1))).astype(np.float32)]
     pixels = [np.ascontiguousarray(points_px, np.float32)]
     guess = cv2.initCameraMatrix2D(points, pixels, size)[0, 0]
@@ -92,10 +125,7 @@ def focal_length(
     pivot = abs(np.linalg.qr(columns).R[-1, -1])
     scatter_px = np.linalg.norm(seen.reshape(-1, 2) - pixels[0]) / np.sqrt(max(columns.shape[0] - columns.shape[1], 1))
     focal = float(matrix[0, 0])
+    if not low < focal < high:
+        return None
     deviation = float(max(scatter_px, accuracy_px) / max(pivot, 1e-12))
-    if not (low < focal < high and deviation <= _MAX_FOCAL_STD * focal):
-        raise InvalidInput(
-            "focal length", "unknown, and the print is too small in this view, or seen too steeply, to tell it",
-            "given, or the photograph taken from near by and at a slant, 30 to 60 degrees above the table",
-        )  # fmt: skip
-    return focal, deviation
+    return Calibration(focal, deviation, rotations[0].ravel(), translations[0].ravel())

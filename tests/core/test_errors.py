@@ -50,3 +50,11 @@ def test_values_are_cut_in_the_middle():
     assert text.startswith("start")
     assert text.endswith("end\\t")
     assert errors.shown("mug.png") == "mug.png"
+
+
+def test_names_that_may_have_been_meant_are_asked_for():
+    known = ["025_mug", "024_bowl", "006_mustard_bottle"]
+    assert "named 'mug'; did you mean 025_mug? known: " in str(errors.UnknownName("object", "mug", known))
+    assert "did you mean 006_mustard_bottle?" in str(errors.UnknownName("object", "006_mustrad_botle", iter(known)))
+    for name in ("", "teapot", 10_000 * "x"):
+        assert "did you mean" not in str(errors.UnknownName("object", name, known))

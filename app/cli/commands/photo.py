@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from osfcore.photo.photograph import Photograph
     from osfcore.photo.poses.estimate_photo import PhotoModels
     from osfcore.photo.poses.photo_steps import PhotoPose, PhotoStep
-    from osfcore.photo.read_photograph import RawPhotograph
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,26 @@ class PhotoBoard:
 
 @dataclass(frozen=True)
 class PhotoEstimate:
-    """Find known objects and the lamp in a photograph; a box around each object says what to look for."""
+    """Find known objects and the lamp in photographs; a box around each object, or a mask, says what to look for."""
 
-    photo: Path
-    """JPEG, PNG or HEIC."""
-    boxes: tuple[str, ...]
-    """NAME:LEFT,TOP,RIGHT,BOTTOM in pixels of the photo, one for each object."""
+    photo: tuple[Path, ...]
+    """JPEG, PNG or HEIC; several of one table must all show the board."""
     out: Path
     """JSON to write."""
+    boxes: tuple[str, ...] = ()
+    """NAME:LEFT,TOP,RIGHT,BOTTOM [px] for each object; PHOTO:NAME:... if it is in another photo than the first."""
+    masks: tuple[Path, ...] = ()
+    """Folder with a mask of each object, NAME.png or mask_NAME.png or BOP's mask_visib; one for each photo."""
+    poses: Path | None = None
+    """Poses in the first photo to begin with: BOP's .csv or scene_gt.json, PoseCNN's .mat, or .json."""
+    image_id: tuple[int, ...] = ()
+    """Number of each photo in files of BOP."""
+    scene_id: int | None = None
+    """Number of the scene in a .csv of BOP."""
+    pose_source: str | None = None
+    """Whose poses in a photo.json; which variable of a .mat, such as poses_icp."""
+    pose_frame: Literal["bop", "ycb_video", "google_16k"] | None = None
+    """Origin of objects: box's centre, YCB-Video's models, or YCB's meshes; by default what such files usually have."""
     focal: float | None = None
     """Focal length in pixels; by default what the board or the camera tells."""
     images: Path | None = None
@@ -67,47 +79,29 @@ class PhotoEstimate:
 
     def run(self) -> dict[str, Any]:
         """Estimate; the result is what the file holds."""
+        from app.cli.commands.photo_inputs import Asked, read_inputs
         from osfcore.fields.field_library import FieldLibrary
-        from osfcore.inspection.photo_sheet import write_sheet
         from osfcore.io.files import write_json
-        from osfcore.photo.poses.estimate_photo import PhotoModels, estimate_photo
-        from osfcore.photo.read_photograph import read_photograph
+        from osfcore.photo.other_programs.pose_file import PoseChoice
+        from osfcore.photo.poses.estimate_photo import PhotoConfig, PhotoModels, estimate_photo
         from osfcore.random_streams import Stream, stream_rng
 
-        raw = read_photograph(self.photo)
-        boxes = dict(_box(text, raw) for text in self.boxes)
-        photo, notes = self._located(raw)
-        photo = photo.with_masks(_masks(raw, boxes))
         fields = FieldLibrary(self.data_dir)
-        models = PhotoModels({name: fields.load(name) for name in boxes})
+        choice = PoseChoice(None, self.scene_id, self.pose_source, self.pose_frame)
+        asked = Asked(self.photo, self.boxes, self.masks, self.poses, choice, self.image_id, self.focal)
+        ready = read_inputs(asked, fields.names())
+        models = PhotoModels({name: fields.load(name) for name in ready.names})
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
-        last = follow(_Shown(step.progress.done, step.progress.total, step.progress.note, step)
-                      for step in estimate_photo(models, [photo], tuple(boxes), rng))  # fmt: skip
+        steps = estimate_photo(models, ready.photos, ready.names, rng, PhotoConfig(ready.starts))
+        last = follow(_Shown(step.progress.done, step.progress.total, step.progress.note, step) for step in steps)
         assert last is not None
-        result = _result(photo, last.step, models, notes)
+        result = _result(ready.photos, last.step, models, list(ready.notes))
         write_json(self.out, result)
         if self.images is not None:
-            for found in last.step.found:
-                write_sheet(self.images / f"{found.name}.png", models, photo, found)
+            _write_sheets(self.images, models, ready.photos, last.step)
         if not self.json:
             _show(result, self.out)
         return result
-
-    def _located(self, raw: RawPhotograph) -> tuple[Photograph, list[str]]:
-        """The photograph with its camera: over the board if it shows one."""
-        from osfcore.photo.board import Board, locate_board
-        from osfcore.photo.read_photograph import guessed_intrinsics, intrinsics_from_focal, to_photograph
-
-        height, width = raw.encoded.shape[:2]
-        scale = max(height, width) / max(raw.sent_size)
-        given = None if self.focal is None else intrinsics_from_focal(width, height, scale * self.focal)
-        try:
-            view = locate_board(raw.eight_bit, Board(), given)
-        except InvalidInput as error:
-            K, note = (given, "") if given is not None else guessed_intrinsics(raw)
-            unknown = f"No board tells where the table is ({error})"
-            return to_photograph(raw, K), [*raw.notes, *([note] if note else []), unknown]
-        return to_photograph(raw, view.intrinsics, view.T_world_camera), list(raw.notes)
 
 
 @dataclass(frozen=True)
@@ -120,31 +114,18 @@ class _Shown:
     step: PhotoStep
 
 
-def _box(text: str, raw: RawPhotograph) -> tuple[str, tuple[float, float, float, float]]:
-    """Name and box of an argument, in pixels of the photo as it was read."""
-    name, _, numbers = text.rpartition(":")
-    try:
-        left, top, right, bottom = (float(number) for number in numbers.split(","))
-    except ValueError:
-        raise InvalidInput("box", text, "NAME:LEFT,TOP,RIGHT,BOTTOM, such as 025_mug:120,80,260,210") from None
-    scale = max(raw.encoded.shape[:2]) / max(raw.sent_size)
-    return name, (scale * left, scale * top, scale * right, scale * bottom)
+def _write_sheets(folder: Path, models: PhotoModels, photos: Sequence[Photograph], step: PhotoStep) -> None:
+    """NAME.png, or NAME-1.png and so on for each photo with a mask of it."""
+    from osfcore.inspection.photo_sheet import write_sheet
+
+    for found in step.found:
+        for number, photo in enumerate(photos, 1):
+            if found.name in photo.masks:
+                name = found.name if len(photos) == 1 else f"{found.name}-{number}"
+                write_sheet(folder / f"{name}.png", models, photo, found)
 
 
-def _masks(raw: RawPhotograph, boxes: dict[str, tuple[float, float, float, float]]) -> dict[str, Any]:
-    """A mask of each object: around it a box, in its middle a click."""
-    import numpy as np
-
-    from osfcore.photo.segmentation import propose_mask
-
-    masks = {}
-    for name, (left, top, right, bottom) in boxes.items():
-        middle = np.array([[(left + right) / 2, (top + bottom) / 2]])
-        masks[name] = propose_mask(raw.eight_bit, (left, top, right, bottom), middle)
-    return masks
-
-
-def _result(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: list[str]) -> dict[str, Any]:
+def _result(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: list[str]) -> dict[str, Any]:
     """What the file holds, in the table's frame where there is one."""
     import numpy as np
 
@@ -152,6 +133,7 @@ def _result(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: list
     from osfcore.photo.light.photo_light import photo_light
     from osfcore.photo.poses.estimate_photo import FINE_ACROSS
 
+    photo = max(photos, key=lambda photo: len(photo.masks))
     light = photo_light(photo, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
     T_table_world, table = Pose.identity(), "board" if photo.on_table else None
     if step.table is not None:
@@ -170,10 +152,12 @@ def _result(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: list
     ]
     toward = rotate(T_table_world.quaternion, light.direction)
     lamp = {"direction": toward.tolist(), "std_deg": float(np.rad2deg(light.std)), "diffuse": light.is_diffuse}
-    T_table_camera = (T_table_world @ photo.T_world_camera).matrix()
-    camera = {"K": photo.intrinsics.tolist(), "T_world_camera": T_table_camera.tolist(), "width": photo.width,
-              "height": photo.height}  # fmt: skip
-    return {"table": table, "objects": objects, "light": lamp, "camera": camera, "notes": notes}
+    cameras = [
+        {"K": photo.intrinsics.tolist(), "T_world_camera": (T_table_world @ photo.T_world_camera).matrix().tolist(),
+         "width": photo.width, "height": photo.height} for photo in photos
+    ]  # fmt: skip
+    several = {"cameras": cameras} if len(photos) > 1 else {}
+    return {"table": table, "objects": objects, "light": lamp, "camera": cameras[0], **several, "notes": notes}
 
 
 def _show(result: dict[str, Any], out: Path) -> None:

@@ -22,6 +22,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.board import TAG_DICTIONARY, Board, BoardView, locate_board, locate_tag
 from osfcore.photo.board_page import page_image
+from osfcore.photo.lens import locate_board_through_lens
 from osfcore.photo.markers import marker_dictionary
 
 _DISTANCES_M = (0.4, 1.0)
@@ -36,6 +37,7 @@ _REFLECTANCES = (0.04, 0.85)  # of ink and paper
 _BLUR_PX = 0.7
 _NOISE = 0.02
 _JPEG_QUALITY = 80
+_NEWTON_STEPS = 6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,6 +110,7 @@ def photograph(
     size: tuple[int, int],
     rng: np.random.Generator,
     blur_px: float = _BLUR_PX,
+    radial: float = 0.0,
 ) -> Photograph:
     """A photograph of a print that lies on a table, its centre at the origin and its top along +y.
 
@@ -118,12 +121,14 @@ def photograph(
         size: width and height of the photograph [px].
         rng: draws the table, the light and the noise.
         blur_px: standard deviation of the lens's blur [px].
+        radial: k1 of the lens, as OpenCV counts it; negative for a barrel.
     """
     width, height = size[0] * _SAMPLES, size[1] * _SAMPLES
     warp = _raster_to_image(paper.shape, pixels_per_m, *camera)
     ink, white = _REFLECTANCES
-    cover = cv2.warpPerspective(np.ones(paper.shape, np.float32), warp, (width, height))
-    print_light = cv2.warpPerspective((ink + (white - ink) * paper).astype(np.float32), warp, (width, height))
+    lens = _lens(size, camera[1], radial)
+    cover = _seen(np.ones(paper.shape, np.float32), warp, (width, height), lens)
+    print_light = _seen((ink + (white - ink) * paper).astype(np.float32), warp, (width, height), lens)
     texture = rng.uniform(0.6, 1.4, (24, 32)).astype(np.float32)
     table = (1 - cover) * cv2.resize(texture, (width, height), interpolation=cv2.INTER_CUBIC)
     layers = [_reduced(layer, size, blur_px)[..., None] for layer in (print_light, table)]
@@ -152,12 +157,13 @@ def board_photograph(
     board: Board | None = None,
     camera: tuple[Pose, Float[np.ndarray, "3 3"]] | None = None,
     blur_px: float = _BLUR_PX,
+    radial: float = 0.0,
 ) -> Photograph:
     """A photograph of the page with a board on it, by a random camera if none is given."""
     pose, intrinsics = camera or random_camera(rng, size)
     resolution = _PAGE_STEP * math.ceil(4 * intrinsics[0, 0] / _DISTANCES_M[0] / _PAGE_STEP)
     page = page_image(board or Board(), resolution)
-    return photograph(page, resolution, (pose, intrinsics), size, rng, blur_px)
+    return photograph(page, resolution, (pose, intrinsics), size, rng, blur_px, radial)
 
 
 def board_errors(
@@ -167,6 +173,7 @@ def board_errors(
     *,
     is_focal_known: bool = True,
     board: Board | None = None,
+    radial: float | None = None,
 ) -> ViewErrors:
     """Errors of cameras found with the board, in random views.
 
@@ -176,12 +183,17 @@ def board_errors(
         size: width and height of the photographs [px].
         is_focal_known: whether the intrinsics are told.
         board: that lies on the table; the default one if not given.
+        radial: k1 of a lens, which is looked for as well; None for a lens without distortion that is taken for such.
     """
     board = board or Board()
-    return _errors(
-        (board_photograph(rng, size, board) for _ in range(count)),
-        lambda view: locate_board(view.image, board, view.intrinsics if is_focal_known else None),
-    )
+
+    def locate(view: Photograph) -> BoardView:
+        intrinsics = view.intrinsics if is_focal_known else None
+        if radial is None:
+            return locate_board(view.image, board, intrinsics)
+        return locate_board_through_lens(view.image, board, intrinsics)[0]
+
+    return _errors((board_photograph(rng, size, board, radial=radial or 0.0) for _ in range(count)), locate)
 
 
 def tag_errors(count: int, rng: np.random.Generator, size: tuple[int, int], *, side_m: float = 0.08) -> ViewErrors:
@@ -225,6 +237,38 @@ def _error(found: BoardView, true: Photograph) -> Float[np.ndarray, "7"]:
             found.corner_count,
         ]
     )
+
+
+def _seen(
+    layer: Float[np.ndarray, "H W"],
+    warp: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
+    lens: Float[np.ndarray, "h w 2"] | None,
+) -> Float[np.ndarray, "h w"]:
+    """A flat layer as a camera of this finely sampled size sees it, through its lens."""
+    if lens is None:
+        return cv2.warpPerspective(layer, warp, size)
+    low = np.floor(np.minimum(lens.min(axis=(0, 1)), 0))
+    columns, rows = (np.ceil(lens.max(axis=(0, 1))) - low + 2).astype(int).tolist()
+    shift = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
+    straight = cv2.warpPerspective(layer, shift @ warp, (columns, rows))
+    return cv2.remap(straight, (lens - low).astype(np.float32), None, cv2.INTER_LINEAR)  # pyright: ignore
+
+
+def _lens(
+    size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"], radial: float
+) -> Float[np.ndarray, "h w 2"] | None:
+    """For each sample of the image the place where it would be without distortion [samples]; None without any."""
+    if radial == 0:
+        return None
+    fine = np.diag([_SAMPLES, _SAMPLES, 1.0]) @ intrinsics
+    columns, rows = np.meshgrid(np.arange(size[0] * _SAMPLES) + 0.5, np.arange(size[1] * _SAMPLES) + 0.5)
+    bent = (np.stack([columns, rows], axis=-1) - fine[:2, 2]) / fine[[0, 1], [0, 1]]
+    distance = np.linalg.norm(bent, axis=-1, keepdims=True)
+    straight = distance.copy()
+    for _ in range(_NEWTON_STEPS):
+        straight -= (straight * (1 + radial * straight**2) - distance) / (1 + 3 * radial * straight**2)
+    return bent * (straight / np.maximum(distance, 1e-9)) * fine[[0, 1], [0, 1]] + fine[:2, 2] - 0.5
 
 
 def _raster_to_image(

@@ -21,6 +21,7 @@ from osfcore.experiments.photos.folders import (
     scene_folders,
 )
 from osfcore.experiments.photos.lamp_errors import lamp_errors_deg
+from osfcore.experiments.photos.marked_masks import mask_iou, masks_from_boxes
 from osfcore.experiments.photos.report import PhotoReport, PhotoScore, report_of
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
@@ -54,6 +55,8 @@ class EvaluatePhotos:
         start: "none"; "perturbed": 3 cm and 20 deg off the ground truth, in random directions; or the name of a source
             of poses. Scenes that lack it are left out.
         plane: "known": fitted to the measured depth around the objects; "free".
+        masks: "given"; "boxes": proposed from the given mask's bounding box, a little looser, and a click at the point
+            farthest from its border, as a person would mark the object.
         mask_error_px: masks are grown and shrunk by that much in turn.
         repeats: random starts of each object.
         loss: of the search.
@@ -68,6 +71,7 @@ class EvaluatePhotos:
     repeats: int = 1
     loss: LossKind = "all"
     seed: int = 0
+    masks: Literal["given", "boxes"] = "given"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,11 +144,11 @@ def _measure(
     for found in last.found:
         moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
         write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
-        scores.append(_score(renderer, scene, moved))
+        scores.append(_score(renderer, scene, moved, mask_iou(photo, scene.photo, found.name)))
     return scores
 
 
-def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> PhotoScore:
+def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask_iou: float) -> PhotoScore:
     """Compare an object, its pose in the camera's frame, with all that is known."""
     name, pose = found.name, found.best.pose
     iou, depth_mm = _fit(renderer, scene, name, pose)
@@ -155,11 +159,13 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> P
         position_mm = 1e3 * float(np.linalg.norm(pose.position - reference.position))
     is_true = GROUND_TRUTH in scene.poses
     return PhotoScore(scene.name, name, is_true, iou, depth_mm, position_mm, rotation_deg, found.doubt,
-                      min(found.ratio, 99.0), found.coarse_s, found.refine_s)  # fmt: skip
+                      min(found.ratio, 99.0), found.coarse_s, found.refine_s, mask_iou)  # fmt: skip
 
 
 def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
     photo = scene.photo
+    if config.masks == "boxes":
+        photo = photo.with_masks(masks_from_boxes(scene))
     if config.mask_error_px:
         kernel = np.ones((2 * config.mask_error_px + 1,) * 2, np.uint8)
         change = (cv2.dilate, cv2.erode)

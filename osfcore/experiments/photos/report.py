@@ -27,6 +27,7 @@ class PhotoScore:
         ratio: loss of the best other orientation over that of the pose.
         coarse_s: of the search over rotations.
         refine_s: of the refinement.
+        mask_iou: of the mask that was searched with and the given one.
     """
 
     scene: str
@@ -40,6 +41,7 @@ class PhotoScore:
     ratio: float
     coarse_s: float
     refine_s: float
+    mask_iou: float = 1.0
 
     @property
     def is_turned_right(self) -> bool:
@@ -78,6 +80,8 @@ class PhotoReport:
             "iou_median": _median([s.iou for s in scores]),
             "iou_mean": _mean([s.iou for s in scores]),
             "iou_min": min((s.iou for s in scores), default=None),
+            "mask_iou_median": _median([s.mask_iou for s in scores]),
+            "mask_iou_min": min((s.mask_iou for s in scores), default=None),
             "depth_within_10mm": _mean([d <= _DEPTH_MM for d in depths]),
             "depth_mm_median": _median(depths),
             "frac_15mm_10deg": _mean([s.is_right for s in true]),

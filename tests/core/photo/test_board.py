@@ -117,9 +117,10 @@ def test_another_board_is_found_when_it_is_told():
         locate_board(view.image, BOARD, view.intrinsics)
 
 
-def test_a_board_of_another_layout_is_refused():
+@pytest.mark.parametrize("size", [(7, 5), (6, 5), (5, 4)])
+def test_a_board_of_another_layout_is_refused(size):
     rng = np.random.default_rng(3)
-    view = board_photograph(rng, VGA, Board(7, 5, 0.036, 0.027), random_camera(rng, VGA, (0.5, 0.5), (50, 50)))
+    view = board_photograph(rng, VGA, Board(*size, 0.036, 0.027), random_camera(rng, VGA, (0.5, 0.5), (50, 50)))
     with pytest.raises(InvalidInput, match="another one"):
         locate_board(view.image, BOARD, view.intrinsics)
 

@@ -20,6 +20,8 @@ class EvaluatePhotosCommand:
     """none; perturbed (3 cm and 20 deg off the truth); or a source of poses in photo.json, such as posecnn_raw."""
     plane: Literal["known", "free"] = "free"
     """Whether the table's plane is known, from the measured depth."""
+    masks: Literal["given", "boxes"] = "given"
+    """The folder's, or what a box around each of them and one click give, as a user has it."""
     mask_error: int = 0
     """Masks are grown and shrunk by that many pixels in turn."""
     repeats: int = 1
@@ -42,7 +44,7 @@ class EvaluatePhotosCommand:
 
         folder = self.data_dir / "photos" if self.out is None else self.out
         config = EvaluatePhotos(folder, self.data, self.start, self.plane, self.mask_error, self.repeats, self.loss,
-                                self.seed)  # fmt: skip
+                                self.seed, self.masks)  # fmt: skip
         last = follow(evaluate_photos(config, FieldLibrary(self.data_dir)))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
@@ -61,7 +63,9 @@ def _show(folder: Path, report: dict[str, Any]) -> None:
     if report["objects_total"]:
         print(
             f"{report['objects_total']} objects: IoU median {report['iou_median']:.3f}, least {report['iou_min']:.3f}; "
-            f"{report['coarse_s_median']:.1f} + {report['refine_s_median']:.1f} s each."
+            f"{report['coarse_s_median']:.1f} + {report['refine_s_median']:.1f} s each. "
+            f"Masks agree with the given ones by {report['mask_iou_median']:.3f} in the median, "
+            f"{report['mask_iou_min']:.3f} at least."
         )
     if report["light_deg_median"] is not None:
         print(f"Lamps: median error {report['light_deg_median']:.1f} deg, most {report['light_deg_max']:.1f} deg.")

@@ -11,6 +11,7 @@ from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.experiments.photos.evaluation import EvaluatePhotos, evaluate_photos
 from osfcore.experiments.photos.folders import read_lamps, read_scene
 from osfcore.experiments.photos.lamp_errors import lamp_errors_deg
+from osfcore.experiments.photos.marked_masks import box_and_click
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotate
 from osfcore.io.image_file import write_png
@@ -78,20 +79,41 @@ def test_lamps_by_the_highlight_and_by_shading(lamps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("start", "plane"), [("perturbed", "free"), ("none", "known")])
-def test_an_object_is_measured_against_its_truth(scene, tmp_path, start, plane):
-    config = EvaluatePhotos(tmp_path, scene.parent, start, plane)
+@pytest.mark.parametrize(
+    ("start", "plane", "masks"), [("perturbed", "free", "given"), ("none", "known", "given"), ("none", "free", "boxes")]
+)
+def test_an_object_is_measured_against_its_truth(scene, tmp_path, start, plane, masks):
+    config = EvaluatePhotos(tmp_path, scene.parent, start, plane, masks=masks)
     *steps, last = evaluate_photos(config, FieldLibrary(None))
     report = last.report.to_json()
     assert steps[0].total == 1
     assert report["objects_total"] == 1
     assert report["iou_median"] == report["iou_min"] > 0.9
+    assert report["mask_iou_median"] == report["mask_iou_min"]
+    assert (report["mask_iou_min"] == 1) == (masks == "given")
+    assert report["mask_iou_min"] > 0.85
     assert report["frac_10deg"] == 1
     assert report["wrong_unflagged"] == 0
     assert report["depth_within_10mm"] == 1
     assert report["light_deg_median"] is None
     assert json.loads((tmp_path / "report.json").read_text())["objects_total"] == 1
     assert (tmp_path / f"desk-{NAME}-0.png").stat().st_size > 1000
+
+
+def test_a_box_holds_the_mask_and_the_click_is_on_it():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        mask = np.zeros((60, 80), bool)
+        for _ in range(4):
+            x, y = rng.integers(0, 50, 2)
+            mask[y : y + rng.integers(5, 12), x : x + rng.integers(5, 30)] = True
+        (left, top, right, bottom), click = box_and_click(mask)
+        rows, columns = np.nonzero(mask)
+        assert 0 <= left <= columns.min()
+        assert columns.max() + 1 <= right <= 80
+        assert 0 <= top <= rows.min()
+        assert rows.max() + 1 <= bottom <= 60
+        assert mask[int(click[0, 1]), int(click[0, 0])]
 
 
 def test_the_table_is_where_depth_says(scene):

@@ -1,0 +1,1 @@
+"""Poses and masks that other programs found: files of BOP, PoseCNN and plain JSON."""
