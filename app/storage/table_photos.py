@@ -23,7 +23,7 @@ from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.io.files import read_json, write_atomically
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode, encode
 
-SENT, PICTURE, _FACTS = "sent", "photo.jpg", "photo.json"
+SENT, STRAIGHT, PICTURE, _FACTS = "sent", "straight.png", "photo.jpg", "photo.json"
 _TEMPORARY_PREFIX = ".new-"
 
 
@@ -202,12 +202,22 @@ class TablePhotoStore:
         """The file as it was sent."""
         return self._root / photo / SENT
 
+    def straight(self, photo: str) -> Path:
+        """All bits of a photograph whose lens bends straight lines, free of that; there may be none."""
+        return self._root / photo / STRAIGHT
+
     def mask(self, photo: str, name: str) -> Path:
         """The mask of an object that was marked."""
         return self._root / photo / f"mask_{name}.png"
 
-    def keep(self, record: TablePhoto, sent: bytes, picture: bytes) -> None:
+    def keep(self, record: TablePhoto, sent: bytes, picture: bytes, straight: bytes | None = None) -> None:
         """Keep a new photograph.
+
+        Args:
+            record: its facts.
+            sent: the file.
+            picture: what is shown.
+            straight: without the lens's distortion, if it shows any.
 
         Raises:
             TooManyPhotos: if there are too many.
@@ -219,16 +229,18 @@ class TablePhotoStore:
                 if len(self.all()) >= self._max_photos:
                     raise TooManyPhotos(self._max_photos)
                 folder.mkdir(parents=True)
-                for name, data in ((SENT, sent), (PICTURE, picture), (_FACTS, _facts(record))):
-                    (folder / name).write_bytes(data)
+                files = {SENT: sent, STRAIGHT: straight, PICTURE: picture, _FACTS: _facts(record)}
+                for name, data in files.items():
+                    if data is not None:
+                        (folder / name).write_bytes(data)
                 put_in_place(folder, self._root / record.id)
         except OSError as error:
             raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def replace(self, record: TablePhoto, files: dict[Path, bytes] | None = None) -> TablePhoto:
-        """Give a photograph other facts, and write files of it before.
+    def replace(self, record: TablePhoto, files: dict[Path, bytes | None] | None = None) -> TablePhoto:
+        """Give a photograph other facts, and write files of it before, or remove those that are None.
 
         Raises:
             UnknownName: if there is none.
@@ -238,7 +250,10 @@ class TablePhotoStore:
             with self._lock:
                 self.get(record.id)
                 for path, data in (files or {}).items():
-                    write_atomically(path, data)
+                    if data is None:
+                        path.unlink(missing_ok=True)
+                    else:
+                        write_atomically(path, data)
                 write_atomically(self._root / record.id / _FACTS, _facts(record))
         except OSError as error:
             raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error

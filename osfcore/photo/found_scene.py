@@ -4,7 +4,7 @@
      "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "doubt",
                   "rivals": [{"position", "quaternion", "loss", "iou"}]}],
      "light": {"direction": [3], "std_deg", "diffuse"},
-     "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "notes": [...]}
+     "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "other_cameras": [...], "notes": [...]}
 
 "board" and "objects" say what tells where the table is. "light" is null where too few pixels show objects.
 """
@@ -63,4 +63,5 @@ class FoundScene(Entry):
     objects: list[FoundObject]
     light: FoundLight | None
     camera: CameraJson
+    other_cameras: list[CameraJson] = Field([], description="Of further photos.")
     notes: list[str]

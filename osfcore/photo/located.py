@@ -2,58 +2,103 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
-from osfcore.photo.board import Board, locate_board
+from osfcore.photo.board import Board, BoardView
+from osfcore.photo.lens import CONTRADICTED, Lens, locate_board_through_lens
+from osfcore.photo.planar_pose import UNTOLD
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
 
 FocalSource = Literal["board", "given", "file", "assumed"]
+_MOST_APART = 1.3  # between the focal length that is given and the one in the file
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Located:
-    """What is known of a camera.
+    """A photograph with what is known of its camera.
 
     Attributes:
-        intrinsics: K [px of the decoded photo].
+        raw: free of distortion.
+        intrinsics: K of `raw` [px].
+        lens: that was found.
         source: who tells the focal length.
         T_world_camera: pose over the board; None if there is none.
         notes: sentences for the user about photo and camera.
+        missing: why no board was found; "" where one was.
     """
 
+    raw: RawPhotograph
     intrinsics: Float[np.ndarray, "3 3"]
+    lens: Lens
     source: FocalSource
     T_world_camera: Pose | None
     notes: tuple[str, ...]
+    missing: str = ""
+
+    def straightened(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """A mask of the photograph as it was read, in the one that is free of distortion."""
+        return self.lens.straightened(mask.astype(np.float32)) > 0.5
 
 
-def locate(raw: RawPhotograph, focal_px: float | None = None, board: Board | None = None) -> Located:
+def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
     """Find the camera.
 
     Args:
         raw: the decoded photo.
         focal_px: focal length in pixels of the photo as it was sent; None where nobody knows.
-        board: that may lie on the table; ours by default.
 
     Raises:
-        InvalidInput: if the focal length makes no sense.
+        InvalidInput: if the focal length makes no sense, or the board contradicts it.
     """
     height, width = raw.encoded.shape[:2]
     scale = max(height, width) / max(raw.sent_size)
     given = None if focal_px is None else intrinsics_from_focal(width, height, scale * focal_px)
+    notes = list(raw.notes)
+    if focal_px is not None and raw.focal_px is not None:
+        written = raw.focal_px / scale
+        if not 1 / _MOST_APART < focal_px / written < _MOST_APART:
+            notes.append(f"The focal length {focal_px:g} is not what the camera wrote into the photo, {written:.0f}.")
     try:
-        view = locate_board(raw.eight_bit, board or Board(), given)
+        view, lens, source = _over_board(raw, given, notes)
     except InvalidInput as error:
-        unknown = f"No board tells where the table is ({error})"
-        if given is not None:
-            return Located(given, "given", None, (*raw.notes, unknown))
-        K, note = guessed_intrinsics(raw)
-        return Located(K, "assumed" if raw.focal_px is None else "file", None, (*raw.notes, note, unknown))
-    source = "given" if given is not None else "board"
-    return Located(view.intrinsics, source, view.T_world_camera, raw.notes)
+        if error.what == CONTRADICTED:
+            raise
+        K, source = given, "given"
+        if K is None:
+            K, note = guessed_intrinsics(raw)
+            notes.append(note)
+            source = _guess_source(raw)
+        notes.append("No printed board was found, so that the table is found from how objects stand on it.")
+        return Located(raw, K, Lens(K, 0.0), source, None, tuple(notes), str(error))
+    if lens.radial:
+        bend = f"k1 = {lens.radial:.3f}, as the board shows"
+        notes.append(f"The lens bends straight lines ({bend}); the photo was straightened.")
+    straight = replace(raw, encoded=lens.straightened(raw.encoded))
+    return Located(straight, view.intrinsics, lens, source, view.T_world_camera, tuple(notes))
+
+
+def _over_board(
+    raw: RawPhotograph, given: Float[np.ndarray, "3 3"] | None, notes: list[str]
+) -> tuple[BoardView, Lens, FocalSource]:
+    """The camera, its lens, and who tells the focal length; one that the board does not tell is guessed, and noted."""
+    source: FocalSource = "board" if given is None else "given"
+    try:
+        view, lens = locate_board_through_lens(raw.eight_bit, Board(), given)
+    except InvalidInput as error:
+        if error.what != UNTOLD:
+            raise
+        guess, note = guessed_intrinsics(raw)
+        view, lens = locate_board_through_lens(raw.eight_bit, Board(), guess)
+        notes.append(f"The board is seen so that it does not tell the focal length. {note}")
+        source = _guess_source(raw)
+    return view, lens, source
+
+
+def _guess_source(raw: RawPhotograph) -> FocalSource:
+    return "assumed" if raw.focal_px is None else "file"

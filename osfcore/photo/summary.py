@@ -17,30 +17,35 @@ from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels
 from osfcore.photo.poses.photo_steps import PhotoObject, PhotoPose, PhotoStep
 
 
-def summarised(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: Sequence[str]) -> FoundScene:
+def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: Sequence[str]) -> FoundScene:
     """The result of an estimation.
 
     Args:
-        photo: with masks.
+        photos: of one table; the light is that of the one with most masks.
         step: the last one.
         models: of the objects.
         notes: sentences for the user about the photo.
     """
-    T_table_world, table, notes = Pose.identity(), "board" if photo.on_table else None, list(notes)
+    T_table_world, table, notes = Pose.identity(), "board" if photos[0].on_table else None, list(notes)
     if step.table is not None:
         T_table_world, table = step.table.T_world_camera, "objects"
         seen = f"{len(step.table.supported)} objects lie, whose verticals differ by {step.table.spread_deg:.1f} degrees"
         notes.append(f"The table was found from how {seen}; it may be off by a few.")
     light = None
     try:
-        fit = photo_light(photo, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
+        shown = max(photos, key=lambda photo: len(photo.masks))
+        fit = photo_light(shown, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
         toward = rotate(T_table_world.quaternion, fit.direction)
         light = FoundLight(direction=toward.tolist(), std_deg=float(np.rad2deg(fit.std)), diffuse=fit.is_diffuse)
     except InvalidInput as error:
         notes.append(f"The light cannot be told: {error}")
-    camera = Camera("photo", T_table_world @ photo.T_world_camera, photo.intrinsics, photo.width, photo.height)
+    cameras = [
+        Camera(f"photo {number}", T_table_world @ photo.T_world_camera, photo.intrinsics, photo.width, photo.height)
+        for number, photo in enumerate(photos, 1)
+    ]
+    first, *others = map(CameraJson.of, cameras)
     objects = [_found(T_table_world, each) for each in step.found]
-    return FoundScene(table=table, objects=objects, light=light, camera=CameraJson.of(camera), notes=notes)
+    return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
 
 
 def _found(T_table_world: Pose, found: PhotoObject) -> FoundObject:

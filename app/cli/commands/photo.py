@@ -17,7 +17,7 @@ from osfcore.errors import InvalidInput
 if TYPE_CHECKING:
     from osfcore.photo.photograph import Photograph
     from osfcore.photo.poses.estimate_photo import PhotoModels
-    from osfcore.photo.poses.photo_steps import PhotoPose, PhotoStep
+    from osfcore.photo.poses.photo_steps import PhotoStep
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,10 @@ class PhotoEstimate:
         from app.cli.commands.photo_inputs import Asked, read_inputs
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import write_json
+        from osfcore.io.json_codec import encode
         from osfcore.photo.other_programs.pose_file import PoseChoice
         from osfcore.photo.poses.estimate_photo import PhotoConfig, PhotoModels, estimate_photo
+        from osfcore.photo.summary import summarised
         from osfcore.random_streams import Stream, stream_rng
 
         fields = FieldLibrary(self.data_dir)
@@ -95,7 +97,7 @@ class PhotoEstimate:
         steps = estimate_photo(models, ready.photos, ready.names, rng, PhotoConfig(ready.starts))
         last = follow(_Shown(step.progress.done, step.progress.total, step.progress.note, step) for step in steps)
         assert last is not None
-        result = _result(ready.photos, last.step, models, list(ready.notes))
+        result = encode(summarised(ready.photos, last.step, models, ready.notes))
         write_json(self.out, result)
         if self.images is not None:
             _write_sheets(self.images, models, ready.photos, last.step)
@@ -125,41 +127,6 @@ def _write_sheets(folder: Path, models: PhotoModels, photos: Sequence[Photograph
                 write_sheet(folder / f"{name}.png", models, photo, found)
 
 
-def _result(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: list[str]) -> dict[str, Any]:
-    """What the file holds, in the table's frame where there is one."""
-    import numpy as np
-
-    from osfcore.geometry.poses import Pose, rotate
-    from osfcore.photo.light.photo_light import photo_light
-    from osfcore.photo.poses.estimate_photo import FINE_ACROSS
-
-    photo = max(photos, key=lambda photo: len(photo.masks))
-    light = photo_light(photo, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
-    T_table_world, table = Pose.identity(), "board" if photo.on_table else None
-    if step.table is not None:
-        T_table_world, table = step.table.T_world_camera, "objects"
-        count, spread = len(step.table.supported), step.table.spread_deg
-        seen = f"The table was found from how {count} objects lie, whose verticals differ by {spread:.1f} degrees"
-        notes = [*notes, f"{seen}; it may be off by a few."]
-
-    def entry(found: PhotoPose) -> dict[str, Any]:
-        pose = T_table_world @ found.pose
-        return {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist(), "loss": found.loss,
-                "iou": found.iou}  # fmt: skip
-
-    objects = [
-        {"name": o.name, **entry(o.best), "doubt": o.doubt, "rivals": [entry(r) for r in o.rivals]} for o in step.found
-    ]
-    toward = rotate(T_table_world.quaternion, light.direction)
-    lamp = {"direction": toward.tolist(), "std_deg": float(np.rad2deg(light.std)), "diffuse": light.is_diffuse}
-    cameras = [
-        {"K": photo.intrinsics.tolist(), "T_world_camera": (T_table_world @ photo.T_world_camera).matrix().tolist(),
-         "width": photo.width, "height": photo.height} for photo in photos
-    ]  # fmt: skip
-    several = {"cameras": cameras} if len(photos) > 1 else {}
-    return {"table": table, "objects": objects, "light": lamp, "camera": cameras[0], **several, "notes": notes}
-
-
 def _show(result: dict[str, Any], out: Path) -> None:
     """The result for people: a line for each object, one for the light, the notes."""
     for entry in result["objects"]:
@@ -167,9 +134,9 @@ def _show(result: dict[str, Any], out: Path) -> None:
         print(f"{entry['name']} at {x:.1f}, {y:.1f}, {z:.1f} cm; its outline fits by {100 * entry['iou']:.0f} %.")
         if entry["doubt"]:
             print(f"  {entry['doubt']}")
-    if result["light"]["diffuse"]:
+    if result["light"] and result["light"]["diffuse"]:
         print("The light is diffuse: nothing speaks for one lamp.")
-    else:
+    elif result["light"]:
         print(f"Toward the lamp: {json.dumps([round(v, 2) for v in result['light']['direction']])}.")
     print("\n".join([*result["notes"], f"Wrote {out}."]))
 

@@ -8,29 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from osfcore.errors import InvalidInput, UnknownName, shown
 from osfcore.geometry.poses import Pose
-from osfcore.photo.board import Board
-from osfcore.photo.lens import CONTRADICTED, Lens, locate_board_through_lens
+from osfcore.photo.located import locate
 from osfcore.photo.other_programs.mask_folder import read_masks
 from osfcore.photo.other_programs.pose_file import PoseChoice, read_poses
-from osfcore.photo.planar_pose import UNTOLD
-from osfcore.photo.read_photograph import (
-    RawPhotograph,
-    guessed_intrinsics,
-    intrinsics_from_focal,
-    read_photograph,
-    to_photograph,
-)
+from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, propose_mask
 
 if TYPE_CHECKING:
     from osfcore.photo.photograph import Photograph
 
 _FORM = "[PHOTO:]NAME:LEFT,TOP,RIGHT,BOTTOM, such as 025_mug:120,80,260,210"
-_MOST_APART = 1.3  # between the focal length that is given and the one in the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,50 +145,14 @@ def _masks(
     return masks
 
 
-def _seen_over_board(
-    raw: RawPhotograph, given: Float[np.ndarray, "3 3"] | None, notes: list[str]
-) -> tuple[Float[np.ndarray, "3 3"], Pose | None, Lens]:
-    """K, `T_world_camera` and the lens, by the board; a focal length that it does not tell is guessed, and noted."""
-    try:
-        view, lens = locate_board_through_lens(raw.eight_bit, Board(), given)
-    except InvalidInput as error:
-        if error.what != UNTOLD:
-            raise
-        guess, note = guessed_intrinsics(raw)
-        view, lens = locate_board_through_lens(raw.eight_bit, Board(), guess)
-        notes.append(f"The board is seen so that it does not tell the focal length. {note}")
-    return view.intrinsics, view.T_world_camera, lens
-
-
 def _located(
     path: Path, raw: RawPhotograph, masks: Mapping[str, Any], focal: float | None, *, is_alone: bool
 ) -> tuple[Photograph, list[str]]:
     """The photograph with its camera, free of distortion: over the board if it shows one."""
-    height, width = raw.encoded.shape[:2]
-    notes = list(raw.notes)
-    given = None
-    if focal is not None:
-        scale = max(height, width) / max(raw.sent_size)
-        given = intrinsics_from_focal(width, height, scale * focal)
-        if raw.focal_px is not None and not 1 / _MOST_APART < scale * focal / raw.focal_px < _MOST_APART:
-            notes.append(
-                f"The focal length {focal:g} is not what the camera wrote into the photo, {raw.focal_px / scale:.0f}."
-            )
-    try:
-        K, pose, lens = _seen_over_board(raw, given, notes)
-    except InvalidInput as error:
-        if error.what == CONTRADICTED:
-            raise
-        if not is_alone:
-            allowed = f"to be seen, since there are several photos ({str(error).rstrip('.')})"
-            raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed) from None
-        K, note = (given, "") if given is not None else guessed_intrinsics(raw)
-        notes += [*([note] if note else []), f"No board tells where the table is ({error})"]
-        pose, lens = None, Lens(K, 0.0)
-    if lens.radial:
-        notes.append(
-            f"The lens bends straight lines (k1 = {lens.radial:.3f}, as the board shows); the photo was straightened."
-        )
-    straight = RawPhotograph(lens.straightened(raw.encoded), raw.encoding, raw.sent_size, raw.focal_px, raw.notes)
-    flat = {name: lens.straightened(mask.astype(np.float32)) > 0.5 for name, mask in masks.items()}
-    return to_photograph(straight, K, pose, flat), notes
+    found = locate(raw, focal)
+    if found.T_world_camera is None and not is_alone:
+        allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
+        raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
+    straight = {name: found.straightened(mask) for name, mask in masks.items()}
+    photo = to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight)
+    return photo, list(found.notes)

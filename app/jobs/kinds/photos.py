@@ -1,7 +1,7 @@
 """The job that finds objects and lamp in photographs of one table.
 
-Its inputs: for photo K `K`, the file as it was sent, and `K_NAME.png`, the masks of marked objects; cameras stand in
-the parameters. It leaves `found.json` and a sheet `NAME.J.png` of each pose that explains the first photo.
+Its inputs: for photo K `K`, the file free of distortion, and `K_NAME.png`, the masks of marked objects; cameras stand
+in the parameters. It leaves `found.json` and a sheet `NAME.J.png` of each pose that explains the first photo.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def photo_job(params: dict[str, Any], place: JobContext) -> Iterator[Finding]:
         yield Finding(step.progress.done, step.progress.total + 1, step.progress.note, len(step.found))
     assert step is not None
     yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
-    write_json(place.folder / FOUND, encode(summarised(photos[0], step, models, params["notes"])))
+    write_json(place.folder / FOUND, encode(summarised(photos, step, models, params["notes"])))
     for found in step.found:
         if found.name in photos[0].masks:
             _draw_sheets(place.folder, models, photos[0], found)

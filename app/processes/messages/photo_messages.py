@@ -29,7 +29,8 @@ class PhotoRead:
     """A decoded photograph.
 
     Attributes:
-        jpeg: the picture, no side longer than 2048 px.
+        jpeg: the picture, free of the lens's distortion, no side longer than 2048 px.
+        straight: PNG of all its bits, free of distortion; None where the lens shows none.
         width: of the picture [px].
         height: of the picture [px].
         sent_width: of the photo as it was sent [px].
@@ -40,6 +41,7 @@ class PhotoRead:
     """
 
     jpeg: bytes
+    straight: bytes | None
     width: int
     height: int
     sent_width: int

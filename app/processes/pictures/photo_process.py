@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
 from app.processes.child_process import limit_memory
 from app.processes.messages.photo_messages import FindMask, Mark, MaskFound, PhotoOrder, PhotoRead, ReadPhoto
@@ -48,15 +48,22 @@ def _read(order: ReadPhoto) -> PhotoRead:
     except CorruptFile as error:
         raise PhotoRefused(str(error)) from None
     found = locate(raw, order.focal_px)
-    height, width = raw.encoded.shape[:2]
-    K = tuple(tuple(float(value) for value in row) for row in found.intrinsics)
+    height, width = found.raw.encoded.shape[:2]
     return PhotoRead(
-        _jpeg(raw.eight_bit), width, height, raw.sent_size[0], K, found.source, found.T_world_camera, found.notes
+        _encoded(".jpg", found.raw.eight_bit, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]),
+        _encoded(".png", found.raw.encoded) if found.lens.radial else None,
+        width,
+        height,
+        raw.sent_size[0],
+        tuple(tuple(float(value) for value in row) for row in found.intrinsics),
+        found.source,
+        found.T_world_camera,
+        found.notes,
     )
 
 
-def _jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    done, encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+def _encoded(kind: str, picture: np.ndarray, options: list[int] | None = None) -> bytes:
+    done, encoded = cv2.imencode(kind, picture[..., ::-1], options or [])
     assert done
     return encoded.tobytes()
 

@@ -114,7 +114,7 @@ class TablePhotos:
         self._runner.storage.check_room()
         facts = uuid.uuid4().hex[:12], name, now_utc(), read.width, read.height, read.sent_width
         photo = TablePhoto(*facts, np.array(read.K), read.source, read.T_world_camera, read.notes)
-        self._store.keep(photo, data, read.jpeg)
+        self._store.keep(photo, data, read.jpeg, read.straight)
         return self._told(photo)
 
     def set_focal(self, photo: str, focal_px: float | None) -> TablePhoto:
@@ -127,7 +127,8 @@ class TablePhotos:
         before = self.get(photo)
         read = self._read(self._store.sent(photo).read_bytes(), focal_px)
         camera = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
-        return self._changed(replace(before, **camera, notes=read.notes))
+        files = {self.picture(photo): read.jpeg, self._store.straight(photo): read.straight}
+        return self._changed(replace(before, **camera, notes=read.notes), files)
 
     def remove(self, photo: str) -> None:
         """Delete a photograph; tables and goals that were made of it stay.
@@ -254,7 +255,7 @@ class TablePhotos:
         """
         return self._told(self._store.replace(photo))
 
-    def _changed(self, photo: TablePhoto, files: dict[Path, bytes] | None = None) -> TablePhoto:
+    def _changed(self, photo: TablePhoto, files: dict[Path, bytes | None] | None = None) -> TablePhoto:
         """Keep a photograph of which something else is to be found now."""
         return self._told(self._store.replace(replace(photo, objects=_unchosen(photo), job=None), files))
 
@@ -267,7 +268,9 @@ class TablePhotos:
             folder.mkdir(parents=True)
             for number, photo in enumerate(photos):
                 masks = {entry.name: self.mask(photo.id, entry.name) for entry in photo.objects}
-                for name, path in inputs_of(number, self._store.sent(photo.id), masks).items():
+                straight = self._store.straight(photo.id)
+                source = straight if straight.is_file() else self._store.sent(photo.id)
+                for name, path in inputs_of(number, source, masks).items():
                     shutil.copyfile(path, folder / name)
         except OSError as error:
             raise CannotStore(folder, error.strerror or str(error)) from error
