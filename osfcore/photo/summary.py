@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotate
 from osfcore.io.scene_file import CameraJson
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundScene
@@ -39,13 +38,16 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
         light = FoundLight(direction=toward.tolist(), std_deg=float(np.rad2deg(fit.std)), diffuse=fit.is_diffuse)
     except InvalidInput as error:
         notes.append(f"The light cannot be told: {error}")
-    cameras = [
-        Camera(f"photo {number}", T_table_world @ photo.T_world_camera, photo.intrinsics, photo.width, photo.height)
-        for number, photo in enumerate(photos, 1)
-    ]
-    first, *others = map(CameraJson.of, cameras)
+    first, *others = [_camera(number, T_table_world, photo) for number, photo in enumerate(photos, 1)]
     objects = [_found(T_table_world, each) for each in step.found]
     return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
+
+
+def _camera(number: int, T_table_world: Pose, photo: Photograph) -> CameraJson:
+    """The camera of a photograph, which may have more pixels than one of the simulation."""
+    T_table_camera = (T_table_world @ photo.T_world_camera).matrix().tolist()
+    K, size = photo.intrinsics.tolist(), {"width": photo.width, "height": photo.height}
+    return CameraJson(name=f"photo {number}", T_world_camera=T_table_camera, K=K, **size)
 
 
 def _found(T_table_world: Pose, found: PhotoObject) -> FoundObject:
