@@ -1,0 +1,129 @@
+"""The linear part of the light: for each colour and view, by weighted least squares, given the lamp's share in closed form.
+
+With s the lamp's share of light on each pixel, n . l times visibility, falloff and cone, and b small (a ridge),
+
+    objects: I = albedo * (a + b . n + k * s),      table: I = A + K * s with A, K >= 0,
+
+since the table's albedo is unknown. k is not negative either: no lamp takes light away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from osfcore.photo.light.lit_pixels import LitPixels
+
+RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Gains:
+    """Light of one scene.
+
+    Attributes:
+        residual: radiance less what the light explains.
+        lamp: k of each view and colour; NaN where no object is seen.
+        ambient: a of them.
+        gradient: b of them, mean over views and colours.
+    """
+
+    residual: Float[np.ndarray, "P 3"]
+    lamp: Float[np.ndarray, "views 3"]
+    ambient: Float[np.ndarray, "views 3"]
+    gradient: Float[np.ndarray, "3"]
+
+
+class GainSolver:
+    """Least squares of the light's linear part.
+
+    Args:
+        pixels: of one scene.
+    """
+
+    def __init__(self, pixels: LitPixels) -> None:
+        self._pixels = pixels
+        self._views = int(pixels.view.max()) + 1
+        table, views = pixels.on_table, range(self._views)
+        self._tables = [found for v in views if len(found := np.flatnonzero(table & (pixels.view == v)))]
+        self._objects = [(v, found) for v in views if len(found := np.flatnonzero(~table & (pixels.view == v)))]
+
+    def __call__(self, share: Float[np.ndarray, "P"] | None, weights: Float[np.ndarray, "P"]) -> Gains:
+        """The light and what it leaves, for the lamp's share of light on each pixel; without a lamp for None."""
+        radiance = self._pixels.radiance
+        residual = np.empty_like(radiance)
+        lamp, ambient = np.full((2, self._views, 3), np.nan)
+        gradients = [np.zeros(3)]
+        for view, chosen in self._objects:
+            light = self._on_objects(chosen, None if share is None else share[chosen], weights[chosen], residual)
+            ambient[view], lamp[view] = light[:, 0], light[:, 4] if share is not None else 0.0
+            gradients.append(light[:, 1:4].mean(axis=0))
+        for chosen in self._tables:
+            part = None if share is None else share[chosen]
+            residual[chosen] = radiance[chosen] - table_light(part, radiance[chosen], weights[chosen])
+        return Gains(residual, lamp, ambient, np.mean(gradients[1:] or gradients, axis=0))
+
+    def _on_objects(
+        self, chosen: np.ndarray, share: np.ndarray | None, weights: np.ndarray, residual: np.ndarray
+    ) -> Float[np.ndarray, "3 K"]:
+        """The light of objects in one view; writes the residual."""
+        pixels = self._pixels
+        plain = np.column_stack([np.ones(len(chosen)), pixels.normals[chosen]])
+        lit = plain if share is None else np.column_stack([plain, share])
+        light = np.zeros((3, 5 if share is not None else 4))
+        for c in range(3):
+            albedo, target = pixels.albedo[chosen, c], pixels.radiance[chosen, c]
+            found = _ridge(lit, albedo, target, weights, 0.0 if share is None else RIDGE)
+            if share is not None and found[4] < 0:
+                found = np.append(_ridge(plain, albedo, target, weights, 0.0), 0.0)
+            light[c] = found
+            residual[chosen, c] = target - albedo * (lit @ found)
+        return light
+
+
+def table_light(
+    share: Float[np.ndarray, "P"] | None, radiance: Float[np.ndarray, "P C"], weights: Float[np.ndarray, "P"]
+) -> Float[np.ndarray, "P C"]:
+    """A + K s that fits radiance best, neither negative."""
+    total = max(float(weights.sum()), _TINY)
+    mean = weights @ radiance / total
+    if share is None:
+        return np.tile(mean, (len(radiance), 1))
+    middle = float(weights @ share) / total
+    centred = share - middle
+    slope = np.maximum((weights * centred) @ radiance / max(float((weights * centred) @ centred), _TINY), 0)
+    base = mean - slope * middle
+    through_zero = (weights * share) @ radiance / max(float((weights * share) @ share), _TINY)
+    slope, base = np.where(base < 0, through_zero, slope), np.maximum(base, 0)
+    return base + share[:, None] * slope
+
+
+def _ridge(
+    basis: np.ndarray, albedo: np.ndarray, target: np.ndarray, weights: np.ndarray, ridge: float
+) -> Float[np.ndarray, "K"]:
+    weighted = basis * (weights * albedo)[:, None]
+    normal = weighted.T @ (basis * albedo[:, None])
+    scale = max(float(normal[0, 0]), _TINY)
+    normal[np.diag_indices(len(normal))] += _TINY * scale
+    normal[[1, 2, 3], [1, 2, 3]] += ridge * scale
+    return np.linalg.solve(normal, weighted.T @ target)
+
+
+def tukey_weights(
+    residual: Float[np.ndarray, "P 3"], on_table: Bool[np.ndarray, "P"]
+) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """Weights of pixels and the standard deviations they are relative to, those of objects and table apart."""
+    size = np.linalg.norm(residual, axis=1) / np.sqrt(3)
+    weights, std = np.empty(len(size)), np.empty(len(size))
+    for part in (on_table, ~on_table):
+        if part.any():
+            std[part] = max(1.4826 * float(np.median(size[part])), _LEAST_STD)
+            weights[part] = (1 - np.minimum(size[part] / (_TUKEY * std[part]), 1) ** 2) ** 2
+    return weights, std
+
+
+_TUKEY = 4.685  # deviations; 95 % efficient for normal errors
+_LEAST_STD = 2e-3  # [radiance]
