@@ -89,9 +89,6 @@ class LampShape:
         share = float(np.clip(self.inner_share + x[6], *_SHARES))
         return LampShape(self.centre, direction, inverse, self.aim + x[3:5], radius, share)
 
-    def visible(self, pixels: LitPixels, lifted: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Share of the lamp that each pixel sees; `lifted` are the points that it is looked for from [m]."""
-        return pixels.shadows.from_place(self.place, lifted)
 
     def unshaded(self, pixels: LitPixels) -> Float[np.ndarray, "P"]:
         """Share of the light that falls on each pixel past no object; 1 on one at the centre that faces the lamp."""

@@ -1,10 +1,11 @@
-"""The linear part of the light: for each colour and view, by weighted least squares, given the lamp's share in closed form.
+"""The linear part of the light: by weighted least squares for each colour and view, given the lamp's share of light.
 
-With s the lamp's share of light on each pixel, n . l times visibility, falloff and cone, and b small (a ridge),
+With s the lamp's share on each pixel, n . l times visibility, falloff and cone, and b small (a ridge),
 
     objects: I = albedo * (a + b . n + k * s),      table: I = A + K * s with A, K >= 0,
 
-since the table's albedo is unknown. k is not negative either: no lamp takes light away.
+since the table's albedo is unknown. k is not negative either: no lamp takes light away. Without a lamp, light on the
+table may vary smoothly, as a quadratic of the place: shadows and cones speak for lamps, vignetting does not.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from osfcore.photo.light.lit_pixels import LitPixels
 
 RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
 _TINY = 1e-9
+_TABLE_SCALE_M = 0.4
+_TUKEY = 4.685  # deviations; 95 % efficient for normal errors
+_LEAST_STD = 2e-3  # [radiance]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,8 +66,11 @@ class GainSolver:
             ambient[view], lamp[view] = light[:, 0], light[:, 4] if share is not None else 0.0
             gradients.append(light[:, 1:4].mean(axis=0))
         for chosen in self._tables:
-            part = None if share is None else share[chosen]
-            residual[chosen] = radiance[chosen] - table_light(part, radiance[chosen], weights[chosen])
+            if share is None:
+                lit = smooth_light(self._pixels.points[chosen], radiance[chosen], weights[chosen])
+            else:
+                lit = _table_light(share[chosen], radiance[chosen], weights[chosen])
+            residual[chosen] = radiance[chosen] - lit
         return Gains(residual, lamp, ambient, np.mean(gradients[1:] or gradients, axis=0))
 
     def _on_objects(
@@ -84,14 +91,29 @@ class GainSolver:
         return light
 
 
-def table_light(
-    share: Float[np.ndarray, "P"] | None, radiance: Float[np.ndarray, "P C"], weights: Float[np.ndarray, "P"]
+def smooth_light(
+    points: Float[np.ndarray, "P 3"],
+    radiance: Float[np.ndarray, "P C"],
+    weights: Float[np.ndarray, "P"],
+    visible: Float[np.ndarray, "P"] | None = None,
+) -> Float[np.ndarray, "P C"]:
+    """The quadratic of x and y that fits the table's radiance best; with visibility, a constant and that times it."""
+    x, y = ((points[:, :2] - points[:, :2].mean(axis=0)) / _TABLE_SCALE_M).T
+    basis = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    if visible is not None:
+        basis = np.column_stack([np.ones_like(x), basis * visible[:, None]])
+    weighted = basis * weights[:, None]
+    normal = weighted.T @ basis
+    normal[np.diag_indices(len(normal))] += _TINY + 1e-6 * normal[0, 0]
+    return basis @ np.linalg.solve(normal, weighted.T @ radiance)
+
+
+def _table_light(
+    share: Float[np.ndarray, "P"], radiance: Float[np.ndarray, "P C"], weights: Float[np.ndarray, "P"]
 ) -> Float[np.ndarray, "P C"]:
     """A + K s that fits radiance best, neither negative."""
     total = max(float(weights.sum()), _TINY)
     mean = weights @ radiance / total
-    if share is None:
-        return np.tile(mean, (len(radiance), 1))
     middle = float(weights @ share) / total
     centred = share - middle
     slope = np.maximum((weights * centred) @ radiance / max(float((weights * centred) @ centred), _TINY), 0)
@@ -124,6 +146,3 @@ def tukey_weights(
             weights[part] = (1 - np.minimum(size[part] / (_TUKEY * std[part]), 1) ** 2) ** 2
     return weights, std
 
-
-_TUKEY = 4.685  # deviations; 95 % efficient for normal errors
-_LEAST_STD = 2e-3  # [radiance]

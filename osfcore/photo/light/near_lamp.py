@@ -9,29 +9,30 @@ taken as one observation: errors of albedo, normals and poses are alike within a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
-from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
-from osfcore.geometry.poses import orthogonal_basis
-from osfcore.geometry.spot_lamp import SpotLamp
-from osfcore.photo.light.lamp_shape import PLACE_NUMBERS, STEPS, LampShape
-from osfcore.photo.light.light_gains import Gains, GainSolver, tukey_weights
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
+from osfcore.geometry.spot_lamp import MIN_LAMP_DISTANCE_M, SpotLamp
+from osfcore.photo.light.lamp_search import LampSearch, Refined, apart
+from osfcore.photo.light.lamp_shape import STEPS, LampShape
+from osfcore.photo.light.light_gains import Gains
 from osfcore.photo.light.lit_pixels import LitPixels
 
-_DIRECTIONS = 400  # on the sphere
-_COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 1500, 3000, 8000
-_INVERSES = 0.1, 0.9, 1.8  # of distances that directions are compared at [1/m]
-_STARTS, _APART_RAD = 4, 0.25
-_RADII_M = None, 0.2, 0.35, 0.6
-_START_INVERSES = 0.1, 0.7, 1.2, 2.0
-_ROUNDS = 3  # of reweighting
-_MOST_LOG_STD = 0.3  # of a distance that is known
-_CONE_GAIN = 0.02  # by which the mean error must fall for a cone to be believed
+_COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 1500, 2500, 7000
+_STARTS, _APART_RAD = 3, 0.2
+_INVERSES = 0.2, 0.7, 1.2, 2.0  # of distances to start from [1/m]
+_RADII_M = None, 0.15, 0.25, 0.4, 0.6  # of the pool of light to start from
+_REFINED = 2  # of all starts; and the best without a cone
+_EVALUATIONS, _ROUNDS = 6, 3  # of one refinement; of reweighting
 _PATCH_M = 0.03
+_PRIOR_STD = np.array([1e3, 1e3, 1e3, 0.3, 0.3, 1.0, 0.3])  # of what is searched, in its units: of the cone only
+_MOST_LOG_STD = 0.25  # of a distance that is known
+_LEAST_GAIN, _MOST_DIRECTED = 0.05, 1.0  # as of a distant lamp
+_WIDE_DEG = 85.0  # half-angle of a cone whose border no photograph shows
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,7 +44,7 @@ class NearLampFit:
         std: of its direction, per axis [rad].
         log_distance_std: of the logarithm of its distance.
         strength: its light on a surface at the centre that faces it, per view and colour, where the radiance of white
-            is 1: relative to the exposure, which is unknown.
+            is 1: relative to the exposure, which is unknown. NaN where no object is seen.
         ambient: light from everywhere, likewise.
         gain: share of the squared residual without a lamp that it explains.
         is_diffuse: nothing speaks for a lamp; the rest then means little.
@@ -64,7 +65,7 @@ class NearLampFit:
 
     @property
     def distance(self) -> float:
-        """From the centre [m]."""
+        """From the centre [m]; it means little if it is not known."""
         return 1 / self.shape.inverse
 
     @property
@@ -72,48 +73,94 @@ class NearLampFit:
         """Whether the photographs tell the distance."""
         return not self.is_diffuse and self.log_distance_std < _MOST_LOG_STD
 
+    @property
+    def lamp(self) -> SpotLamp | None:
+        """The lamp over the table, as renderers take it; None if its distance is not known, or it is too near or low.
 
-class _Search:
-    """Costs of lamps on some pixels."""
+        Without a cone in the photographs, it has a wide one.
+        """
+        place, cone = self.shape.place, self.shape.cone_rad
+        distance = float(np.linalg.norm(place))
+        is_low = place[2] < distance * np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))
+        if not self.distance_known or distance < MIN_LAMP_DISTANCE_M or is_low:
+            return None
+        inner, outer = (_WIDE_DEG, _WIDE_DEG) if cone is None else np.rad2deg(cone)
+        return SpotLamp(place, self.shape.aim_point, float(inner), float(outer))
 
-    def __init__(self, pixels: LitPixels) -> None:
-        self.pixels, self.solver, self.table = pixels, GainSolver(pixels), pixels.on_table
-        self.lifted = pixels.lifted()
-        self.above_table = bool(self.table.any())
 
-    def share(self, lamp: LampShape) -> np.ndarray:
-        return lamp.unshaded(self.pixels) * lamp.visible(self.pixels, self.lifted)
+def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLampFit:
+    """Find the lamp.
 
-    def l1(self, residual: np.ndarray) -> float:
-        size = np.abs(residual).sum(axis=1)
-        return sum(float(p.sum() * np.log(size[p].mean() + 1e-9)) for p in (self.table, ~self.table) if p.any()) / len(size)
+    Args:
+        pixels: of all photographs of one scene.
+        centre: what its direction and distance are told from [m], such as the table's centre.
+    """
+    start = _start(pixels, centre)
+    search = LampSearch(_about(pixels, _FINE_PIXELS))
+    weights = np.ones(len(search.pixels.radiance))
+    weights = search.wide_weights(search.gains(start, weights).residual)
+    found = search.refine(start, weights, _EVALUATIONS)
+    for _ in range(_ROUNDS):
+        weights = search.weights(search.gains(found.lamp, weights).residual)
+        found = search.refine(found.lamp, weights, _EVALUATIONS)
+    covariance = _covariance(found, search.pixels)
+    std = float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2))
+    log_std = float(np.sqrt(covariance[2, 2])) / found.lamp.inverse
+    under, without = search.gains(found.lamp, weights), search.gains(None, weights)
+    left = [float((weights[:, None] * g.residual**2).sum()) for g in (under, without)]
+    gain = 1 - left[0] / max(left[1], 1e-12)
+    return NearLampFit(found.lamp, std, log_std, under.lamp, under.ambient, gain, _is_diffuse(gain, under, without))
 
-    def gains(self, lamp: LampShape | None, weights: np.ndarray) -> Gains:
-        return self.solver(None if lamp is None else self.share(lamp), weights)
 
-    def soft(self, residual: np.ndarray) -> np.ndarray:
-        w, std = tukey_weights(residual, self.table)
-        size = np.linalg.norm(residual, axis=1) / np.sqrt(3)
-        return 1 / np.sqrt(1 + (size / std) ** 2) / std**2
+def _is_diffuse(gain: float, under: Gains, without: Gains) -> bool:
+    """Whether light without a lamp explains as much, and is no more directed than a room's."""
+    if not np.isfinite(under.lamp).any():
+        return gain <= _LEAST_GAIN
+    directed = np.linalg.norm(without.gradient) > _MOST_DIRECTED * max(float(np.nanmean(without.ambient)), 0.0)
+    return bool(np.nanmean(under.lamp) <= 0 or not (directed or gain > _LEAST_GAIN))
 
-    def tukey(self, residual: np.ndarray) -> np.ndarray:
-        w, std = tukey_weights(residual, self.table)
-        return w / std**2
 
-    def refine(self, lamp: LampShape, weights: np.ndarray, most: int = 12):
-        root = np.sqrt(weights)[:, None]
-        steps = STEPS[: lamp.count]
+def _about(pixels: LitPixels, count: int) -> LitPixels:
+    return pixels.every(max(len(pixels.radiance) // count, 1))
 
-        def cost(x):
-            return (root * self.gains(lamp.moved(x * steps, above_table=self.above_table), weights).residual).ravel()
 
-        def jac(x):
-            base = cost(x)
-            out = np.empty((len(base), len(x)))
-            for k in range(len(x)):
-                e = np.zeros(len(x)); e[k] = 1.0
-                out[:, k] = (cost(x + e) - cost(x - e)) / 2
-            return out
+def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
+    """The best lamp on few pixels."""
+    directions = LampSearch(_about(pixels, _COARSE_PIXELS)).by_direction(centre)
+    search = LampSearch(_about(pixels, _MIDDLE_PIXELS))
+    flat = search.wide_weights(search.gains(None, np.ones(len(search.pixels.radiance))).residual)
+    starts = _with_cones(search, apart(directions, _STARTS, _APART_RAD), flat)
+    tried = [*starts[:_REFINED], next(lamp for lamp in starts if lamp.radius is None)]
+    ends, costs = [], []
+    for lamp in tried:
+        weights = flat
+        for _ in range(2):
+            weights = search.wide_weights(search.gains(lamp, weights).residual)
+            lamp = search.refine(lamp, weights, _EVALUATIONS).lamp
+        ends.append(lamp)
+        costs.append(search.cost(search.gains(lamp, weights).residual))
+    return ends[int(np.argmin(costs))]
 
-        found = least_squares(cost, np.zeros(lamp.count), jac=jac, max_nfev=most, x_scale=1.0, method="lm" if False else "trf")
-        return lamp.moved(found.x * steps, above_table=self.above_table), found
+
+def _with_cones(search: LampSearch, lamps: Sequence[LampShape], weights: np.ndarray) -> list[LampShape]:
+    """Lamps at several distances and with several cones, the best first."""
+    costs, tried = [], []
+    for lamp in (replace(lamp, inverse=inverse) for lamp in lamps for inverse in _INVERSES):
+        visible = search.visible(lamp)
+        for radius in _RADII_M if search.is_on_table else (None,):
+            tried.append(replace(lamp, radius=radius))
+            costs.append(search.cost(search.gains(tried[-1], weights, visible).residual))
+    return [tried[k] for k in np.argsort(costs, kind="stable")]
+
+
+def _covariance(found: Refined, pixels: LitPixels) -> Float[np.ndarray, "count count"]:
+    """Of the lamp's numbers, in their units: H^-1 (sum of g g^T over patches) H^-1, g the gradient from one patch."""
+    count = found.lamp.count
+    curvature = np.einsum("pci,pcj->ij", found.jacobian, found.jacobian)
+    curvature += np.diag((STEPS[:count] / _PRIOR_STD[:count]) ** 2)
+    gradients = np.einsum("pci,pc->pi", found.jacobian, found.residual)
+    cells = np.column_stack([np.floor(pixels.points / _PATCH_M).astype(np.int64), pixels.owner])
+    _, patch = np.unique(cells, axis=0, return_inverse=True)
+    sums = np.stack([np.bincount(patch.reshape(-1), column) for column in gradients.T], axis=1)
+    inverse = np.linalg.pinv(curvature)
+    return inverse @ (sums.T @ sums) @ inverse * np.outer(STEPS[:count], STEPS[:count])

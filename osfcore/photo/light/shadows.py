@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from osfcore.fields.ray_marching import ONE_AT_A_TIME
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
-from osfcore.photo.poses.pose_kernels import draw_poses
+from osfcore.photo.poses.pose_kernels import draw_surfels
 from osfcore.photo.poses.surfels import Surfels
 
 SIDE = 224  # of the picture that the lamp sees [px]
@@ -59,9 +58,7 @@ class Shadows:
         """Of the sphere around it that holds them [m]."""
         self._lift_m = _LIFT * max((c.spacing for c in self._casters), default=0.0)
 
-    def lifted(
-        self, points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]
-    ) -> Float[np.ndarray, "P 3"]:
+    def lifted(self, points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Points of the objects' own surfaces, lifted so that these do not shade themselves [m]."""
         return points + self._lift_m * normals
 
@@ -83,16 +80,15 @@ class Shadows:
 
     def _drawn(self, to_lamp: Pose, intrinsics: np.ndarray) -> Float32[np.ndarray, "side side"]:
         """Depth of what the lamp sees first, along its axis [m]; huge where it sees nothing."""
-        rotation = np.ascontiguousarray(quaternion_to_matrix(to_lamp.quaternion)[None], np.float32)
-        position = np.ascontiguousarray(to_lamp.position[None], np.float32)
+        rotation = np.ascontiguousarray(quaternion_to_matrix(to_lamp.quaternion), np.float32)
+        position = np.ascontiguousarray(to_lamp.position, np.float32)
         lens = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
         nearest = np.full((SIDE, SIDE), 1e9, np.float32)
-        depth, index = np.empty((1, SIDE, SIDE), np.float32), np.empty((1, SIDE, SIDE), np.int32)
+        depth, index = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.int32)
         for caster in self._casters:
             half = np.float32(_HALF_SIDE * caster.spacing)
-            with ONE_AT_A_TIME:
-                draw_poses(caster.points, caster.normals, half, rotation, position, lens, depth, index)
-            np.minimum(nearest, depth[0], out=nearest)
+            draw_surfels(caster.points, caster.normals, half, rotation, position, lens, depth, index)
+            np.minimum(nearest, depth, out=nearest)
         return nearest
 
 
