@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,9 @@ from osfcore.photo.light.lit_pixels import LitPixels
 _DIRECTIONS = 260  # on the sphere
 _LEAST_HEIGHT = 0.1  # of those above a table
 _INVERSES = 0.4, 1.4  # of the distances that they are compared at [1/m]
+_RING, _RINGS_RAD = 6, (0.06, 0.12)  # directions near the best of them
+_FINE_INVERSES = 0.1, 0.7, 1.3, 2.1
+_EVALUATIONS = 6  # of one refinement
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,7 +81,7 @@ class LampSearch:
         return weights / std**2
 
     def by_direction(self, centre: Float[np.ndarray, "3"]) -> list[LampShape]:
-        """Lamps without a cone in all directions, the best first; the table's brightness may vary smoothly.
+        """Lamps without a cone in all directions, the best first; see `ranked`.
 
         Args:
             centre: what directions and distances are told from [m].
@@ -86,14 +89,24 @@ class LampSearch:
         directions = fibonacci_sphere(_DIRECTIONS)
         if self.is_on_table:
             directions = directions[directions[:, 2] > _LEAST_HEIGHT]
-        lamps = [LampShape(centre, d, q, np.zeros(2)) for d in directions for q in _INVERSES]
+        return self.ranked([LampShape(centre, d, q, np.zeros(2)) for d in directions for q in _INVERSES])
+
+    def around(self, lamps: Sequence[LampShape]) -> list[LampShape]:
+        """Lamps without a cone near some, at several distances, the best first; see `ranked`."""
+        angles = np.linspace(0, 2 * np.pi, _RING, endpoint=False)
+        steps = [(0.0, 0.0), *((r * np.cos(a), r * np.sin(a)) for r in _RINGS_RAD for a in angles)]
+        near = [lamp.moved(np.array([*step, 0.0]), above_table=self.is_on_table) for lamp in lamps for step in steps]
+        return self.ranked([replace(lamp, inverse=q) for lamp in near for q in _FINE_INVERSES])
+
+    def ranked(self, lamps: Sequence[LampShape]) -> list[LampShape]:
+        """The best first; the table's brightness may vary smoothly, so that its shadows count and no cone matters."""
         grey, albedo = self._normalised(), self.pixels.albedo.mean(axis=1)
         costs = [self.cost(self._left_over(lamp, grey, albedo)) for lamp in lamps]
         return [lamps[k] for k in np.argsort(costs, kind="stable")]
 
-    def refine(self, lamp: LampShape, weights: Float[np.ndarray, "P"], most: int) -> Refined:
-        """Levenberg-Marquardt from a lamp, of at most so many evaluations with their central differences."""
-        steps, root = STEPS[: lamp.count], np.sqrt(weights)[:, None]
+    def refine(self, lamp: LampShape, weights: Float[np.ndarray, "P"], scale: float = 1.0) -> Refined:
+        """Levenberg-Marquardt from a lamp, with central differences over `STEPS` times a scale."""
+        steps, root = scale * STEPS[: lamp.count], np.sqrt(weights)[:, None]
 
         def cost(x: np.ndarray) -> np.ndarray:
             moved = lamp.moved(x * steps, above_table=self.is_on_table)
@@ -102,10 +115,10 @@ class LampSearch:
         def jacobian(x: np.ndarray) -> np.ndarray:
             return np.stack([(cost(x + e) - cost(x - e)) / 2 for e in np.eye(len(x))], axis=1)
 
-        found = least_squares(cost, np.zeros(lamp.count), jac=jacobian, max_nfev=most)
+        found = least_squares(cost, np.zeros(lamp.count), jac=jacobian, max_nfev=_EVALUATIONS)
         shape = len(weights), 3
         moved = lamp.moved(found.x * steps, above_table=self.is_on_table)
-        return Refined(moved, found.fun.reshape(shape), found.jac.reshape(*shape, -1))
+        return Refined(moved, found.fun.reshape(shape), found.jac.reshape(*shape, -1) / scale)
 
     def _normalised(self) -> Float[np.ndarray, "P 1"]:
         """Radiance, mean of the colours, such that views have about the same exposure."""

@@ -23,11 +23,12 @@ from osfcore.photo.light.light_gains import Gains
 from osfcore.photo.light.lit_pixels import LitPixels
 
 _COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 1500, 2500, 7000
-_STARTS, _APART_RAD = 3, 0.2
+_STARTS, _APART_RAD = 3, 0.15
 _INVERSES = 0.2, 0.7, 1.2, 2.0  # of distances to start from [1/m]
 _RADII_M = None, 0.15, 0.25, 0.4, 0.6  # of the pool of light to start from
 _REFINED = 2  # of all starts; and the best without a cone
-_EVALUATIONS, _ROUNDS = 6, 3  # of one refinement; of reweighting
+_SCALES = 4.0, 2.0, 1.0  # of steps: shadows' edges are seen from farther with long ones
+_ROUNDS = 3  # of reweighting
 _PATCH_M = 0.03
 _PRIOR_STD = np.array([1e3, 1e3, 1e3, 0.3, 0.3, 1.0, 0.3])  # of what is searched, in its units: of the cone only
 _MOST_LOG_STD = 0.25  # of a distance that is known
@@ -99,10 +100,10 @@ def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLamp
     search = LampSearch(_about(pixels, _FINE_PIXELS))
     weights = np.ones(len(search.pixels.radiance))
     weights = search.wide_weights(search.gains(start, weights).residual)
-    found = search.refine(start, weights, _EVALUATIONS)
+    found = search.refine(start, weights)
     for _ in range(_ROUNDS):
         weights = search.weights(search.gains(found.lamp, weights).residual)
-        found = search.refine(found.lamp, weights, _EVALUATIONS)
+        found = search.refine(found.lamp, weights)
     covariance = _covariance(found, search.pixels)
     std = float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2))
     log_std = float(np.sqrt(covariance[2, 2])) / found.lamp.inverse
@@ -126,7 +127,8 @@ def _about(pixels: LitPixels, count: int) -> LitPixels:
 
 def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
     """The best lamp on few pixels."""
-    directions = LampSearch(_about(pixels, _COARSE_PIXELS)).by_direction(centre)
+    coarse = LampSearch(_about(pixels, _COARSE_PIXELS))
+    directions = coarse.around(apart(coarse.by_direction(centre), _STARTS, _APART_RAD))
     search = LampSearch(_about(pixels, _MIDDLE_PIXELS))
     flat = search.wide_weights(search.gains(None, np.ones(len(search.pixels.radiance))).residual)
     starts = _with_cones(search, apart(directions, _STARTS, _APART_RAD), flat)
@@ -134,9 +136,9 @@ def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
     ends, costs = [], []
     for lamp in tried:
         weights = flat
-        for _ in range(2):
+        for scale in _SCALES:
             weights = search.wide_weights(search.gains(lamp, weights).residual)
-            lamp = search.refine(lamp, weights, _EVALUATIONS).lamp
+            lamp = search.refine(lamp, weights, scale).lamp
         ends.append(lamp)
         costs.append(search.cost(search.gains(lamp, weights).residual))
     return ends[int(np.argmin(costs))]
