@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
 from osfcore.photo.light.lamp_shape import STEPS, LampShape
-from osfcore.photo.light.light_gains import RIDGE, Gains, GainSolver, smooth_light, tukey_weights
+from osfcore.photo.light.light_gains import RIDGE, Gains, GainSolver, smooth_light, spread
 from osfcore.photo.light.lit_pixels import LitPixels
 
 _DIRECTIONS = 260  # on the sphere
@@ -69,16 +69,10 @@ class LampSearch:
         parts = [part for part in (self._table, ~self._table) if part.any()]
         return sum(float(part.mean() * np.log(size[part].mean() + 1e-6)) for part in parts)
 
-    def wide_weights(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Weights that shadows which are still misplaced do not lose: as of absolute errors, over variances."""
-        _, std = tukey_weights(residual, self._table)
-        size = np.linalg.norm(residual, axis=1) / np.sqrt(3)
-        return 1 / np.sqrt(1 + (size / std) ** 2) / std**2
-
     def weights(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Tukey's weights, over variances."""
-        weights, std = tukey_weights(residual, self._table)
-        return weights / std**2
+        """As of absolute errors, which shadows that are still misplaced do not lose, over variances."""
+        size, usual = spread(residual, self.pixels)
+        return 1 / np.sqrt(1 + (size / usual) ** 2) / usual**2
 
     def by_direction(self, centre: Float[np.ndarray, "3"]) -> list[LampShape]:
         """Lamps without a cone in all directions, the best first; see `ranked`.

@@ -13,15 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from osfcore.photo.light.lit_pixels import LitPixels
 
 RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
 _TINY = 1e-9
 _TABLE_SCALE_M = 0.4
-_TUKEY = 4.685  # deviations; 95 % efficient for normal errors
-_LEAST_STD = 2e-3  # [radiance]
+_LEAST_STD, _LEAST_SHARE = 2e-3, 0.05  # [radiance], and of the median radiance
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -134,15 +133,16 @@ def _ridge(
     return np.linalg.solve(normal, weighted.T @ target)
 
 
-def tukey_weights(
-    residual: Float[np.ndarray, "P 3"], on_table: Bool[np.ndarray, "P"]
+def spread(
+    residual: Float[np.ndarray, "P C"], pixels: LitPixels
 ) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """Weights of pixels and the standard deviations they are relative to, those of objects and table apart."""
-    size = np.linalg.norm(residual, axis=1) / np.sqrt(3)
-    weights, std = np.empty(len(size)), np.empty(len(size))
-    for part in (on_table, ~on_table):
-        if part.any():
-            std[part] = max(1.4826 * float(np.median(size[part])), _LEAST_STD)
-            weights[part] = (1 - np.minimum(size[part] / (_TUKEY * std[part]), 1) ** 2) ** 2
-    return weights, std
+    """Root mean square of each pixel's residual and its usual size, that of objects and of the table apart.
 
+    The usual size is at least a share of the radiance: on a plain table a shadow is no outlier by its contrast alone.
+    """
+    size, usual = np.sqrt((residual**2).mean(axis=1)), np.empty(len(residual))
+    for part in (pixels.on_table, ~pixels.on_table):
+        if part.any():
+            least = _LEAST_SHARE * float(np.median(pixels.radiance[part].mean(axis=1)))
+            usual[part] = max(1.4826 * float(np.median(size[part])), least, _LEAST_STD)
+    return size, usual

@@ -19,10 +19,10 @@ from osfcore.photo.poses.surfels import Surfels
 
 FEWEST = 50
 TABLE = -1
-_MASK_SIDE, _TABLE_SIDE = 60, 240  # of masks and photographs, as they are looked at [px]
+_MASK_SIDE, _TABLE_SIDE = 60, 320  # of masks and photographs, as they are looked at [px]
 _OBJECT_PIXELS, _TABLE_PIXELS = 600, 1800  # of one object, and of the table, in one photograph
 _AROUND_M = 0.4  # of the table, around the objects
-_MARGIN = 5  # of masks, grown by half of it on each side [px]
+_MARGIN, _BESIDE = 3, 41  # masks grow by half of it on each side: what the table loses; where shadows often lie [px]
 _SEEN = 0.25  # least cosine of the angle at which a surface is seen
 
 
@@ -150,7 +150,7 @@ def _table_pixels(
     for mask in full.masks.values():
         objects |= mask.view(np.uint8)
     whole = cv2.resize(objects.astype(np.float32), (photo.width, photo.height), interpolation=cv2.INTER_AREA)
-    covered = cv2.dilate((whole > 0).astype(np.uint8), np.ones((_MARGIN, _MARGIN), np.uint8)) > 0
+    covered, beside = (cv2.dilate((whole > 0).astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in (_MARGIN, _BESIDE))
     rows, columns = np.nonzero(photo.well_exposed & ~covered)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
     matrix = quaternion_to_matrix(photo.T_world_camera.quaternion) @ np.linalg.inv(photo.intrinsics)
@@ -160,8 +160,8 @@ def _table_pixels(
     near = down & (np.linalg.norm(points[:, :2] - centre[:2], axis=1) < _AROUND_M)
     if covered_m is not None:
         near &= np.any(np.abs(points[:, :2]) > np.array(covered_m) / 2, axis=1)
-    kept = np.flatnonzero(near)
-    kept = kept[:: max(-(-len(kept) // _TABLE_PIXELS), 1)]
+    groups = [np.flatnonzero(near & (beside[rows, columns] == flag)) for flag in (True, False)]
+    kept = np.concatenate([group[:: max(-(-2 * len(group) // _TABLE_PIXELS), 1)] for group in groups])
     normals = np.tile([0.0, 0.0, 1.0], (len(kept), 1))
     flat = points[kept] * (1.0, 1.0, 0.0)
     return photo.image[rows[kept], columns[kept]], np.ones((len(kept), 3)), flat, normals

@@ -3,7 +3,7 @@
 Its share of light on each pixel (`LampShape`) is searched, everything else about the light is linear (`GainSolver`).
 Directions are compared first, by the shadows that they cast and by shading, with a table whose brightness may vary
 smoothly as it likes; then distances and cones, for the best of them; Levenberg-Marquardt refines what fits best, with
-the weights of Tukey's biweight. Deviations come from the curvature of the residuals, those of one patch of a surface
+weights as of absolute errors. Deviations come from the curvature of the residuals, those of one patch of a surface
 taken as one observation: errors of albedo, normals and poses are alike within a patch.
 """
 
@@ -99,7 +99,7 @@ def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLamp
     start = _start(pixels, centre)
     search = LampSearch(_about(pixels, _FINE_PIXELS))
     weights = np.ones(len(search.pixels.radiance))
-    weights = search.wide_weights(search.gains(start, weights).residual)
+    weights = search.weights(search.gains(start, weights).residual)
     found = search.refine(start, weights)
     for _ in range(_ROUNDS):
         weights = search.weights(search.gains(found.lamp, weights).residual)
@@ -130,14 +130,14 @@ def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
     coarse = LampSearch(_about(pixels, _COARSE_PIXELS))
     directions = coarse.around(apart(coarse.by_direction(centre), _STARTS, _APART_RAD))
     search = LampSearch(_about(pixels, _MIDDLE_PIXELS))
-    flat = search.wide_weights(search.gains(None, np.ones(len(search.pixels.radiance))).residual)
+    flat = search.weights(search.gains(None, np.ones(len(search.pixels.radiance))).residual)
     starts = _with_cones(search, apart(directions, _STARTS, _APART_RAD), flat)
     tried = [*starts[:_REFINED], next(lamp for lamp in starts if lamp.radius is None)]
     ends, costs = [], []
     for lamp in tried:
         weights = flat
         for scale in _SCALES:
-            weights = search.wide_weights(search.gains(lamp, weights).residual)
+            weights = search.weights(search.gains(lamp, weights).residual)
             lamp = search.refine(lamp, weights, scale).lamp
         ends.append(lamp)
         costs.append(search.cost(search.gains(lamp, weights).residual))
