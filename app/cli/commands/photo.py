@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -146,13 +146,8 @@ def _masks(raw: RawPhotograph, boxes: dict[str, tuple[float, float, float, float
 
 def _result(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: list[str]) -> dict[str, Any]:
     """What the file holds, in the table's frame where there is one."""
-    import numpy as np
+    from osfcore.geometry.poses import Pose
 
-    from osfcore.geometry.poses import Pose, rotate
-    from osfcore.photo.light.photo_light import photo_light
-    from osfcore.photo.poses.estimate_photo import FINE_ACROSS
-
-    light = photo_light(photo, step.found, [models.surfels(o.name, FINE_ACROSS) for o in step.found])
     T_table_world, table = Pose.identity(), "board" if photo.on_table else None
     if step.table is not None:
         T_table_world, table = step.table.T_world_camera, "objects"
@@ -168,12 +163,40 @@ def _result(photo: Photograph, step: PhotoStep, models: PhotoModels, notes: list
     objects = [
         {"name": o.name, **entry(o.best), "doubt": o.doubt, "rivals": [entry(r) for r in o.rivals]} for o in step.found
     ]
-    toward = rotate(T_table_world.quaternion, light.direction)
-    lamp = {"direction": toward.tolist(), "std_deg": float(np.rad2deg(light.std)), "diffuse": light.is_diffuse}
+    lamp, unknown = _lamp(photo, step, models)
     T_table_camera = (T_table_world @ photo.T_world_camera).matrix()
     camera = {"K": photo.intrinsics.tolist(), "T_world_camera": T_table_camera.tolist(), "width": photo.width,
               "height": photo.height}  # fmt: skip
-    return {"table": table, "objects": objects, "light": lamp, "camera": camera, "notes": notes}
+    return {"table": table, "objects": objects, "light": lamp, "camera": camera, "notes": [*notes, *unknown]}
+
+
+def _lamp(photo: Photograph, step: PhotoStep, models: PhotoModels) -> tuple[dict[str, Any], list[str]]:
+    """The lamp in the table's frame where there is one, and what is not known of it, in sentences."""
+    import numpy as np
+
+    from osfcore.photo.board_page import PAGE_M
+    from osfcore.photo.light.photo_light import photo_lamp, photo_light
+    from osfcore.photo.poses.estimate_photo import FINE_ACROSS
+
+    surfels, found = [models.surfels(o.name, FINE_ACROSS) for o in step.found], step.found
+    if step.table is None and not photo.on_table:
+        light = photo_light(photo, found, surfels)
+        lamp = {"direction": light.direction.tolist(), "std_deg": float(np.rad2deg(light.std)), "diffuse":
+                light.is_diffuse, "distance_m": None, "distance_std_m": None}  # fmt: skip
+        return lamp, ["How far away the lamp is, cannot be told without a known table."]
+    covered = PAGE_M
+    if step.table is not None:
+        place, covered = step.table.T_world_camera, None
+        photo = replace(photo, T_world_camera=place, on_table=True)
+        found = [replace(o, best=replace(o.best, pose=place @ o.best.pose)) for o in found]
+    light = photo_lamp([photo], found, surfels, covered_m=covered)
+    known = light.distance_known
+    lamp = {"direction": light.direction.tolist(), "std_deg": float(np.rad2deg(light.std)),
+            "diffuse": light.is_diffuse, "distance_m": light.distance if known else None,
+            "distance_std_m": light.distance * light.log_distance_std if known else None}  # fmt: skip
+    if known or light.is_diffuse:
+        return lamp, []
+    return lamp, ["How far away the lamp is, cannot be told: a distant one would look the same."]
 
 
 def _show(result: dict[str, Any], out: Path) -> None:
@@ -186,7 +209,9 @@ def _show(result: dict[str, Any], out: Path) -> None:
     if result["light"]["diffuse"]:
         print("The light is diffuse: nothing speaks for one lamp.")
     else:
-        print(f"Toward the lamp: {json.dumps([round(v, 2) for v in result['light']['direction']])}.")
+        light = result["light"]
+        far = f", {light['distance_m']:.2f} m away" if light["distance_m"] is not None else ""
+        print(f"Toward the lamp: {json.dumps([round(v, 2) for v in light['direction']])}{far}.")
     print("\n".join([*result["notes"], f"Wrote {out}."]))
 
 

@@ -66,7 +66,8 @@ def lamp_scene(
     Args:
         library: of meshes.
         among: which objects there are to choose from.
-        seed, number: of the scene.
+        seed: of everything random.
+        number: of the scene.
         views: 1 to 4.
         is_near: whether its lamp is near.
         is_wooden: whether the table has a grain; it has one colour otherwise.

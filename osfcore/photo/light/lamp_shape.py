@@ -72,8 +72,8 @@ class LampShape:
         """Another lamp nearby.
 
         Args:
-            x: two steps of the direction [rad], of the inverse distance [1/m], of the aim [m], of the radius's logarithm
-                and of the inner share; the first three alone without a cone.
+            x: two steps of the direction [rad], of the inverse distance [1/m], of the aim [m], of the radius's
+                logarithm and of the inner share; the first three alone without a cone.
             above_table: keep it above the plane.
         """
         right, up = orthogonal_basis(self.direction)
@@ -88,7 +88,6 @@ class LampShape:
         radius = float(np.clip(self.radius * np.exp(np.clip(x[5], -1, 1)), *_RADII_M))
         share = float(np.clip(self.inner_share + x[6], *_SHARES))
         return LampShape(self.centre, direction, inverse, self.aim + x[3:5], radius, share)
-
 
     def unshaded(self, pixels: LitPixels) -> Float[np.ndarray, "P"]:
         """Share of the light that falls on each pixel past no object; 1 on one at the centre that faces the lamp."""

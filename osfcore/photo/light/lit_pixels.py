@@ -150,7 +150,9 @@ def _table_pixels(
     for mask in full.masks.values():
         objects |= mask.view(np.uint8)
     whole = cv2.resize(objects.astype(np.float32), (photo.width, photo.height), interpolation=cv2.INTER_AREA)
-    covered, beside = (cv2.dilate((whole > 0).astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in (_MARGIN, _BESIDE))
+    covered, beside = (
+        cv2.dilate((whole > 0).astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in (_MARGIN, _BESIDE)
+    )
     rows, columns = np.nonzero(photo.well_exposed & ~covered)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
     matrix = quaternion_to_matrix(photo.T_world_camera.quaternion) @ np.linalg.inv(photo.intrinsics)

@@ -4,7 +4,7 @@ Its share of light on each pixel (`LampShape`) is searched, everything else abou
 Directions are compared first, by the shadows that they cast and by shading, with a table whose brightness may vary
 smoothly as it likes; then distances and cones, for the best of them; Levenberg-Marquardt refines what fits best, with
 weights as of absolute errors. Deviations come from the curvature of the residuals, those of one patch of a surface
-taken as one observation: errors of albedo, normals and poses are alike within a patch.
+taken as one observation, since errors of albedo and normals are alike within a patch; and from what poses add.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from osfcore.photo.light.lamp_shape import STEPS, LampShape
 from osfcore.photo.light.light_gains import Gains
 from osfcore.photo.light.lit_pixels import LitPixels
 
-_COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 1500, 2500, 7000
+_COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 1500, 2500, 5000
 _STARTS, _APART_RAD = 3, 0.15
 _INVERSES = 0.2, 0.7, 1.2, 2.0  # of distances to start from [1/m]
 _RADII_M = None, 0.15, 0.25, 0.4, 0.6  # of the pool of light to start from
 _REFINED = 2  # of all starts; and the best without a cone
 _SCALES = 4.0, 2.0, 1.0  # of steps: shadows' edges are seen from farther with long ones
-_ROUNDS = 3  # of reweighting
+_ROUNDS = 2  # of reweighting
 _PATCH_M = 0.03
 _PRIOR_STD = np.array([1e3, 1e3, 1e3, 0.3, 0.3, 1.0, 0.3])  # of what is searched, in its units: of the cone only
+_POSE_STD_RAD, _POSE_STD_PER_M = 0.014, 0.09  # what errors of poses, albedo and table add, as simulated scenes showed
 _MOST_LOG_STD = 0.25  # of a distance that is known
 _LEAST_GAIN, _MOST_DIRECTED = 0.05, 1.0  # as of a distant lamp
 _WIDE_DEG = 85.0  # half-angle of a cone whose border no photograph shows
@@ -105,8 +106,8 @@ def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLamp
         weights = search.weights(search.gains(found.lamp, weights).residual)
         found = search.refine(found.lamp, weights)
     covariance = _covariance(found, search.pixels)
-    std = float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2))
-    log_std = float(np.sqrt(covariance[2, 2])) / found.lamp.inverse
+    std = float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2 + _POSE_STD_RAD**2))
+    log_std = float(np.sqrt(covariance[2, 2] + _POSE_STD_PER_M**2)) / found.lamp.inverse
     under, without = search.gains(found.lamp, weights), search.gains(None, weights)
     left = [float((weights[:, None] * g.residual**2).sum()) for g in (under, without)]
     gain = 1 - left[0] / max(left[1], 1e-12)
@@ -134,8 +135,8 @@ def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
     starts = _with_cones(search, apart(directions, _STARTS, _APART_RAD), flat)
     tried = [*starts[:_REFINED], next(lamp for lamp in starts if lamp.radius is None)]
     ends, costs = [], []
-    for lamp in tried:
-        weights = flat
+    for first in tried:
+        lamp, weights = first, flat
         for scale in _SCALES:
             weights = search.weights(search.gains(lamp, weights).residual)
             lamp = search.refine(lamp, weights, scale).lamp
