@@ -31,9 +31,10 @@ _SCALES = 4.0, 2.0, 1.0  # of steps: shadows' edges are seen from farther with l
 _ROUNDS = 2  # of reweighting
 _PATCH_M = 0.03
 _PRIOR_STD = np.array([1e3, 1e3, 1e3, 0.3, 0.3, 1.0, 0.3])  # of what is searched, in its units: of the cone only
-_POSE_STD_RAD, _POSE_STD_PER_M = 0.014, 0.09  # what errors of poses, albedo and table add, as simulated scenes showed
+_POSE_STD_RAD, _POSE_STD_PER_M = 0.02, 0.09  # what errors of poses, albedo and table add, as simulated scenes showed
 _MOST_LOG_STD = 0.25  # of a distance that is known
 _LEAST_GAIN, _MOST_DIRECTED = 0.05, 1.0  # as of a distant lamp
+_LEAST_TABLE_GAIN = 0.12  # 0.3 and more in simulated scenes under a lamp, at most 0.1 in most photographs of rooms
 _WIDE_DEG = 85.0  # half-angle of a cone whose border no photograph shows
 
 
@@ -111,15 +112,21 @@ def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLamp
     under, without = search.gains(found.lamp, weights), search.gains(None, weights)
     left = [float((weights[:, None] * g.residual**2).sum()) for g in (under, without)]
     gain = 1 - left[0] / max(left[1], 1e-12)
-    return NearLampFit(found.lamp, std, log_std, under.lamp, under.ambient, gain, _is_diffuse(gain, under, without))
+    is_diffuse = _is_diffuse(gain, under, without, on_table=search.is_on_table)
+    return NearLampFit(found.lamp, std, log_std, under.lamp, under.ambient, gain, is_diffuse)
 
 
-def _is_diffuse(gain: float, under: Gains, without: Gains) -> bool:
-    """Whether light without a lamp explains as much, and is no more directed than a room's."""
-    if not np.isfinite(under.lamp).any():
-        return gain <= _LEAST_GAIN
+def _is_diffuse(gain: float, under: Gains, without: Gains, *, on_table: bool) -> bool:
+    """Whether light without a lamp explains as much; objects alone must show that it is no more directed than a room's.
+
+    On a table, a lamp casts shadows that nothing else explains.
+    """
+    if not np.nanmax(under.lamp, initial=0.0) > 0:
+        return True
+    if on_table:
+        return gain <= _LEAST_TABLE_GAIN
     directed = np.linalg.norm(without.gradient) > _MOST_DIRECTED * max(float(np.nanmean(without.ambient)), 0.0)
-    return bool(np.nanmean(under.lamp) <= 0 or not (directed or gain > _LEAST_GAIN))
+    return not (directed or gain > _LEAST_GAIN)
 
 
 def _about(pixels: LitPixels, count: int) -> LitPixels:
