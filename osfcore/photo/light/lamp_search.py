@@ -109,7 +109,8 @@ class LampSearch:
         def jacobian(x: np.ndarray) -> np.ndarray:
             return np.stack([(cost(x + e) - cost(x - e)) / 2 for e in np.eye(len(x))], axis=1)
 
-        found = least_squares(cost, np.zeros(lamp.count), jac=jacobian, max_nfev=_EVALUATIONS, method="lm")
+        start = np.zeros(lamp.count)
+        found = least_squares(cost, start, jacobian, method="lm", max_nfev=_EVALUATIONS)  # pyright: ignore[reportArgumentType]
         shape = len(weights), 3
         moved = lamp.moved(found.x * steps, above_table=self.is_on_table)
         return Refined(moved, found.fun.reshape(shape), found.jac.reshape(*shape, -1) / scale)

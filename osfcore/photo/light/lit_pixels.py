@@ -133,7 +133,8 @@ def _object_pixels(
     try:
         radiance, albedo, points, normals = object_pixels(photo, name, pose, surfels)
     except InvalidInput:  # a tiny mask in one of several views
-        return (np.zeros((0, 3)),) * 4
+        nothing = np.zeros((0, 3))
+        return nothing, nothing, nothing, nothing
     to_camera = photo.T_world_camera.position - points
     cosine = np.sum(normals * to_camera, axis=1) / np.linalg.norm(to_camera, axis=1)
     kept = np.flatnonzero(cosine > _SEEN)
