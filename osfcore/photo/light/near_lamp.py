@@ -22,7 +22,7 @@ from osfcore.photo.light.lamp_shape import STEPS, LampShape
 from osfcore.photo.light.light_gains import Gains
 from osfcore.photo.light.lit_pixels import LitPixels
 
-_COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 1500, 2500, 5000
+_COARSE_PIXELS, _MIDDLE_PIXELS, _FINE_PIXELS = 3000, 4000, 5000
 _STARTS, _APART_RAD = 3, 0.15
 _INVERSES = 0.2, 0.7, 1.2, 2.0  # of distances to start from [1/m]
 _RADII_M = None, 0.15, 0.25, 0.4, 0.6  # of the pool of light to start from
