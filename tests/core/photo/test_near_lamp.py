@@ -112,6 +112,7 @@ def test_light_from_everywhere_is_called_diffuse():
     assert not found.distance_known
 
 
+@pytest.mark.slow
 def test_strength_is_relative_to_the_exposure():
     spot = SpotLamp(np.array([0.3, -0.2, 0.4]), CENTRE, 60, 75)
     one, half = (fit_near_lamp(scene(spot, gain=g, noise=0.004 * g), CENTRE) for g in (1.0, 0.5))
