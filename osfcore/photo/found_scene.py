@@ -3,7 +3,7 @@
     {"table": "board" | "objects" | null,
      "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "doubt",
                   "rivals": [{"position", "quaternion", "loss", "iou"}]}],
-     "light": {"direction": [3], "std_deg", "diffuse"},
+     "light": {"direction": [3], "std_deg", "diffuse", "distance_m", "distance_std_m"},
      "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "other_cameras": [...], "notes": [...]}
 
 "board" and "objects" say what tells where the table is. "light" is null where too few pixels show objects.
@@ -54,6 +54,8 @@ class FoundLight(Entry):
     direction: Vector3 = Field(description="Unit vector toward it.")
     std_deg: float = Field(description="Standard deviation of the direction.")
     diffuse: bool = Field(description="Nothing speaks for one lamp; the direction then means little.")
+    distance_m: float | None = Field(description="From the frame's origin; null where it cannot be told.")
+    distance_std_m: float | None = Field(description="Its standard deviation.")
 
 
 class FoundScene(Entry):

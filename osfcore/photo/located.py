@@ -75,6 +75,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
             notes.append(note)
             source = _guess_source(raw)
         notes.append("No printed board was found, so that the table is found from how objects stand on it.")
+        notes.append(f"If a board is in view: {error}")
         return Located(raw, K, Lens(K, 0.0), source, None, tuple(notes), str(error))
     if lens.radial:
         bend = f"k1 = {lens.radial:.3f}, as the board shows"

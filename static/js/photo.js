@@ -106,7 +106,7 @@ function drawResult() {
   byId("photo-doubts").hidden = !isDoubtful;
   const { light } = photo;
   byId("photo-light").textContent = !light ? "" : light.diffuse ? "The light is diffuse: nothing speaks for one lamp."
-    : `Lamp ${((Math.asin(Math.min(Math.max(light.direction[2], -1), 1)) * 180) / Math.PI).toFixed(0)}° above the table, ± ${light.std_deg.toFixed(1)}°.`;
+    : `Lamp ${((Math.asin(Math.min(Math.max(light.direction[2], -1), 1)) * 180) / Math.PI).toFixed(0)}° above the table, ± ${light.std_deg.toFixed(1)}°${light.distance_m === null ? "" : `, ${light.distance_m.toFixed(2)} m away`}.`;
   for (const id of ["photo-goal", "photo-table"]) byId(id).disabled = !photo.table;
   const choices = photo.objects.map(({ choice }) => choice ?? 0).join("-");
   setDrawing(isFound() && photo.table ? `api/${path(`/drawing.png?${new URLSearchParams({ job: photo.job.id, choices })}`)}` : "");

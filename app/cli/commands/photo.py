@@ -137,7 +137,9 @@ def _show(result: dict[str, Any], out: Path) -> None:
     if result["light"] and result["light"]["diffuse"]:
         print("The light is diffuse: nothing speaks for one lamp.")
     elif result["light"]:
-        print(f"Toward the lamp: {json.dumps([round(v, 2) for v in result['light']['direction']])}.")
+        light = result["light"]
+        far = f", {light['distance_m']:.2f} m away" if light["distance_m"] is not None else ""
+        print(f"Toward the lamp: {json.dumps([round(v, 2) for v in light['direction']])}{far}.")
     print("\n".join([*result["notes"], f"Wrote {out}."]))
 
 

@@ -27,6 +27,7 @@ from osfcore.geometry.poses import orthogonal_basis
 Visibility = Callable[[Float[np.ndarray, "3"]], Float[np.ndarray, "P"]]
 
 _DIRECTIONS = 600
+_SHADED = 60  # of them, the best without shadows, that are compared with them
 _RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
 _ROUNDS = 3  # of reweighting
 _TUKEY = 4.685  # deviations; 95 % efficient for normal errors
@@ -90,8 +91,10 @@ def fit_lamp(pixels: ShadedPixels, visible: Visibility | None = None) -> LampFit
     """
     weights = np.ones(len(pixels.radiance))
     grid = fibonacci_sphere(_DIRECTIONS)
-    costs = [_squared(_solve(pixels, d, visible, weights)[0], weights) for d in grid]
-    direction = grid[int(np.argmin(costs))]
+    for shadows in [None] if visible is None else [None, visible]:
+        costs = [_squared(_solve(pixels, d, shadows, weights)[0], weights) for d in grid]
+        grid = grid[np.argsort(costs, kind="stable")[:_SHADED]]
+    direction = grid[0]
     for _ in range(_ROUNDS):
         direction, std = _refine(pixels, direction, visible, weights)
         weights = _tukey(_solve(pixels, direction, visible, weights)[0])

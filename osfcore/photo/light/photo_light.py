@@ -1,24 +1,23 @@
-"""The light of a photograph whose objects are known: surfels give normals and albedo of the pixels that show them."""
+"""The light of photographs whose objects are known: surfels give normals and albedo of the pixels that show them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
-from osfcore.geometry.poses import Pose, rotate
 from osfcore.photo.light.lamp import LampFit, ShadedPixels, fit_lamp
+from osfcore.photo.light.lit_pixels import lit_pixels, object_pixels
+from osfcore.photo.light.near_lamp import NearLampFit, fit_near_lamp
+from osfcore.photo.light.shadows import Shadows
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.poses.object_window import object_windows
 from osfcore.photo.poses.photo_steps import PhotoObject
-from osfcore.photo.poses.pose_loss import draw
 from osfcore.photo.poses.surfels import Surfels
-
-_SIDE = 60  # of masks [px]: shading is smooth
 
 
 def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequence[Surfels]) -> LampFit:
-    """Direction toward the lamp in the world, from all objects of one photograph.
+    """Direction toward a distant lamp in the world, from the shading of all objects and the shadows between them.
 
     Args:
         photo: with masks of the objects.
@@ -28,16 +27,44 @@ def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequ
     Raises:
         InvalidInput: if too few pixels show objects that are trusted.
     """
-    radiance, albedo, normals = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 3))]
+    columns = [[np.zeros((0, 3))] for _ in range(4)]
     for found, points in zip(objects, surfels, strict=True):
-        if found.name not in photo.masks:
-            continue
-        window = object_windows([photo], found.name, _SIDE)[0]
-        pose = found.best.pose
-        index, _ = draw(points, window, Pose(pose.position[None], pose.quaternion[None]))
-        shown = (index[0] >= 0) & window.plain
-        seen = index[0][shown]
-        radiance.append(window.image[shown])
-        albedo.append(points.albedo[seen])
-        normals.append(rotate(pose.quaternion, points.normals[seen]))
-    return fit_lamp(ShadedPixels(np.concatenate(radiance), np.concatenate(albedo), np.concatenate(normals)))
+        if found.name in photo.masks:
+            for column, values in zip(columns, object_pixels(photo, found.name, found.best.pose, points), strict=True):
+                column.append(values)
+    radiance, albedo, points, normals = (np.concatenate(column) for column in columns)
+    shadows = Shadows(surfels, [found.best.pose for found in objects])
+    lifted = shadows.lifted(points, normals)
+
+    def visible(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "P"]:
+        return shadows.from_direction(direction, lifted)
+
+    return fit_lamp(ShadedPixels(radiance, albedo, normals), visible)
+
+
+def photo_lamp(
+    photos: Sequence[Photograph],
+    objects: Sequence[PhotoObject],
+    surfels: Sequence[Surfels],
+    *,
+    covered_m: tuple[float, float] | None = None,
+    shared_exposure: bool = False,
+) -> NearLampFit:
+    """The lamp and its place, from objects, the shadows that they cast and the table where that is known.
+
+    Its direction and distance are told from the world's origin on a known table, else from the objects' centre.
+
+    Args:
+        photos: of one scene, with masks of the objects.
+        objects: what was found in them.
+        surfels: of each object.
+        covered_m: sides of a print that lies around the world's origin and hides the table, along x and y [m].
+        shared_exposure: all photographs have the same exposure and white balance.
+
+    Raises:
+        InvalidInput: if too few pixels show anything known.
+    """
+    poses = {found.name: found.best.pose for found in objects}
+    known = dict(zip(poses, surfels, strict=True))
+    pixels = lit_pixels(photos, poses, known, covered_m=covered_m, shared_exposure=shared_exposure)
+    return fit_near_lamp(pixels, np.zeros(3) if all(p.on_table for p in photos) else pixels.shadows.centre)

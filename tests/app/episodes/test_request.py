@@ -180,7 +180,7 @@ def found_file(order, place, table="board", apart_m=0.2):
         for name, shift, height in (("009_gelatin_box", 0.0, 0.06), ("005_tomato_soup_can", apart_m, 0.051))
     ]  # fmt: skip
     path = place / "found.json"
-    light = {"direction": [0.0, 0.6, 0.8], "std_deg": 1.0, "diffuse": False}
+    light = {"direction": [0.0, 0.6, 0.8], "std_deg": 1.0, "diffuse": False, "distance_m": None, "distance_std_m": None}
     facts = {"table": table, "objects": objects, "light": light, "camera": camera_to_json(camera), "notes": []}
     path.write_text(json.dumps(facts))
     return replace(order, names=None, found=path)

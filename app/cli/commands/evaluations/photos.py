@@ -8,14 +8,21 @@ from typing import Any, Literal
 
 from app.cli.progress_bar import follow
 from app.storage.paths import default_data_dir
+from osfcore.errors import InvalidInput
 
 
 @dataclass(frozen=True)
 class EvaluatePhotosCommand:
     """Real photographs: objects by their masks, without a start or from poses of another program; lamps."""
 
-    data: Path
+    data: Path | None = None
     """Folder of folders with photo.json, or of chrome balls under lamps."""
+    lamps: Literal["photographed", "simulated"] = "photographed"
+    """simulated: near lamps over simulated tables instead, without data."""
+    tasks: int = 20
+    """Simulated scenes with a near lamp; a fourth as many have a distant one."""
+    views: int = 1
+    """Photographs of each simulated scene, 1 to 4."""
     start: str = "none"
     """none; perturbed (3 cm and 20 deg off the truth); or a source of poses in photo.json, such as posecnn_raw."""
     plane: Literal["known", "free"] = "free"
@@ -42,6 +49,11 @@ class EvaluatePhotosCommand:
         from osfcore.experiments.photos.evaluation import EvaluatePhotos, evaluate_photos
         from osfcore.fields.field_library import FieldLibrary
 
+        if self.lamps == "simulated":
+            return self._simulated_lamps()
+        if self.data is None:
+            allowed = "a folder of photographs, or --lamps simulated, which needs none"
+            raise InvalidInput("data", "missing", allowed)
         folder = self.data_dir / "photos" if self.out is None else self.out
         config = EvaluatePhotos(folder, self.data, self.start, self.plane, self.mask_error, self.repeats, self.loss,
                                 self.seed, self.masks)  # fmt: skip
@@ -51,6 +63,22 @@ class EvaluatePhotosCommand:
         report = last.report.to_json()
         if not self.json:
             _show(folder, report)
+        return report
+
+    def _simulated_lamps(self) -> dict[str, Any]:
+        """Measure lamps in simulated scenes."""
+        from osfcore.experiments.photos.lamp_evaluation import EvaluateLamps, evaluate_lamps
+        from osfcore.fields.field_library import FieldLibrary
+        from osfcore.objects.asset_library import AssetLibrary
+
+        folder = self.data_dir / "lamps" if self.out is None else self.out
+        config = EvaluateLamps(folder, self.tasks, self.views, self.seed)
+        last = follow(evaluate_lamps(config, AssetLibrary(self.data_dir / "objects"), FieldLibrary(self.data_dir)))
+        assert last is not None
+        assert last.report is not None, "the last step brings the report"
+        report = last.report.to_json()
+        if not self.json:
+            _show_lamps(folder, report)
         return report
 
 
@@ -70,3 +98,18 @@ def _show(folder: Path, report: dict[str, Any]) -> None:
     if report["light_deg_median"] is not None:
         print(f"Lamps: median error {report['light_deg_median']:.1f} deg, most {report['light_deg_max']:.1f} deg.")
     print(f"Pictures and figures: {folder}")
+
+
+def _show_lamps(folder: Path, report: dict[str, Any]) -> None:
+    """The report of simulated lamps for people."""
+    for score in report["scores"]:
+        true = "a distant lamp" if score["true_m"] is None else f"a lamp {score['true_m']:.2f} m away"
+        found = "unknown" if score["distance_m"] is None else f"{score['distance_m']:.2f} m"
+        print(f"Scene {score['number']}, {true}: direction {score['direction_deg']:.1f} deg off, distance {found}.")
+    print(
+        f"{report['lamp_tasks']} near lamps: direction {report['lamp_direction_deg_median']:.1f} deg off (median), "
+        f"{100 * report['lamp_within_5deg']:.0f} % within 5 deg; distance unknown of {report['lamp_undetermined']}."
+    )
+    if report["lamp_distance_percent_median"] is not None:
+        print(f"Distances known: {report['lamp_distance_percent_median']:.1f} % off (median).")
+    print(f"Figures: {folder}")

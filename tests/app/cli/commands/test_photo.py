@@ -57,6 +57,8 @@ def test_an_object_is_found_by_its_box(taken, photo, tmp_path, capsys):
     assert np.rad2deg(rotation_angle(np.array(found["quaternion"]), taken.pose.quaternion)) < 10
     assert result["table"] is None  # one object does not tell
     assert any("No printed board was found" in note for note in result["notes"])
+    assert result["light"]["distance_m"] is None
+    assert any("How far away the lamp is" in note for note in result["notes"])
     assert (images / f"{NAME}.png").stat().st_size > 1000
 
 
