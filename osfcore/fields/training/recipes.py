@@ -26,7 +26,8 @@ class Recipe:
         hidden: their width.
         rays: pixels per step of descent.
         solid_g: density feature inside the visual hull at first.
-        hollow_g: the same for hollow objects: fog so thin that light reaches what silhouettes cannot carve.
+        hollow_g: the same of fog around the surfaces of a hollow object on which views agree, from which its edges grow.
+        hollow_steps: of descent without networks, before the first phase of a hollow object.
         hollow_share: instead of coarse_share for hollow objects: opening a hollow takes time.
         coarse_rates: learning rates of the first phase.
         fine_rates: of the second.
@@ -41,7 +42,8 @@ class Recipe:
     hidden: int = 16
     rays: int = 4096
     solid_g: float = 6.0
-    hollow_g: float = -3.0
+    hollow_g: float = -5.5
+    hollow_steps: int = 400
     hollow_share: float = 0.3
     coarse_rates: Rates = _COARSE_RATES
     fine_rates: Rates = _FINE_RATES
