@@ -155,7 +155,8 @@ class _Run:
         r = self._recipe
         if self._config.recipe == "distil":
             return first_teacher(self._images, box, self._teacher_recipe(), self._rng, self._device)
-        field = first_shell(self._images, box, across=r.coarse_across, cells=r.cells, hidden=r.hidden,
+        across = r.hollow_across if self._config.hollow else r.coarse_across
+        field = first_shell(self._images, box, across=across, cells=r.cells, hidden=r.hidden,
                             inside_g=r.solid_g, rng=self._rng)  # fmt: skip
         if self._config.hollow:
             field = open_hollows(field, self._images, fog_g=r.hollow_g)

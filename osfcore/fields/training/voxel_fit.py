@@ -2,7 +2,8 @@
 
 Each corner has a density, an albedo and its own dependence on the light, of second order in l, which learns shadows:
 
-    radiance = albedo * (ambient + max(c . Y(l), 0)),    Y(l) = (1, l, l_x l_y, l_y l_z, l_x l_z, l_x^2 - l_y^2, 3 l_z^2 - 1)
+    radiance = albedo * (ambient + max(c . Y(l), 0))
+    Y(l) = (1, l, l_x l_y, l_y l_z, l_x l_z, l_x^2 - l_y^2, 3 l_z^2 - 1)
 
 Errors count relative to brightness, since the inside of a hollow is mostly in shadow. Compiled for the CPU.
 """
