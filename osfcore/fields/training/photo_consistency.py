@@ -57,15 +57,16 @@ def open_hollows(field: KiloOSF, images: ImageSet, *, fog_g: float) -> KiloOSF:
 
 def without_fog(field: KiloOSF) -> KiloOSF:
     """The field without the corners that are neither opaque nor next to one that is: they can never become so again."""
-    keep = ndimage.binary_dilation(field.density > _OPAQUE_G) & (field.index > 0)
+    keep = np.asarray(ndimage.binary_dilation(field.density > _OPAQUE_G), bool) & (field.index > 0)
     features = field.rows[field.index]
     return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
 
 
 def _largest(mask: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx ny nz"]:
     """The largest piece, over small gaps: an object is in one, while the middle of a lid may look right and float."""
-    pieces, count = ndimage.label(ndimage.binary_dilation(mask, np.ones((3, 3, 3)), iterations=_GAP_VOXELS))
-    if count == 0:
+    joined = np.asarray(ndimage.binary_dilation(mask, np.ones((3, 3, 3)), iterations=_GAP_VOXELS))
+    pieces = np.zeros(mask.shape, np.int32)
+    if not ndimage.label(joined, output=pieces):
         return mask
     return mask & (pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:]))
 
@@ -86,7 +87,7 @@ def surface_misfit(
     Returns:
         NaN inside, outside, and where too few views look.
     """
-    points = np.argwhere(solid & ~ndimage.binary_erosion(solid))
+    points = np.argwhere(solid & ~np.asarray(ndimage.binary_erosion(solid), bool))
     cameras = images.cameras
     matrices = [c.intrinsics @ c.T_world_camera.inverse().matrix()[:3] for c in cameras]
     to_pixels = np.array(matrices)
@@ -98,7 +99,7 @@ def surface_misfit(
     single = (points, to_pixels, eyes, images.light_directions, brightness, _directions(_NORMALS))
     arrays = [np.ascontiguousarray(a, np.float32) for a in single]
     with ONE_AT_A_TIME:
-        _judge(solid, np.ascontiguousarray(images.rgba[..., 3] >= _OPAQUE), *arrays, found)
+        _judge(found, solid, np.ascontiguousarray(images.rgba[..., 3] >= _OPAQUE), *arrays)
     misfit = np.full(solid.shape, np.nan, np.float32)
     misfit[tuple(points.T)] = np.where(found < 0, np.nan, found)
     return misfit
@@ -200,7 +201,7 @@ def _misfit(normal, lights, seen, towards, is_lit, shade):  # noqa: ANN001, ANN2
 
 
 @numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
-def _judge(solid, opaque, points, to_pixels, eyes, lights, brightness, normals, misfit):  # noqa: ANN001, ANN202
+def _judge(misfit, solid, opaque, points, to_pixels, eyes, lights, brightness, normals):  # noqa: ANN001, ANN202
     """The least misfit of every point over all normals; -1 where too few views look."""
     views = len(eyes)
     for n in numba.prange(len(points)):

@@ -82,7 +82,7 @@ def _gradient(
     origins = (rays.origins - field.origin) / np.float32(field.voxel)
     arrays = (origins, rays.directions, rays.lights, rays.rgb, rays.alpha, offsets)
     with ONE_AT_A_TIME:
-        _descend(values, field.index, *(np.ascontiguousarray(a, np.float32) for a in arrays), parts)
+        _descend(parts, values, field.index, *(np.ascontiguousarray(a, np.float32) for a in arrays))
     return parts.sum(axis=0) / np.float32(len(offsets))
 
 
@@ -177,7 +177,7 @@ def _spread(rows, weights, features, gains, count, depth, light, slope, slope_al
 
 
 @numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
-def _descend(values, index, origins, directions, lights, rgb, alpha, offsets, parts):  # noqa: ANN001, ANN202
+def _descend(parts, values, index, origins, directions, lights, rgb, alpha, offsets):  # noqa: ANN001, ANN202
     for part in numba.prange(len(parts)):
         rows, weights = np.empty((_MOST_SAMPLES, 8), np.int32), np.empty((_MOST_SAMPLES, 8), np.float32)
         features, gains = np.empty((_MOST_SAMPLES, _FEATURES), np.float32), np.empty(_MOST_SAMPLES, np.float32)

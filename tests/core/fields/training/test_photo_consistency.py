@@ -133,3 +133,22 @@ def test_the_same_seed_gives_the_same_voxels(cup):
     images, hull = cup
     first, second = (fit_voxels(hull, images, steps=3, rays=64, rng=np.random.default_rng(1)) for _ in range(2))
     np.testing.assert_array_equal(first.rows, second.rows)
+
+
+def test_descent_lessens_what_colours_miss(box):
+    images, hull = box
+    fitted = fit_voxels(hull, images, steps=100, rays=512, rng=np.random.default_rng(0))
+    colours = fitted.rows[fitted.index[fitted.density > 0], 1:4]
+    wanted = np.array([200, 120, 80]) / 255
+    seen = (
+        np.abs(colours / np.maximum(colours.sum(axis=1, keepdims=True), 1e-6) - wanted / wanted.sum()).max(axis=1)
+        < 0.05
+    )
+    assert seen.mean() > 0.2  # the surface; nothing is learned inside
+
+
+def test_opening_draws_nothing(cup):
+    images, hull = cup
+    opened = open_hollows(hull, images, fog_g=-5.5)
+    again = open_hollows(hull, images, fog_g=-5.5)
+    np.testing.assert_array_equal(opened.density, again.density)
