@@ -29,9 +29,11 @@ from osfcore.fields.training.distillation import Distillation, first_student
 from osfcore.fields.training.network_stage import NetworkHoldout, NetworkStage
 from osfcore.fields.training.optimization import Stage
 from osfcore.fields.training.osf_training import TeacherRecipe, first_teacher, restored_teacher
+from osfcore.fields.training.photo_consistency import open_hollows, without_fog
 from osfcore.fields.training.recipes import Pace, Recipe, TrainField
 from osfcore.fields.training.validation import Holdout
 from osfcore.fields.training.visual_hull import silhouette_box
+from osfcore.fields.training.voxel_fit import fit_voxels
 from osfcore.fields.voxel_shell import first_shell, refine, trim
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_set import ImageSet, read_splits
@@ -153,9 +155,17 @@ class _Run:
         r = self._recipe
         if self._config.recipe == "distil":
             return first_teacher(self._images, box, self._teacher_recipe(), self._rng, self._device)
-        field = first_shell(self._images, box, across=r.coarse_across, cells=r.cells, hidden=r.hidden,
-                            inside_g=r.hollow_g if self._config.hollow else r.solid_g, rng=self._rng)  # fmt: skip
-        return Stage(field, r.coarse_rates, self._device)
+        across = r.hollow_across if self._config.hollow else r.coarse_across
+        field = first_shell(self._images, box, across=across, cells=r.cells, hidden=r.hidden,
+                            inside_g=r.solid_g, rng=self._rng)  # fmt: skip
+        if self._config.hollow:
+            field = open_hollows(field, self._images, fog_g=r.hollow_g)
+            field = without_fog(fit_voxels(field, self._images, steps=r.hollow_steps, rays=r.rays, rng=self._rng))
+        return self._stage("coarse", field)
+
+    def _stage(self, name: str, field: KiloOSF) -> Stage:
+        r = self._recipe
+        return Stage(field, r.coarse_rates if name == "coarse" else r.fine_rates, self._device)
 
     def _next(self, name: str, before: _Learner) -> _Learner:
         """The learner of a phase, from that of the phase before."""
@@ -170,7 +180,7 @@ class _Run:
         field = before.snapshot()
         if not isinstance(before, Distillation):
             field = refine(field, self._images, across=r.fine_across, rng=self._rng)
-        return Stage(field, r.fine_rates, self._device)
+        return self._stage(name, field)
 
     def _teacher_recipe(self) -> TeacherRecipe:
         return TeacherRecipe(OSFSize(self._config.teacher_depth, self._config.teacher_width))
@@ -278,13 +288,12 @@ class _Run:
         write_checkpoint(self._checkpoint_path, checkpoint, self._fingerprint())
 
     def _resumed(self, saved: Checkpoint) -> _Learner:
-        r = self._recipe
         if saved.stage == "teacher":
             learner = restored_teacher(saved.field, saved.optimiser, self._teacher_recipe(), self._device)
         elif saved.stage == "distil":
             learner = Distillation.restored(saved.field, saved.optimiser, self._teacher_recipe().size, self._device)
         else:
-            learner = Stage(saved.field, r.coarse_rates if saved.stage == "coarse" else r.fine_rates, self._device)
+            learner = self._stage(saved.stage, saved.field)
             learner.restore(saved.optimiser)
         self._done_s, self._done_steps = saved.clock["seconds"], saved.clock["steps"]
         self._looked_at, self._psnr = saved.clock["looked_at"], saved.clock["psnr"]

@@ -26,7 +26,9 @@ class Recipe:
         hidden: their width.
         rays: pixels per step of descent.
         solid_g: density feature inside the visual hull at first.
-        hollow_g: the same for hollow objects: fog so thin that light reaches what silhouettes cannot carve.
+        hollow_across: instead of coarse_across for hollow objects: views agree on fine surfaces.
+        hollow_g: density feature of the fog around the surfaces on which views agree, from which edges grow.
+        hollow_steps: of descent without networks, before the first phase of a hollow object.
         hollow_share: instead of coarse_share for hollow objects: opening a hollow takes time.
         coarse_rates: learning rates of the first phase.
         fine_rates: of the second.
@@ -41,7 +43,9 @@ class Recipe:
     hidden: int = 16
     rays: int = 4096
     solid_g: float = 6.0
-    hollow_g: float = -3.0
+    hollow_across: int = 96
+    hollow_g: float = -5.5
+    hollow_steps: int = 400
     hollow_share: float = 0.3
     coarse_rates: Rates = _COARSE_RATES
     fine_rates: Rates = _FINE_RATES
