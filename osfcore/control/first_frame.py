@@ -1,0 +1,140 @@
+"""The first frame, whatever its pictures are like: exposure, response, ambient light and the table's colour are found.
+
+Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where it does
+not, an image model is fitted first (`Calibrator`): with each object in the pose that fits its masks best at any
+brightness, for pictures that are linear and for such that are sRGB; the response that leaves less unexplained is taken.
+Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the image model is
+fitted once more, and Gauss-Newton does the last millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+
+from osfcore.estimation.first_frame import FirstFrameConfig, check_masks, visible_part
+from osfcore.estimation.first_frame import estimate_first as estimate_usual
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
+from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.photometry.calibration import Calibration, Calibrator
+from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.table_check import check_table
+from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
+from osfcore.estimation.search.pose_initialization import OVERHEAD, initial_poses
+from osfcore.estimation.step_reporter import StepReporter
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import Observation
+from osfcore.photo.camera_response import Encoding, linear_from_encoded
+from osfcore.progress import Progress
+
+_COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
+_TINT = 0.1  # weight of the gains' spread over the colours: lamps are nearly white
+_LEAST_GAIN, _MOST_GAIN = 0.05, 20.0  # beyond, pictures show nothing, or nothing else
+_ROUNDS, _ITERATIONS = 2, 2
+
+
+def estimate_first(
+    models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
+) -> Iterator[EstimateStep]:
+    """Find all poses and the light; the last step holds the estimate.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: one or more views with masks, of any exposure, linear or sRGB.
+        rng: of the searches.
+        config: how much work to do; under a held light pictures are taken for usual ones.
+
+    Raises:
+        InvalidInput: without masks, or if an object's masks are all empty.
+        UnknownName: if an object has no field.
+    """
+    config = config or FirstFrameConfig()
+    models.check(observation.names)
+    check_masks(observation)
+    can_adapt = models.can_change and config.held_light is None and len(observation.names) > 0
+    if not can_adapt or check_table(models, views_of(observation, FINE_SIDE)).is_usual:
+        yield from estimate_usual(models, observation, rng, config)
+        return
+    calibrator = Calibrator(models, observation.names)
+    rough = min((_calibrated(models, calibrator, observation, e) for e in get_args(Encoding)), key=lambda r: r.loss)
+    if not rough.is_sane:
+        yield from estimate_usual(models, observation, rng, config)
+        return
+    yield from _steps(models, calibrator, rough, rng, config)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Calibrated:
+    """Pictures as a camera response makes them linear, and the image model that explains them."""
+
+    observation: Observation
+    found: Calibration
+
+    @property
+    def loss(self) -> float:
+        return self.found.unexplained + _TINT * float(np.std(np.log(self.found.model.gain)))
+
+    @property
+    def is_sane(self) -> bool:
+        gain = self.found.model.gain
+        return bool(np.all((gain > _LEAST_GAIN) & (gain < _MOST_GAIN)))
+
+
+def _calibrated(
+    models: ObjectModels, calibrator: Calibrator, observation: Observation, encoding: Encoding
+) -> _Calibrated:
+    """The image model with each object in the pose that fits its masks best, at any brightness."""
+    images = linear_from_encoded(observation.images, encoding).astype(np.float32)
+    linear = replace(observation, images=images)
+    coarse, rough = views_of(linear, _COARSE_SIDE), views_of(linear, _ROUGH_SIDE)
+    best = [initial_poses(models, name, visible_part(coarse, n)) for n, name in enumerate(linear.names)]
+    positions, quaternions = (np.stack(a) for a in zip(*[(b.positions[0], b.quaternions[0]) for b in best], strict=True))
+    params = SceneParameters(linear.names, positions, quaternions, OVERHEAD, linear.pusher)
+    return _Calibrated(linear, calibrator.search(rough, coarse, params))
+
+
+def _steps(
+    models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, rng: np.random.Generator, config: FirstFrameConfig
+) -> Iterator[EstimateStep]:
+    """The usual estimator on pictures and models that agree, then both once more."""
+    model, linear, usual = rough.found.model, rough.observation, None
+    for step in estimate_usual(model.adapted(models, linear.names), model.normalized(linear), rng, config):
+        usual = step
+        if step.estimate is None:
+            more = Progress(step.progress.done, step.progress.total + _ROUNDS * _ITERATIONS, step.progress.note)
+            yield replace(step, progress=more)
+    assert usual is not None
+    assert usual.estimate is not None
+    reporter = StepReporter(usual.progress.total + _ROUNDS * _ITERATIONS)
+    reporter.done = usual.progress.total - 1
+    yield from _polished(models, calibrator, model, linear, usual.estimate, reporter)
+
+
+def _polished(
+    models: ObjectModels,
+    calibrator: Calibrator,
+    model: ImageModel,
+    linear: Observation,
+    estimate: EstimatedState,
+    reporter: StepReporter,
+) -> Iterator[EstimateStep]:
+    """Image model, poses and lamp in turn."""
+    at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
+    fine, adapted = views_of(linear, FINE_SIDE, samples=2), models
+    for _ in range(_ROUNDS):
+        found = calibrator.refine(fine, at.params, model.ambient)
+        model = found.model
+        adapted, normal = model.adapted(models, linear.names), model.normalized(linear)
+        at = GaussNewtonState.at(replace(at.params, light=found.light))
+        views, middle = views_of(normal, FINE_SIDE, samples=2), views_of(normal, _COARSE_SIDE, samples=2)
+        for at in gauss_newton(adapted, views, at, iterations=_ITERATIONS, light=middle):
+            yield reporter.refinement("Exposure and table", at)
+    fit = evaluate_fit(adapted, views, at.params)
+    rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
+    yield reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))
