@@ -94,7 +94,9 @@ def _calibrated(
     linear = replace(observation, images=images)
     coarse, rough = views_of(linear, _COARSE_SIDE), views_of(linear, _ROUGH_SIDE)
     best = [initial_poses(models, name, visible_part(coarse, n)) for n, name in enumerate(linear.names)]
-    positions, quaternions = (np.stack(a) for a in zip(*[(b.positions[0], b.quaternions[0]) for b in best], strict=True))
+    positions, quaternions = (
+        np.stack(a) for a in zip(*[(b.positions[0], b.quaternions[0]) for b in best], strict=True)
+    )
     params = SceneParameters(linear.names, positions, quaternions, OVERHEAD, linear.pusher)
     return _Calibrated(linear, calibrator.search(rough, coarse, params))
 
@@ -125,16 +127,18 @@ def _polished(
     reporter: StepReporter,
 ) -> Iterator[EstimateStep]:
     """Image model, poses and lamp in turn."""
-    at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
-    fine, adapted = views_of(linear, FINE_SIDE, samples=2), models
-    for _ in range(_ROUNDS):
-        found = calibrator.refine(fine, at.params, model.ambient)
+    params = SceneParameters.of(estimate.state, linear.pusher)
+    seen = views_of(linear, FINE_SIDE, samples=2)
+    for number in range(1, _ROUNDS + 1):
+        found = calibrator.refine(seen, params, model.ambient)
         model = found.model
         adapted, normal = model.adapted(models, linear.names), model.normalized(linear)
-        at = GaussNewtonState.at(replace(at.params, light=found.light))
-        views, middle = views_of(normal, FINE_SIDE, samples=2), views_of(normal, _COARSE_SIDE, samples=2)
-        for at in gauss_newton(adapted, views, at, iterations=_ITERATIONS, light=middle):
+        fine, middle = views_of(normal, FINE_SIDE, samples=2), views_of(normal, _COARSE_SIDE, samples=2)
+        start = GaussNewtonState.at(replace(params, light=found.light))
+        for at in gauss_newton(adapted, fine, start, iterations=_ITERATIONS, light=middle):
+            params = at.params
             yield reporter.refinement("Exposure and table", at)
-    fit = evaluate_fit(adapted, views, at.params)
-    rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
-    yield reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))
+        if number == _ROUNDS:
+            fit = evaluate_fit(adapted, fine, params)
+            rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
+            yield reporter.finish(at, estimate_with_uncertainty(params, at.normals, fit, rivals))

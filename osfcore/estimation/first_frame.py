@@ -87,6 +87,11 @@ def estimate_first(
 
 
 def check_masks(observation: Observation) -> None:
+    """Refuse an observation that does not show where each object is.
+
+    Raises:
+        InvalidInput: without masks, or if an object's masks are all empty.
+    """
     if observation.masks is None:
         raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
     for name, masks in zip(observation.names, np.moveaxis(observation.masks, 1, 0), strict=True):

@@ -1,4 +1,4 @@
-"""Whether pictures show the table as it is known, from its pixels alone: a check of the image model before any estimate.
+"""Whether pictures show the table as it is known, from its pixels alone: a check before any estimate.
 
 Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x where
 the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another table

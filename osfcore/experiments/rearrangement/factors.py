@@ -1,8 +1,9 @@
 """Factors of variation, one at a time: worlds that differ in one thing from what the method takes for granted.
 
-The method is told of none of them. `mild_together` are many at once, each of them small. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 10
+The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 10
 deg and more above the table; a table of one known colour; exact calibration; linear images without noise; exact masks;
-friction as the dynamics were trained on; objects that they were trained on.
+friction as the dynamics were trained on; objects that they were trained on. `mild_together` are many factors at once,
+each of them small.
 """
 
 from __future__ import annotations
@@ -145,7 +146,9 @@ FACTORS: Mapping[str, Factor] = MappingProxyType(
     }
 )
 _FIRST_FRAME_ONLY = ("exposure_0.7", "exposure_1.4", "ambient_0.6", "table_dark", "mild_together")
-EPISODE_FACTORS = tuple(name for name in FACTORS if name not in _FIRST_FRAME_ONLY)  # in which whole episodes are measured
+EPISODE_FACTORS = tuple(
+    name for name in FACTORS if name not in _FIRST_FRAME_ONLY
+)  # in which whole episodes are measured
 FIRST_FRAME_FACTORS = (
     "exposure_0.7", "exposure_1.4", "ambient_0.1", "ambient_0.6", "srgb_8bit", "table_dark", "table_wood",
     "table_colour", "noise_2", "jpeg_80", "camera_shifted", "masks_dilated_2", "masks_eroded_2", "mild_together",
