@@ -2,7 +2,7 @@
 
 Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where it does
 not, an image model is fitted first (`Calibrator`): with each object in the pose that fits its masks best at any
-brightness, for pictures that are linear and for such that are sRGB; the response that leaves less unexplained is taken.
+brightness, once for linear pictures and once for sRGB ones; what leaves less unexplained is taken.
 Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the image model is
 fitted once more, and Gauss-Newton does the last millimetres.
 """
@@ -62,7 +62,8 @@ def estimate_first(
         yield from estimate_usual(models, observation, rng, config)
         return
     calibrator = Calibrator(models, observation.names)
-    rough = min((_calibrated(models, calibrator, observation, e) for e in get_args(Encoding)), key=lambda r: r.loss)
+    poses = _rough_poses(models, observation)
+    rough = min((_calibrated(calibrator, observation, poses, e) for e in get_args(Encoding)), key=lambda r: r.loss)
     if not rough.is_sane:
         yield from estimate_usual(models, observation, rng, config)
         return
@@ -86,19 +87,21 @@ class _Calibrated:
         return bool(np.all((gain > _LEAST_GAIN) & (gain < _MOST_GAIN)))
 
 
+def _rough_poses(models: ObjectModels, observation: Observation) -> SceneParameters:
+    """Each object in the pose that fits its masks best, at any brightness; hardly the response's matter."""
+    coarse = views_of(observation, _COARSE_SIDE)
+    best = [initial_poses(models, name, visible_part(coarse, n)).best(1) for n, name in enumerate(observation.names)]
+    positions, quaternions = (np.concatenate(a) for a in ([b.positions for b in best], [b.quaternions for b in best]))
+    return SceneParameters(observation.names, positions, quaternions, OVERHEAD, observation.pusher)
+
+
 def _calibrated(
-    models: ObjectModels, calibrator: Calibrator, observation: Observation, encoding: Encoding
+    calibrator: Calibrator, observation: Observation, params: SceneParameters, encoding: Encoding
 ) -> _Calibrated:
-    """The image model with each object in the pose that fits its masks best, at any brightness."""
+    """The image model of pictures that are encoded so, from rough poses."""
     images = linear_from_encoded(observation.images, encoding).astype(np.float32)
     linear = replace(observation, images=images)
-    coarse, rough = views_of(linear, _COARSE_SIDE), views_of(linear, _ROUGH_SIDE)
-    best = [initial_poses(models, name, visible_part(coarse, n)) for n, name in enumerate(linear.names)]
-    positions, quaternions = (
-        np.stack(a) for a in zip(*[(b.positions[0], b.quaternions[0]) for b in best], strict=True)
-    )
-    params = SceneParameters(linear.names, positions, quaternions, OVERHEAD, linear.pusher)
-    return _Calibrated(linear, calibrator.search(rough, coarse, params))
+    return _Calibrated(linear, calibrator.search(views_of(linear, _ROUGH_SIDE), views_of(linear, _COARSE_SIDE), params))
 
 
 def _steps(
@@ -127,18 +130,18 @@ def _polished(
     reporter: StepReporter,
 ) -> Iterator[EstimateStep]:
     """Image model, poses and lamp in turn."""
-    params = SceneParameters.of(estimate.state, linear.pusher)
-    seen = views_of(linear, FINE_SIDE, samples=2)
-    for number in range(1, _ROUNDS + 1):
-        found = calibrator.refine(seen, params, model.ambient)
+    at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
+    middle, fine = (views_of(linear, side, samples=2) for side in (_COARSE_SIDE, FINE_SIDE))
+    for number, (views, is_light_held) in enumerate(((middle, False), (fine, True)), 1):
+        found = calibrator.refine(views, at.params, model.ambient, hold_light=is_light_held)
         model = found.model
         adapted, normal = model.adapted(models, linear.names), model.normalized(linear)
-        fine, middle = views_of(normal, FINE_SIDE, samples=2), views_of(normal, _COARSE_SIDE, samples=2)
-        start = GaussNewtonState.at(replace(params, light=found.light))
-        for at in gauss_newton(adapted, fine, start, iterations=_ITERATIONS, light=middle):
-            params = at.params
+        sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
+        at = GaussNewtonState.at(replace(at.params, light=found.light))
+        for step in gauss_newton(adapted, sharp, at, iterations=_ITERATIONS, light=soft):
+            at = step
             yield reporter.refinement("Exposure and table", at)
         if number == _ROUNDS:
-            fit = evaluate_fit(adapted, fine, params)
+            fit = evaluate_fit(adapted, sharp, at.params)
             rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
-            yield reporter.finish(at, estimate_with_uncertainty(params, at.normals, fit, rivals))
+            yield reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))

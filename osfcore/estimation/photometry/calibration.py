@@ -82,9 +82,17 @@ class Calibrator:
         best = [(directions[k // len(_AMBIENT)], float(_AMBIENT[k % len(_AMBIENT)])) for k in found]
         return self._refined(fine, params, best, _FIRST_STEP_RAD, _FIRST_FACTOR, _ROUNDS)
 
-    def refine(self, views: ObservedViews, params: SceneParameters, ambient: float) -> Calibration:
-        """Improve a calibration, now that the poses are known; its lamp is that of the parameters."""
-        return self._refined(views, params, [(params.light, ambient)], _FIRST_STEP_RAD / 4, _FIRST_FACTOR**0.25, 4)
+    def refine(self, views: ObservedViews, params: SceneParameters, ambient: float, *, hold_light: bool) -> Calibration:
+        """Improve a calibration, now that the poses are known.
+
+        Args:
+            views: pictures.
+            params: objects and lamp, near the truth.
+            ambient: r likewise.
+            hold_light: the lamp is where it is.
+        """
+        step = 0.0 if hold_light else _FIRST_STEP_RAD / 4
+        return self._refined(views, params, [(params.light, ambient)], step, _FIRST_FACTOR**0.5, 4, kept=1)
 
     def _refined(
         self,
@@ -94,21 +102,21 @@ class Calibrator:
         step: float,
         factor: float,
         rounds: int,
+        kept: int = _SURVIVORS // 2,
     ) -> Calibration:
         pixels = self._pixels(views, params)
         cost = np.inf
         for _ in range(rounds):
             tried: list[tuple[float, np.ndarray, float]] = []
             for light, ambient in best:
-                lights = _neighbours(params, light, step)
+                lights = _neighbours(params, light, step) if step else light[None]
                 around = ambient * factor ** np.array([-1.0, 0.0, 1.0])
                 costs = pixels.costs(self._direct_parts(views, params, lights, pixels), around)
                 tried += [
                     (costs[a, b], lights[a], float(around[b])) for a in range(len(lights)) for b in range(len(around))
                 ]
             tried.sort(key=lambda one: one[0])
-            cost, best = tried[0][0], [(light, ambient) for _, light, ambient in tried[:_SURVIVORS]]
-            best = best[: max(1, _SURVIVORS // 2)]
+            cost, best = tried[0][0], [(light, ambient) for _, light, ambient in tried[:kept]]
             step, factor = step * _SHRINKING, factor**_SHRINKING
         light, ambient = best[0]
         direct = self._direct_parts(views, params, light[None], pixels)[0]
