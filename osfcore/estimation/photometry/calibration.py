@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
+from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
 from osfcore.estimation.photometry.image_model import ImageModel, scaled_field, scaled_table
@@ -92,7 +92,7 @@ class Calibrator:
             hold_light: the lamp is where it is.
         """
         step = 0.0 if hold_light else _FIRST_STEP_RAD / 4
-        return self._refined(views, params, [(params.light, ambient)], step, _FIRST_FACTOR**0.5, 4, kept=1)
+        return self._refined(views, params, [(params.light, ambient)], step, _FIRST_FACTOR**0.5, 3, kept=1)
 
     def _refined(
         self,
@@ -127,9 +127,9 @@ class Calibrator:
         """The pixels that count, with what is seen there and its ambient part."""
         batch = params.perturbed(np.zeros((1, params.size)))
         nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), params.light[None], None)
-        whole = self._whole.together.render(batch, views.cameras, quality=QUALITY, outputs={"rgb", "opacity"})
-        direct = self._direct.together.render(batch, views.cameras, quality=QUALITY).rgb[0]
-        empty, lit = (m.together.render(nothing, views.cameras, quality=QUALITY).rgb[0]
+        whole = self._whole.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
+        direct = self._direct.together.render(batch, views.cameras, quality=views.quality).rgb[0]
+        empty, lit = (m.together.render(nothing, views.cameras, quality=views.quality).rgb[0]
                       for m in (self._whole, self._direct))  # fmt: skip
         assert whole.opacity is not None
         ambient, bare = whole.rgb[0] - direct, empty - lit
@@ -148,7 +148,7 @@ class Calibrator:
         self, views: ObservedViews, params: SceneParameters, lights: np.ndarray, pixels: _Pixels
     ) -> Float32[np.ndarray, "L P 3"]:
         batch = replace(params.perturbed(np.zeros((len(lights), params.size))), lights=lights)
-        rendered = self._direct.together.render(batch, views.cameras, quality=QUALITY, only=pixels.counted)
+        rendered = self._direct.together.render(batch, views.cameras, quality=views.quality, only=pixels.counted)
         return rendered.rgb[:, pixels.counted]
 
 

@@ -2,7 +2,7 @@
 
 Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x where
 the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another table
-changes the colours.
+changes the colours. Where no shadow is seen, as under a lamp in the back of all cameras, only colours tell.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.render.types import SceneBatch
 
-_BESIDE_PX = 5  # of masks and pusher, where nothing is table for sure; masks may be too small
+_MASK_ERROR_PX, _BESIDE = 2, 0.02  # of masks, and of the image's side: where nothing is table for sure
 _FEWEST = 200  # pixels of table, without which nothing is told
 _DARKEST = 0.003  # share of the pixels that lies in shadow in any scene
 _SHADOW, _BRIGHTEST = 0.05, 1.06  # |x| in shadow, and x in full light
+_LEAST_CONTRAST = 0.05  # of x: less is noise, not a shadow
 _COLOUR = 0.012  # median error of colours [radiance]
 
 
@@ -64,13 +65,16 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
     x = (lit[table] - AMBIENT) / DIFFUSE
     shadow, brightest = np.quantile(x, [_DARKEST, 0.99])
     colour = float(np.median(error[table]))
-    is_usual = abs(shadow) < _SHADOW and brightest < _BRIGHTEST and colour < _COLOUR
+    has_shadow = brightest - shadow > _LEAST_CONTRAST
+    is_dark = abs(shadow) < _SHADOW if has_shadow else shadow > -_SHADOW
+    is_usual = is_dark and brightest < _BRIGHTEST and colour < _COLOUR
     return TableCheck(float(shadow), float(brightest), colour, bool(is_usual))
 
 
 def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
     """Pixels that show nothing but table, well within its edge."""
-    kernel = np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)
+    reach = _MASK_ERROR_PX + round(_BESIDE * max(on_table.shape[1:]))
+    kernel = np.ones((2 * reach + 1,) * 2, np.uint8)
     other = ~on_table
     if views.masks is not None and views.masks.shape[1]:
         other |= views.masks.max(axis=1) > 0
