@@ -10,10 +10,17 @@ from osfcore.estimation.photometry.calibration import Calibrator
 from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.estimation.photometry.table_check import check_table
 from osfcore.geometry.cameras import default_cameras
-from tests.core.estimation.scenes import NAMES, observe, params_of, scene
+from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, lying, observe, params_of, scene
 
-CAMERAS = default_cameras(64)[:2]
+CAMERAS = default_cameras(64)[2:]  # on the other side than the lamp: they see shadows
 MODEL = ImageModel(np.array([0.7, 0.75, 0.8]), 2.0, np.array([0.5, 0.7, 0.9]))
+
+
+@pytest.fixture(scope="module")
+def truth(models):
+    """Under a low lamp, so that shadows are long."""
+    poses = {BOX: lying(models, BOX, 30, 0.05, -0.08), BOTTLE: lying(models, BOTTLE, 50, -0.06, 0.09)}
+    return scene(poses, (0.6, 0.5, 0.45))
 
 
 def taken(models, state, model):
@@ -67,6 +74,13 @@ def test_a_wrong_pose_leaves_more_unexplained(models, truth, pictures):
 def test_the_table_tells_whether_pictures_are_usual(models, truth, gain, ambient, table, is_usual):
     model = ImageModel(np.full(3, gain), ambient, np.array(table))
     assert check_table(models, views_of(taken(models, truth, model), 64)).is_usual == is_usual
+
+
+def test_without_a_visible_shadow_only_colours_tell(models):
+    empty = observe(models, scene({}), CAMERAS)
+    for factor, is_usual in ((1.0, True), (0.8, True), (np.array([1.0, 0.8, 0.7]), False)):
+        shown = replace(empty, images=empty.images * factor)
+        assert check_table(models, views_of(shown, 64)).is_usual == is_usual
 
 
 def test_noise_does_not_make_a_table_unusual(models, truth):
