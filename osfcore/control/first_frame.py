@@ -1,15 +1,16 @@
 """The first frame, whatever its pictures are like: exposure, response, ambient light and the table's colour are found.
 
-Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where it does
-not, an image model is fitted first (`Calibrator`): with each object in the pose that fits its masks best at any
-brightness, once for linear pictures and once for sRGB ones; what leaves less unexplained is taken.
-Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the image model is
-fitted once more, and Gauss-Newton does the last millimetres.
+Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where no shadow
+tells, it is asked first, and its answer taken if the image model at its poses is the usual one. Otherwise an image
+model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
+linear pictures and once for sRGB ones; what leaves less unexplained is taken. Pictures and fields are made to agree,
+and the usual estimator finds poses and lamp. With these the image model is fitted once more, and Gauss-Newton does the
+last millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -58,16 +59,34 @@ def estimate_first(
     models.check(observation.names)
     check_masks(observation)
     can_adapt = models.can_change and config.held_light is None and len(observation.names) > 0
-    if not can_adapt or check_table(models, views_of(observation, FINE_SIDE)).is_usual:
+    verdict = check_table(models, views_of(observation, FINE_SIDE)).verdict if can_adapt else "usual"
+    if verdict == "usual":
         yield from estimate_usual(models, observation, rng, config)
         return
     calibrator = Calibrator(models, observation.names)
+    if verdict == "unclear":
+        last = yield from _all_but_last(estimate_usual(models, observation, rng, config))
+        assert last.estimate is not None
+        params = SceneParameters.of(last.estimate.state, observation.pusher)
+        views = views_of(observation, _COARSE_SIDE, samples=2)
+        if calibrator.refine(views, params, 1.0, hold_light=True).model.is_usual:
+            yield last
+            return
     poses = _rough_poses(models, observation)
     rough = min((_calibrated(calibrator, observation, poses, e) for e in get_args(Encoding)), key=lambda r: r.loss)
-    if not rough.is_sane:
+    if rough.is_sane:
+        yield from _steps(models, calibrator, rough, rng, config)
+    else:
         yield from estimate_usual(models, observation, rng, config)
-        return
-    yield from _steps(models, calibrator, rough, rng, config)
+
+
+def _all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None, EstimateStep]:
+    """Steps of an estimate but for the last one, which is returned."""
+    before = next(steps)
+    for step in steps:
+        yield before
+        before = step
+    return before
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,17 +127,17 @@ def _steps(
     models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, rng: np.random.Generator, config: FirstFrameConfig
 ) -> Iterator[EstimateStep]:
     """The usual estimator on pictures and models that agree, then both once more."""
-    model, linear, usual = rough.found.model, rough.observation, None
-    for step in estimate_usual(model.adapted(models, linear.names), model.normalized(linear), rng, config):
-        usual = step
-        if step.estimate is None:
-            more = Progress(step.progress.done, step.progress.total + _ROUNDS * _ITERATIONS, step.progress.note)
-            yield replace(step, progress=more)
-    assert usual is not None
-    assert usual.estimate is not None
-    reporter = StepReporter(usual.progress.total + _ROUNDS * _ITERATIONS)
-    reporter.done = usual.progress.total - 1
-    yield from _polished(models, calibrator, model, linear, usual.estimate, reporter)
+    model, linear, more = rough.found.model, rough.observation, _ROUNDS * _ITERATIONS
+    usual = estimate_usual(model.adapted(models, linear.names), model.normalized(linear), rng, config)
+    before = next(usual)
+    for step in usual:
+        progress = before.progress
+        yield replace(before, progress=Progress(progress.done, progress.total + more, progress.note))
+        before = step
+    assert before.estimate is not None
+    reporter = StepReporter(before.progress.total + more)
+    reporter.done = before.progress.total - 1
+    yield from _polished(models, calibrator, model, linear, before.estimate, reporter)
 
 
 def _polished(

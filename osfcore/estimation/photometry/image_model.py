@@ -23,6 +23,7 @@ from osfcore.fields.table_field import TableField
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.states import Observation
 
+_USUAL = 0.12  # of the logarithm of each factor
 _ALBEDO = slice(1, 4)  # among a field's features
 
 
@@ -44,6 +45,12 @@ class ImageModel:
     def scale(self) -> float:
         """What brings the radiance of a white surface that faces the lamp back to 1."""
         return 1 / (AMBIENT * self.ambient + DIFFUSE)
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether fields were made for such pictures, within what a fit to right poses may be off."""
+        factors = np.array([*self.gain, self.ambient, *self.table])
+        return bool(np.all(np.abs(np.log(factors)) < _USUAL))
 
     def normalized(self, observation: Observation) -> Observation:
         """The observation as it would be at the usual exposure."""

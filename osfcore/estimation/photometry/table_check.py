@@ -2,12 +2,13 @@
 
 Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x where
 the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another table
-changes the colours. Where no shadow is seen, as under a lamp in the back of all cameras, only colours tell.
+changes the colours. Where no shadow is seen, as under a lamp overhead, only colours tell.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -19,9 +20,11 @@ from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.render.types import SceneBatch
 
+TableVerdict = Literal["usual", "unclear", "other"]
 _MASK_ERROR_PX, _BESIDE = 2, 0.02  # of masks, and of the image's side: where nothing is table for sure
 _FEWEST = 200  # pixels of table, without which nothing is told
-_DARKEST = 0.003  # share of the pixels that lies in shadow in any scene
+_DARKEST = 0.001, 0.003  # shares of the pixels; where both lie well in shadow, it is as dark everywhere
+_SAME = 0.025  # difference of x within a shadow
 _SHADOW, _BRIGHTEST = 0.05, 1.06  # |x| in shadow, and x in full light
 _LEAST_CONTRAST = 0.05  # of x: less is noise, not a shadow
 _COLOUR = 0.012  # median error of colours [radiance]
@@ -35,13 +38,14 @@ class TableCheck:
         shadow: x of the darkest; 0 on the known table under the known ambient light.
         brightest: x of the brightest.
         colour: median error of the colours [radiance].
-        is_usual: nothing speaks against the usual image model.
+        verdict: "usual", or "other" where something speaks against the usual image model; "unclear" where no full
+            shadow is seen: then another lamp may explain what another exposure does.
     """
 
     shadow: float
     brightest: float
     colour: float
-    is_usual: bool
+    verdict: TableVerdict
 
 
 def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
@@ -61,14 +65,15 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
     error = np.abs(seen - lit[..., None] * full).mean(axis=-1)
     table = _table_pixels(views, empty.depth[0] > 0)
     if table.sum() < _FEWEST:
-        return TableCheck(0.0, 0.0, 0.0, True)
+        return TableCheck(0.0, 0.0, 0.0, "unclear")
     x = (lit[table] - AMBIENT) / DIFFUSE
-    shadow, brightest = np.quantile(x, [_DARKEST, 0.99])
+    darkest, shadow, brightest = np.quantile(x, [*_DARKEST, 0.99])
     colour = float(np.median(error[table]))
-    has_shadow = brightest - shadow > _LEAST_CONTRAST
-    is_dark = abs(shadow) < _SHADOW if has_shadow else shadow > -_SHADOW
+    has_shadow = brightest - shadow > _LEAST_CONTRAST and shadow - darkest < _SAME
+    is_dark = abs(shadow) < _SHADOW if has_shadow else darkest > -_SHADOW
     is_usual = is_dark and brightest < _BRIGHTEST and colour < _COLOUR
-    return TableCheck(float(shadow), float(brightest), colour, bool(is_usual))
+    verdict: TableVerdict = "other" if not is_usual else "usual" if has_shadow else "unclear"
+    return TableCheck(float(shadow), float(brightest), colour, verdict)
 
 
 def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
