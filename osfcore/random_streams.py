@@ -47,6 +47,7 @@ class Stream(IntEnum):
     VIDEO_ESTIMATE = 82  # what is taken of them from images
     PHOTO_SEARCH = 90  # poses in photographs, and starts that are measured
     PHOTO_PLANE = 91  # of the table, from measured depth
+    FACTOR_FRAME = 92  # what a factor leaves to chance in a measured first frame: wood, errors of cameras, noise
     LAMP_SCENE = 95  # scenes under lamps that are estimated, and the photographs of them
 
 

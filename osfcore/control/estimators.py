@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
+from osfcore.control.first_frame import estimate_first
+from osfcore.estimation.first_frame import FirstFrameConfig
 from osfcore.estimation.goal_image import GoalImageConfig
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep

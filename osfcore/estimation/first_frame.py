@@ -82,11 +82,16 @@ def estimate_first(
         UnknownName: if an object has no field.
     """
     models.check(observation.names)
-    _check_masks(observation)
+    check_masks(observation)
     yield from _FirstFrameEstimator(models, observation, rng, config or FirstFrameConfig()).steps()
 
 
-def _check_masks(observation: Observation) -> None:
+def check_masks(observation: Observation) -> None:
+    """Refuse an observation that does not show where each object is.
+
+    Raises:
+        InvalidInput: without masks, or if an object's masks are all empty.
+    """
     if observation.masks is None:
         raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
     for name, masks in zip(observation.names, np.moveaxis(observation.masks, 1, 0), strict=True):
@@ -114,8 +119,8 @@ class _FirstFrameEstimator:
         self._held = None if config.held_light is None else np.array(config.held_light)
 
     def steps(self) -> Iterator[EstimateStep]:
-        parts = [_visible_part(self._coarse, n) for n in range(len(self._names))]
-        better = [_visible_part(self._middle, n) for n in range(len(self._names))]
+        parts = [visible_part(self._coarse, n) for n in range(len(self._names))]
+        better = [visible_part(self._middle, n) for n in range(len(self._names))]
         starts: list[RankedPoses] = []
         for name, part in zip(self._names, parts, strict=True):
             starts.append(initial_poses(self._models, name, part))
@@ -140,7 +145,7 @@ class _FirstFrameEstimator:
     def _rerank(self, n: int, starts: RankedPoses, light: np.ndarray) -> RankedPoses:
         """Rank poses again under a known light, the best in full resolution, where labels tell sides apart."""
         for views, count in ((self._coarse, len(starts.losses)), (self._sharp, _RANKED_SHARP)):
-            part, best = _visible_part(views, n), starts.best(count)
+            part, best = visible_part(views, n), starts.best(count)
             starts = rank_poses(self._models, self._names[n], part, best.positions, best.quaternions, light)
         return starts
 
@@ -163,7 +168,7 @@ class _FirstFrameEstimator:
             yield self._reporter.step("objects", "Each object in its masks", best, shown, losses, sigma)
         refined = []
         for n, (name, search) in enumerate(zip(self._names, searches, strict=True)):
-            part, ends = _visible_part(self._fine, n), search.best_poses()
+            part, ends = visible_part(self._fine, n), search.best_poses()
             found = rank_poses(
                 self._models, name, part, ends.position, ends.quaternion, light, any_brightness=brightness
             )
@@ -237,7 +242,7 @@ class _FirstFrameEstimator:
         return self._reporter.step(stage, note, params, shown, [float(s.losses[0]) for s in starts])
 
 
-def _visible_part(views: ObservedViews, number: int) -> ObjectView:
+def visible_part(views: ObservedViews, number: int) -> ObjectView:
     """An object's part; where its masks are too thin for this resolution, their brightest pixel stands for them."""
     assert views.masks is not None
     own = views.masks[:, number]

@@ -28,6 +28,7 @@ _MIN_OVERLAP = 0.75  # of silhouette and mask
 _MIN_PIXELS = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
 _MIN_RIVAL_RATIO = 1.05
+AMBIGUOUS = "another orientation explains the images as well"  # a doubt
 _MAX_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths were within -1 and 4 mm
 
 
@@ -140,7 +141,7 @@ def _reason_for_doubt(fit: FitQuality, n: int, position_std: float, rotation_std
     if residual > _MAX_RESIDUAL:
         return f"its images differ from what was rendered by {residual:.2f}"
     if rival < _MIN_RIVAL_RATIO:
-        return "another orientation explains the images as well"
+        return AMBIGUOUS
     if position_std > _MOST_POSITION_STD_M or rotation_std > _MOST_ROTATION_STD_RAD:
         return f"its pose is known to {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg only"
     return ""

@@ -55,12 +55,19 @@ class EvaluateEstimateCommand(ParallelEvaluation):
     """What to measure; first frames are in any case."""
     bad: int = 0
     """Number of spoiled inputs (100 gives ten of each kind)."""
+    factor: tuple[str, ...] = ()
+    """Things in which pictures differ from what the method takes for granted, such as exposure_0.7, or "all" of them:
+    first frames are measured under each."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.estimation.evaluation import evaluate_estimate
         from osfcore.experiments.estimation.parts import EvaluateEstimate
+        from osfcore.experiments.rearrangement.factors import FIRST_FRAME_FACTORS
 
-        config = EvaluateEstimate(self.folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names)
+        factors = FIRST_FRAME_FACTORS if self.factor == ("all",) else self.factor
+        config = EvaluateEstimate(
+            self.folder, self.tasks, self.objects, self.seed, self.parts, self.bad, self.names, factors=factors
+        )
         return evaluate_estimate(config, fields, assets, executor)
 
     def _show(self, report: dict[str, Any]) -> None:
@@ -206,6 +213,12 @@ def _show_estimate(folder: Path, result: dict[str, Any]) -> None:
         rows = {f"{n} views" if n != "1" else "1 view": row for n, row in result["by_views"].items()}
         for what, row in {"light held overhead": result["fixed_light"], **rows}.items():
             print(f"  {what}: {_percent(row['frac_1cm_5deg'])} under 1 cm and 5 deg; medians {_errors(row)}")
+    for name, row in result.get("by_factor", {}).items():
+        print(
+            f"  {name}: {_percent(row['frac_1cm_5deg'])} of {row['objects_total']} objects; medians {_errors(row)}, "
+            f"{_percent(row['light_frac_10deg'])} of lights within 10 deg; {row['wrong_unflagged']} wrong without "
+            f"a warning; {_number(row['first_s_median'])} s"
+        )
     if "bad_cases" in result:
         print(
             f"Bad cases: {result['bad_cases']}: {result['bad_refused']} refused, {result['bad_flagged']} flagged, "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
 from osfcore.errors import UnknownName
@@ -32,6 +32,7 @@ class ObjectModels:
         """
         alone, together = (SceneRenderer(fields, ground, device=device) for ground in (None, table))
         self._set(fields, alone, together)
+        self._changeable = fields, table, device
 
     @classmethod
     def rendered_by(
@@ -54,7 +55,29 @@ class ObjectModels:
     def _set(self, fields: Mapping[str, DensityGrid], alone: Renderer, together: Renderer) -> None:
         self._fields = dict(fields)
         self._resting: dict[str, RestingOrientations] = {}
+        self._changeable: tuple[Mapping[str, KiloOSF], TableField, str] | None = None
         self.alone, self.together = alone, together
+
+    @property
+    def can_change(self) -> bool:
+        """Whether `changed` works: not where another renderer draws fields of its own kind."""
+        return self._changeable is not None
+
+    def changed(
+        self, names: Iterable[str], field: Callable[[KiloOSF], KiloOSF], table: Callable[[TableField], TableField]
+    ) -> ObjectModels:
+        """Models of some of the objects with another look and the same shapes.
+
+        Args:
+            names: of the objects.
+            field: from a field to the one in its place, of the same density.
+            table: likewise of the table.
+        """
+        assert self._changeable is not None, "can_change tells"
+        fields, ground, device = self._changeable
+        models = ObjectModels({name: field(fields[name]) for name in names}, table(ground), device=device)
+        models._resting = {name: self.resting(name) for name in names}
+        return models
 
     def check(self, names: tuple[str, ...]) -> None:
         """Refuse objects without a field.

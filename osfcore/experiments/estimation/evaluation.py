@@ -21,6 +21,7 @@ from osfcore.experiments.estimation.scores import FrameScore, TrackScore
 from osfcore.experiments.estimation.spoiled_inputs import BadScore
 from osfcore.experiments.fields.evaluation import MAX_TASKS
 from osfcore.experiments.pieces import Piece, results_of
+from osfcore.experiments.rearrangement.factors import factor_named
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import image_side
@@ -30,6 +31,7 @@ from osfcore.io.json_codec import decode
 from osfcore.objects.asset_library import AssetLibrary
 
 REPORT_FILE = "report.json"
+_FACTOR = "factor_"  # and its name: a part
 _Results = dict[str, list[TaskResult]]
 
 
@@ -62,7 +64,7 @@ def evaluate_estimate(
         executor: does tasks side by side, if given; then their times are those of a busy machine.
 
     Raises:
-        UnknownName, MissingAssets: if an object lacks a field or a mesh.
+        UnknownName, MissingAssets: if an object lacks a field or a mesh, or no factor is called so.
         InvalidInput: if a number is out of range.
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
@@ -99,6 +101,8 @@ def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[
         jobs["fixed_light"] = "Light held overhead", tasks, runner.fixed_light
         for views in VIEWS:
             jobs[f"views_{views}"] = f"{views} of 4 views", tasks, _few_views(runner, views)
+    for factor in config.factors:
+        jobs[f"{_FACTOR}{factor}"] = f"Factor {factor}", tasks, _varied(runner, factor)
     if config.bad:
         jobs["bad"] = "Bad cases", config.bad, runner.bad
     return jobs
@@ -106,6 +110,10 @@ def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[
 
 def _few_views(runner: TaskRunner, views: int) -> Callable[[int], Piece]:
     return lambda number: runner.few_views(number, views)
+
+
+def _varied(runner: TaskRunner, factor: str) -> Callable[[int], Piece]:
+    return lambda number: runner.varied(number, factor)
 
 
 def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
@@ -119,6 +127,8 @@ def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrar
     for part in config.parts:
         if part not in PARTS:
             raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
+    for factor in config.factors:
+        factor_named(factor)  # raises UnknownName
     image_side(config.size)
     known = tuple(name for name in fields.names() if assets.has(name))
     if config.names is None and not known:
@@ -153,6 +163,7 @@ def _report(kept: _Results) -> EstimateReport:
         fixed_light=frames("fixed_light") if "fixed_light" in kept else None,
         views={views: frames(f"views_{views}") for views in VIEWS} if "fixed_light" in kept else None,
         bad=None if bad is None else tuple(decode(BadScore, result.figures["score"], "score") for result in bad),
+        factors={key.removeprefix(_FACTOR): frames(key) for key in kept if key.startswith(_FACTOR)},
     )
 
 
@@ -163,7 +174,8 @@ def _goal_scores(result: TaskResult) -> tuple[FrameScore, ...]:
 def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
     """What went wrong, each part in a picture of its own."""
     folder = config.folder
-    for key in ("first", "fixed_light", *(f"views_{views}" for views in VIEWS)):
+    factors = [key for key in kept if key.startswith(_FACTOR)]
+    for key in ("first", "fixed_light", *(f"views_{views}" for views in VIEWS), *factors):
         if key in kept:
             scores = [decode(FrameScore, result.figures["score"], "score") for result in kept[key]]
             failures = [frame_failure(f"task {n}", score, kept[key][n].shown) for n, score in enumerate(scores)]

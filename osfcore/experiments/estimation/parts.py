@@ -18,10 +18,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+import osfcore.control.first_frame
 import osfcore.estimation
 import osfcore.render
+from osfcore.control.first_frame import estimate_first
 from osfcore.errors import OsfError
-from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
+from osfcore.estimation.first_frame import FirstFrameConfig
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
@@ -33,6 +35,7 @@ from osfcore.experiments.estimation.tasks import STEPS, Frame, episode, first_fr
 from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
 from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
 from osfcore.experiments.pieces import Piece
+from osfcore.experiments.rearrangement.factors import Factor, factor_named
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
@@ -73,6 +76,7 @@ class EvaluateEstimate:
         effort: of first frames.
         track: of later frames.
         goal: of goals.
+        factors: names of factors of variation, under each of which first frames are measured too.
     """
 
     out: Path
@@ -87,6 +91,7 @@ class EvaluateEstimate:
     effort: FirstFrameConfig = field(default_factory=FirstFrameConfig)
     track: TrackingConfig = field(default_factory=TrackingConfig)
     goal: GoalImageConfig = field(default_factory=GoalImageConfig)
+    factors: tuple[str, ...] = ()
 
     @property
     def folder(self) -> Path:
@@ -120,6 +125,13 @@ class TaskRunner:
     def first(self, number: int) -> Piece:
         """The first frame of a task; its figures hold the score and the estimated state."""
         return self._first("first", number, self._config.effort, tuple(range(len(self._cameras))))
+
+    def varied(self, number: int, factor: str) -> Piece:
+        """The first frame of a task under a factor of variation."""
+        draw, effort = self._draw(number), self._config.effort
+        given = {**self._circumstances(draw, asdict(effort)), "factor": factor}
+        work = partial(self._seen_first, draw, effort, tuple(range(len(self._cameras))), factor_named(factor))
+        return self._piece(f"factor_{factor}", number, given, work)
 
     def fixed_light(self, number: int) -> Piece:
         """The first frame with the light held overhead."""
@@ -163,8 +175,10 @@ class TaskRunner:
 
     # How they are measured
 
-    def _seen_first(self, draw: Draw, effort: FirstFrameConfig, views: tuple[int, ...]) -> TaskResult:
-        frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views))
+    def _seen_first(
+        self, draw: Draw, effort: FirstFrameConfig, views: tuple[int, ...], factor: Factor | None = None
+    ) -> TaskResult:
+        frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views), factor)
         rng = stream_rng(draw.seed, Stream.FIRST_FRAME)
         score, estimate = self._timed(estimate_first(self._models, frame.observation, rng, effort), frame)
         figures = {"score": encode(score), "state": None if estimate is None else estimated_to_json(estimate)}
@@ -177,12 +191,8 @@ class TaskRunner:
                 draw.names, (False,) * len(draw.names), (), (), (), (), (), pushes.moved_m, first.refused
             )
             return TaskResult({"score": encode(score)}, self._compared(pushes.frames[-1].observation, None))
-        models, assets, expected, rng = (
-            self._models,
-            self._meshes(draw.names),
-            start,
-            stream_rng(draw.seed, Stream.TRACKING),
-        )
+        models, assets, expected = self._models, self._meshes(draw.names), start
+        rng = stream_rng(draw.seed, Stream.TRACKING)
         rows: dict[str, Any] = {key: [] for key in ("position_mm", "rotation_deg", "doubted", "seconds")}
         states = []
         for frame in pushes.frames:
@@ -291,7 +301,7 @@ class TaskRunner:
 
     @cached_property
     def _code(self) -> str:
-        return code_sha256(osfcore.estimation, osfcore.render)
+        return code_sha256(osfcore.estimation, osfcore.control.first_frame, osfcore.render)
 
     @cached_property
     def _table(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from osfcore.experiments.estimation.spoiled_inputs import BadScore, summary
 DRIFT_STEPS = (5, 10, 15, 20)
 _OF = ("median", "mean", "p90", "p95")
 _MOVED_M = 0.01
+_LIGHT_DEG = 10.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,6 +39,7 @@ class EstimateReport:
         fixed_light: first frames with the light held overhead.
         views: first frames from fewer cameras, by their number.
         bad: spoiled inputs.
+        factors: first frames under factors of variation, by name.
     """
 
     first: tuple[FrameScore, ...]
@@ -46,6 +48,7 @@ class EstimateReport:
     fixed_light: tuple[FrameScore, ...] | None = None
     views: Mapping[int, tuple[FrameScore, ...]] | None = None
     bad: tuple[BadScore, ...] | None = None
+    factors: Mapping[str, tuple[FrameScore, ...]] = field(default_factory=dict)
 
     @property
     def all_goals(self) -> tuple[FrameScore, ...]:
@@ -76,6 +79,7 @@ class EstimateReport:
             "fixed_light": None if self.fixed_light is None else _brief(self.fixed_light),
             "by_views": None if self.views is None else {str(n): _brief(f) for n, f in self.by_views().items()},
             **(summary(self.bad) if self.bad is not None else {}),
+            **({"by_factor": {name: _varied(frames) for name, frames in self.factors.items()}} if self.factors else {}),
         }
 
 
@@ -225,3 +229,17 @@ def _brief(frames: Sequence[FrameScore]) -> dict[str, Any]:
         "first_s_median", "first_refused",
     )  # fmt: skip
     return {key: row[key] for key in keys}
+
+
+def _varied(frames: Sequence[FrameScore]) -> dict[str, Any]:
+    """As `_brief`, with the share of lights that are right, and objects that are wrong without a warning."""
+    lights = [frame.light_deg for frame in frames]
+    objects = objects_of(frames)
+    return {
+        **_brief(frames),
+        "objects_total": sum(len(frame.names) for frame in frames),
+        "light_frac_10deg": sum(deg is not None and deg < _LIGHT_DEG for deg in lights) / max(len(lights), 1),
+        "light_deg_max": max((deg for deg in lights if deg is not None), default=None),
+        "wrong_unflagged": sum(not o.is_right and not o.flagged for o in objects),
+        "right_flagged": sum(o.is_right and o.flagged for o in objects),
+    }

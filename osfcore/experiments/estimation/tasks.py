@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects
 from osfcore.experiments.fields.composite_scenes import HARSH_ELEVATION_DEG, Draw
+from osfcore.experiments.rearrangement.factors import Factor
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
@@ -24,6 +25,7 @@ from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.collection.policies import DirectedPolicy
+from osfcore.world.conditions import Conditions
 from osfcore.world.goal_layouts import SHIFT_M
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
@@ -81,20 +83,26 @@ class Goal:
     moved: tuple[str, ...]
 
 
-def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) -> Frame:
+def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], factor: Factor | None = None) -> Frame:
     """The scene at rest, with masks and with the pusher in a free place.
 
     Args:
         draw: the scene.
         library: meshes of its objects.
-        cameras: of one image size.
+        cameras: of one image size, as they are calibrated.
+        factor: how the scene and its pictures differ from the usual; the truth stays the truth.
 
     Raises:
         UnknownName, MissingAssets: if an object has no mesh here.
         NoRoom: if the objects do not fit side by side.
     """
-    with opened(draw, library) as world:
-        return take_frame(world, cameras, masks=True)
+    factor, rng = factor or Factor(), stream_rng(draw.seed, Stream.FACTOR_FRAME)
+    lit = replace(draw, light=factor.light(draw.light, rng))
+    errors = factor.camera_errors(rng, len(cameras))
+    standing = tuple(error.applied(camera) for error, camera in zip(errors, cameras, strict=True))
+    with opened(lit, library, factor.drawn_conditions(rng)) as world:
+        frame = take_frame(world, standing, masks=True)
+    return replace(frame, observation=factor.received(frame.observation, cameras, rng))
 
 
 def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, steps: int = STEPS) -> Episode:
@@ -155,9 +163,9 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
 
 
 @contextmanager
-def opened(draw: Draw, library: AssetLibrary) -> Iterator[Tabletop]:
-    """The draw's scene as a world, for as long as it is needed."""
-    world = Tabletop(library, request=SceneRequest(names=draw.names, light=draw.light))
+def opened(draw: Draw, library: AssetLibrary, conditions: Conditions | None = None) -> Iterator[Tabletop]:
+    """The draw's scene as a world, for as long as it is needed, under the usual conditions or others."""
+    world = Tabletop(library, request=SceneRequest(names=draw.names, light=draw.light), conditions=conditions)
     try:
         for attempt in range(_LAYOUTS):
             try:

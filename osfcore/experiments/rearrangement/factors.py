@@ -2,7 +2,8 @@
 
 The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 10
 deg and more above the table; a table of one known colour; exact calibration; linear images without noise; exact masks;
-friction as the dynamics were trained on; objects that they were trained on.
+friction as the dynamics were trained on; objects that they were trained on. `mild_together` are many factors at once,
+each of them small.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Factor:
         has_wooden_table: the table is of wood, another one for each world.
         camera_turn_rad: by which every camera is turned, each about an axis of its own [rad].
         camera_shift_m: by which every camera is moved, each in a direction of its own [m].
-        image: what becomes of every image.
+        exposure: factor on every image, which saturates at 1.
+        image: what becomes of every image then.
         mask_radius_px: by which masks reach too far [px], or not far enough where it is negative.
         has_unseen_objects: the dynamics are those that were trained without mustard bottle and tuna can, whose shapes
             are then all that is known of them. Fields are of single objects in any case.
@@ -53,6 +55,7 @@ class Factor:
     has_wooden_table: bool = False
     camera_turn_rad: float = 0.0
     camera_shift_m: float = 0.0
+    exposure: float = 1.0
     image: ImageChange = "none"
     mask_radius_px: int = 0
     has_unseen_objects: bool = False
@@ -64,6 +67,29 @@ class Factor:
             return light
         x, y, _ = light.direction
         return Light.from_angles(float(np.arctan2(y, x)), float(np.deg2rad(rng.uniform(*self.light_elevation_deg))))
+
+    def camera_errors(self, rng: np.random.Generator, count: int) -> list[CameraError]:
+        """How cameras stand otherwise than they are calibrated, each in its own way."""
+        return [CameraError.random(rng, self.camera_turn_rad, self.camera_shift_m) for _ in range(count)]
+
+    def drawn_conditions(self, rng: np.random.Generator) -> Conditions:
+        """Lamp, table and contacts; the wood is drawn anew."""
+        if not self.has_wooden_table:
+            return self.conditions
+        return replace(self.conditions, table=TableSurface(texture=wooden_texture(rng)))
+
+    def received(self, taken: Observation, cameras: tuple[Camera, ...], rng: np.random.Generator) -> Observation:
+        """What a program gets of pictures.
+
+        Args:
+            taken: by cameras as they stand.
+            cameras: as they are calibrated.
+            rng: draws the noise.
+        """
+        exposed = taken.images * np.float32(self.exposure) if self.exposure != 1 else taken.images
+        images = np.stack([received(image, self.image, rng) for image in exposed])
+        masks = None if taken.masks is None else resized_masks(taken.masks, self.mask_radius_px)
+        return replace(taken, cameras=cameras, images=images, masks=masks)
 
     def task(self, task: RearrangementTask, rng: np.random.Generator) -> RearrangementTask:
         """A task under such lights; where start and goal share one, they still do."""
@@ -105,8 +131,28 @@ FACTORS: Mapping[str, Factor] = MappingProxyType(
         "mass_0.5": Factor(Conditions(mass_factor=0.5)),
         "mass_2": Factor(Conditions(mass_factor=2.0)),
         "objects_unseen": Factor(has_unseen_objects=True),
+        "exposure_0.7": Factor(exposure=0.7),
+        "exposure_1.4": Factor(exposure=1.4),
+        "ambient_0.6": _lamp(ambient=0.6),
+        "table_dark": Factor(Conditions(table=TableSurface((0.20, 0.19, 0.17)))),
+        "mild_together": Factor(
+            Conditions(lamp=Lamp(ambient=0.35, diffuse=0.65), table=TableSurface((0.50, 0.52, 0.53))),
+            camera_turn_rad=float(np.deg2rad(0.15)),
+            camera_shift_m=0.0015,
+            exposure=0.85,
+            image="srgb_noise_jpeg",
+            mask_radius_px=1,
+        ),
     }
 )
+_FIRST_FRAME_ONLY = ("exposure_0.7", "exposure_1.4", "ambient_0.6", "table_dark", "mild_together")
+EPISODE_FACTORS = tuple(
+    name for name in FACTORS if name not in _FIRST_FRAME_ONLY
+)  # in which whole episodes are measured
+FIRST_FRAME_FACTORS = (
+    "exposure_0.7", "exposure_1.4", "ambient_0.1", "ambient_0.6", "srgb_8bit", "table_dark", "table_wood",
+    "table_colour", "noise_2", "jpeg_80", "camera_shifted", "masks_dilated_2", "masks_eroded_2", "mild_together",
+)  # fmt: skip
 
 
 def factor_named(name: str) -> Factor:
@@ -149,11 +195,9 @@ class VariedWorld:
     ) -> None:
         self.cameras = default_cameras() if cameras is None else cameras
         self._factor, self._rng = factor, rng
-        errors = [CameraError.random(rng, factor.camera_turn_rad, factor.camera_shift_m) for _ in self.cameras]
-        self._goal_error = CameraError.random(rng, factor.camera_turn_rad, factor.camera_shift_m)
-        conditions = factor.conditions
-        if factor.has_wooden_table:
-            conditions = replace(conditions, table=TableSurface(texture=wooden_texture(rng)))
+        errors = factor.camera_errors(rng, len(self.cameras))
+        (self._goal_error,) = factor.camera_errors(rng, 1)
+        conditions = factor.drawn_conditions(rng)
         standing = tuple(error.applied(camera) for error, camera in zip(errors, self.cameras, strict=True))
         self._world = Tabletop(library, cameras=standing, request=request, executor=executor, conditions=conditions)
 
@@ -216,6 +260,4 @@ class VariedWorld:
         return self._world.render(cameras, masks=masks, with_pusher=with_pusher)
 
     def _received(self, taken: Observation, cameras: tuple[Camera, ...]) -> Observation:
-        images = np.stack([received(image, self._factor.image, self._rng) for image in taken.images])
-        masks = None if taken.masks is None else resized_masks(taken.masks, self._factor.mask_radius_px)
-        return replace(taken, cameras=cameras, images=images, masks=masks)
+        return self._factor.received(taken, cameras, self._rng)

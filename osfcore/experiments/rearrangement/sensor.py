@@ -14,7 +14,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.camera_response import linear_of_srgb, srgb_of_linear
 
-ImageChange = Literal["none", "noise", "jpeg", "srgb_8bit", "srgb_8bit_decoded"]
+ImageChange = Literal["none", "noise", "jpeg", "srgb_8bit", "srgb_8bit_decoded", "srgb_noise_jpeg"]
 NOISE_SIGMA = 0.02  # of each channel of each pixel
 JPEG_QUALITY = 80
 
@@ -27,7 +27,8 @@ def received(
     Args:
         image: linear radiance.
         change: "noise" adds Gaussian noise; "jpeg" stores linear values in a JPEG file; "srgb_8bit" hands over sRGB
-            values of 8 bit where linear ones are expected; "srgb_8bit_decoded" makes them linear again.
+            values of 8 bit where linear ones are expected; "srgb_8bit_decoded" makes them linear again;
+            "srgb_noise_jpeg" hands over sRGB values with half of the noise, from a JPEG file.
         rng: draws the noise.
 
     Returns:
@@ -44,6 +45,9 @@ def received(
             return to_uint8(srgb_of_linear(image)).astype(np.float32) / 255
         case "srgb_8bit_decoded":
             return linear_of_srgb(to_uint8(srgb_of_linear(image)).astype(np.float32) / 255)
+        case "srgb_noise_jpeg":
+            noisy = image + np.float32(NOISE_SIGMA / 2) * rng.standard_normal(image.shape, np.float32)
+            return _through_jpeg(to_uint8(srgb_of_linear(np.clip(noisy, 0, 1)))).astype(np.float32) / 255
         case "none":
             return image
 

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
-from osfcore.experiments.rearrangement.factors import FACTORS
+from osfcore.experiments.rearrangement.factors import EPISODE_FACTORS
 from osfcore.experiments.rearrangement.methods import TRUTHS, Variant
 from osfcore.experiments.rearrangement.tasks import Family
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
@@ -67,7 +67,7 @@ class Scale:
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
     foresight: ForesightSettings = field(default_factory=ForesightSettings)
-    factors: tuple[str, ...] = tuple(FACTORS)
+    factors: tuple[str, ...] = EPISODE_FACTORS
     families: tuple[Family, ...] = ("turned", "crowded", "relit")
     scenes: int = 20
     videos: int = 20

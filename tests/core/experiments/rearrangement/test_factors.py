@@ -6,7 +6,14 @@ import pytest
 
 from osfcore.control.world_protocol import World
 from osfcore.errors import UnknownName
-from osfcore.experiments.rearrangement.factors import FACTORS, Factor, VariedWorld, factor_named
+from osfcore.experiments.rearrangement.factors import (
+    EPISODE_FACTORS,
+    FACTORS,
+    FIRST_FRAME_FACTORS,
+    Factor,
+    VariedWorld,
+    factor_named,
+)
 from osfcore.experiments.rearrangement.sensor import received
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.light import Light
@@ -44,7 +51,10 @@ def test_factors_are_those_that_were_asked_for():
     sensor = ("camera_shifted", "noise_2", "jpeg_80", "srgb_8bit", "srgb_8bit_decoded")
     masks = ("masks_eroded_2", "masks_dilated_2")
     contacts = ("friction_0.5", "friction_2", "mass_0.5", "mass_2")
-    assert tuple(FACTORS) == (*light, *table, *sensor, *masks, *contacts, "objects_unseen")
+    first = ("exposure_0.7", "exposure_1.4", "ambient_0.6", "table_dark", "mild_together")
+    assert (*light, *table, *sensor, *masks, *contacts, "objects_unseen") == EPISODE_FACTORS
+    assert tuple(FACTORS) == (*EPISODE_FACTORS, *first)
+    assert set(FIRST_FRAME_FACTORS) < set(FACTORS)
     assert factor_named("jpeg_80") is FACTORS["jpeg_80"]
     with pytest.raises(UnknownName, match="jpeg_80"):
         factor_named("jpeg_50")

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
-from osfcore.experiments.rearrangement.factors import FACTORS
+from osfcore.experiments.rearrangement.factors import EPISODE_FACTORS
 from osfcore.experiments.rearrangement.methods import Variant, check_variant
 from osfcore.experiments.reproduction.sections import QUICK, SECTIONS, Scale, sections_of
 
@@ -39,7 +39,7 @@ def test_a_full_report_has_what_was_asked_for():
     assert all(cell.config.actions == cell.config.settings.steps == 30 for s in methods for cell in s.cells)
     assert [cell.config.oracle for cell in methods[1].cells] == [True, False, False, False, False, False]
     (factors,) = named("factors", Scale())
-    assert {cell.config.factor for cell in factors.cells} == {"", *FACTORS}
+    assert {cell.config.factor for cell in factors.cells} == {"", *EPISODE_FACTORS}
     (families,) = named("families", Scale())
     assert [cell.config.family for cell in families.cells] == ["shifted", "turned", "crowded", "relit"]
 

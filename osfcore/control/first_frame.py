@@ -1,0 +1,166 @@
+"""The first frame, whatever its pictures are like: exposure, response, ambient light and the table's colour are found.
+
+Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where no shadow
+tells, it is asked first, and its answer taken if the image model at its poses is the usual one. Otherwise an image
+model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
+linear pictures and once for sRGB ones; what leaves less unexplained is taken. Pictures and fields are made to agree,
+and the usual estimator finds poses and lamp. With these the image model is fitted once more, and Gauss-Newton does the
+last millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+
+from osfcore.estimation.first_frame import FirstFrameConfig, check_masks, visible_part
+from osfcore.estimation.first_frame import estimate_first as estimate_usual
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
+from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.photometry.calibration import Calibration, Calibrator
+from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.table_check import check_table
+from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
+from osfcore.estimation.search.pose_initialization import OVERHEAD, initial_poses
+from osfcore.estimation.step_reporter import StepReporter
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit
+from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import Observation
+from osfcore.photo.camera_response import Encoding, linear_from_encoded
+from osfcore.progress import Progress
+
+_COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
+_TINT = 0.1  # weight of the gains' spread over the colours: lamps are nearly white
+_LEAST_GAIN, _MOST_GAIN = 0.05, 20.0  # beyond, pictures show nothing, or nothing else
+_ROUNDS, _ITERATIONS = 2, 2
+
+
+def estimate_first(
+    models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
+) -> Iterator[EstimateStep]:
+    """Find all poses and the light; the last step holds the estimate.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: one or more views with masks, of any exposure, linear or sRGB.
+        rng: of the searches.
+        config: how much work to do; under a held light pictures are taken for usual ones.
+
+    Raises:
+        InvalidInput: without masks, or if an object's masks are all empty.
+        UnknownName: if an object has no field.
+    """
+    config = config or FirstFrameConfig()
+    models.check(observation.names)
+    check_masks(observation)
+    can_adapt = models.can_change and config.held_light is None and len(observation.names) > 0
+    verdict = check_table(models, views_of(observation, FINE_SIDE)).verdict if can_adapt else "usual"
+    if verdict == "usual":
+        yield from estimate_usual(models, observation, rng, config)
+        return
+    calibrator = Calibrator(models, observation.names)
+    if verdict == "unclear":
+        last = yield from _all_but_last(estimate_usual(models, observation, rng, config))
+        assert last.estimate is not None
+        params = SceneParameters.of(last.estimate.state, observation.pusher)
+        views = views_of(observation, _COARSE_SIDE, samples=2)
+        if calibrator.refine(views, params, 1.0, hold_light=True).model.is_usual:
+            yield last
+            return
+    poses = _rough_poses(models, observation)
+    rough = min((_calibrated(calibrator, observation, poses, e) for e in get_args(Encoding)), key=lambda r: r.loss)
+    if rough.is_sane:
+        yield from _steps(models, calibrator, rough, rng, config)
+    else:
+        yield from estimate_usual(models, observation, rng, config)
+
+
+def _all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None, EstimateStep]:
+    """Steps of an estimate but for the last one, which is returned."""
+    before = next(steps)
+    for step in steps:
+        yield before
+        before = step
+    return before
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Calibrated:
+    """Pictures as a camera response makes them linear, and the image model that explains them."""
+
+    observation: Observation
+    found: Calibration
+
+    @property
+    def loss(self) -> float:
+        return self.found.unexplained + _TINT * float(np.std(np.log(self.found.model.gain)))
+
+    @property
+    def is_sane(self) -> bool:
+        gain = self.found.model.gain
+        return bool(np.all((gain > _LEAST_GAIN) & (gain < _MOST_GAIN)))
+
+
+def _rough_poses(models: ObjectModels, observation: Observation) -> SceneParameters:
+    """Each object in the pose that fits its masks best, at any brightness; hardly the response's matter."""
+    coarse = views_of(observation, _COARSE_SIDE)
+    best = [initial_poses(models, name, visible_part(coarse, n)).best(1) for n, name in enumerate(observation.names)]
+    positions, quaternions = (np.concatenate(a) for a in ([b.positions for b in best], [b.quaternions for b in best]))
+    return SceneParameters(observation.names, positions, quaternions, OVERHEAD, observation.pusher)
+
+
+def _calibrated(
+    calibrator: Calibrator, observation: Observation, params: SceneParameters, encoding: Encoding
+) -> _Calibrated:
+    """The image model of pictures that are encoded so, from rough poses."""
+    images = linear_from_encoded(observation.images, encoding).astype(np.float32)
+    linear = replace(observation, images=images)
+    return _Calibrated(linear, calibrator.search(views_of(linear, _ROUGH_SIDE), views_of(linear, _COARSE_SIDE), params))
+
+
+def _steps(
+    models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, rng: np.random.Generator, config: FirstFrameConfig
+) -> Iterator[EstimateStep]:
+    """The usual estimator on pictures and models that agree, then both once more."""
+    model, linear, more = rough.found.model, rough.observation, _ROUNDS * _ITERATIONS
+    usual = estimate_usual(model.adapted(models, linear.names), model.normalized(linear), rng, config)
+    before = next(usual)
+    for step in usual:
+        progress = before.progress
+        yield replace(before, progress=Progress(progress.done, progress.total + more, progress.note))
+        before = step
+    assert before.estimate is not None
+    reporter = StepReporter(before.progress.total + more)
+    reporter.done = before.progress.total - 1
+    yield from _polished(models, calibrator, model, linear, before.estimate, reporter)
+
+
+def _polished(
+    models: ObjectModels,
+    calibrator: Calibrator,
+    model: ImageModel,
+    linear: Observation,
+    estimate: EstimatedState,
+    reporter: StepReporter,
+) -> Iterator[EstimateStep]:
+    """Image model, poses and lamp in turn."""
+    at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
+    middle, fine = (views_of(linear, side, samples=2) for side in (_COARSE_SIDE, FINE_SIDE))
+    for number, (views, is_light_held) in enumerate(((middle, False), (fine, True)), 1):
+        found = calibrator.refine(views, at.params, model.ambient, hold_light=is_light_held)
+        model = found.model
+        adapted, normal = model.adapted(models, linear.names), model.normalized(linear)
+        sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
+        at = GaussNewtonState.at(replace(at.params, light=found.light))
+        for step in gauss_newton(adapted, sharp, at, iterations=_ITERATIONS, light=soft):
+            at = step
+            yield reporter.refinement("Exposure and table", at)
+        if number == _ROUNDS:
+            fit = evaluate_fit(adapted, sharp, at.params)
+            rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
+            yield reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))

@@ -1,0 +1,79 @@
+"""The image model of pictures whose exposure, ambient light and table are not known: fields and pictures made to fit.
+
+Fields are of ambient 0.25 and diffuse 0.75 on a table of one known colour. Pictures obey, for each colour c,
+
+    I_c = G_c * albedo_c * (r * ambient + direct(l)) * (T_c on the table),          ideal: G = r = T = 1
+
+where G is exposure and white balance, r the ambient light relative to the direct one, T the table's albedo relative to
+the known one. Pictures are divided by G, r and T go into the fields; both are then scaled such that a white surface
+which faces the lamp has radiance 1 again, because errors are judged in radiance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.table_field import TableField
+from osfcore.geometry.light import AMBIENT, DIFFUSE
+from osfcore.geometry.states import Observation
+
+_USUAL = 0.12  # of the logarithm of each factor
+_ALBEDO = slice(1, 4)  # among a field's features
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ImageModel:
+    """How pictures differ from those that fields were made for.
+
+    Attributes:
+        gain: G, exposure and white balance, per colour.
+        ambient: r, factor on the ambient light against the direct one.
+        table: T, factors on the table's albedo, per colour.
+    """
+
+    gain: Float[np.ndarray, "3"]
+    ambient: float
+    table: Float[np.ndarray, "3"]
+
+    @property
+    def scale(self) -> float:
+        """What brings the radiance of a white surface that faces the lamp back to 1."""
+        return 1 / (AMBIENT * self.ambient + DIFFUSE)
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether fields were made for such pictures, within what a fit to right poses may be off."""
+        factors = np.array([*self.gain, self.ambient, *self.table])
+        return bool(np.all(np.abs(np.log(factors)) < _USUAL))
+
+    def normalized(self, observation: Observation) -> Observation:
+        """The observation as it would be at the usual exposure."""
+        images = observation.images * (self.scale / self.gain)
+        return replace(observation, images=images.astype(np.float32))
+
+    def adapted(self, models: ObjectModels, names: Iterable[str]) -> ObjectModels:
+        """Models of some objects that show what `normalized` pictures do."""
+        return models.changed(
+            names,
+            lambda field: scaled_field(field, self.scale, self.ambient),
+            lambda table: scaled_table(table, self.scale * self.table, self.ambient),
+        )
+
+
+def scaled_field(field: KiloOSF, albedo: float, ambient: float) -> KiloOSF:
+    """A field with factors on its albedo and on its ambient light."""
+    rows = field.rows.copy()
+    rows[:, _ALBEDO] *= np.float32(albedo)
+    return replace(field, rows=rows, ambient=field.ambient * np.float32(ambient))
+
+
+def scaled_table(table: TableField, albedo: Float[np.ndarray, "3"], ambient: float) -> TableField:
+    """A table with factors on its albedo, per colour, and on its ambient light."""
+    factors = np.asarray(albedo, np.float32)
+    return replace(table, albedo=table.albedo * factors, ambient=table.ambient * np.float32(ambient))

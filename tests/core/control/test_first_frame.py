@@ -1,0 +1,70 @@
+"""First frames of pictures whose exposure, response, ambient light and table nobody tells."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.control.first_frame import estimate_first
+from osfcore.errors import InvalidInput
+from osfcore.estimation.first_frame import FirstFrameConfig
+from osfcore.estimation.first_frame import estimate_first as estimate_usual
+from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.geometry.cameras import default_cameras
+from osfcore.photo.camera_response import srgb_of_linear
+from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, apart, lying, observe, scene, shipped_models
+
+QUICK = FirstFrameConfig(2, 6, 2, 8, 2, 3, 2)
+OTHER = ImageModel(np.array([0.75, 0.75, 0.75]), 1.8, np.array([0.5, 0.7, 0.9]))
+
+
+@pytest.fixture(scope="module")
+def models():
+    return shipped_models()
+
+
+@pytest.fixture(scope="module")
+def truth(models):
+    return scene({BOX: lying(models, BOX, 30, 0.05, -0.08), BOTTLE: lying(models, BOTTLE, 50, -0.06, 0.09)})
+
+
+def steps_of(estimate, models, seen, config=QUICK):
+    return list(estimate(models, seen, np.random.default_rng(0), config))
+
+
+@pytest.mark.slow
+def test_usual_pictures_are_estimated_as_ever_to_the_last_bit(models, truth):
+    seen = observe(models, truth, default_cameras(48)[2:])
+    ours, usual = (steps_of(estimate, models, seen)[-1].estimate for estimate in (estimate_first, estimate_usual))
+    np.testing.assert_array_equal(ours.state.poses.position, usual.state.poses.position)
+    np.testing.assert_array_equal(ours.state.light.direction, usual.state.light.direction)
+    np.testing.assert_array_equal(ours.position_std, usual.position_std)
+
+
+@pytest.mark.slow
+def test_poses_and_light_of_an_srgb_picture_of_another_table_at_another_exposure(models, truth):
+    shown = observe(OTHER.adapted(models, NAMES), truth, default_cameras(96)[1:])
+    linear = np.clip(shown.images * (OTHER.gain / OTHER.scale), 0, 1)
+    steps = steps_of(estimate_first, models, replace(shown, images=srgb_of_linear(linear)))
+    estimate = steps[-1].estimate
+    shift, turn, light = apart(estimate.state, truth)
+    assert shift.max() < 0.005
+    assert np.rad2deg(turn).max() < 5
+    assert np.rad2deg(light) < 5
+    assert estimate.trusted, estimate.reason
+    assert [step.progress.done for step in steps] == list(range(1, len(steps) + 1))
+    assert {step.progress.total for step in steps} == {len(steps)}
+    assert [step.estimate is None for step in steps] == [True] * (len(steps) - 1) + [False]
+
+
+@pytest.mark.slow
+def test_black_pictures_are_not_trusted(models, truth):
+    seen = observe(models, truth, default_cameras(48)[2:])
+    last = steps_of(estimate_first, models, replace(seen, images=np.zeros_like(seen.images)))[-1]
+    assert not last.estimate.trusted
+
+
+def test_masks_are_needed(models, truth):
+    seen = observe(models, truth, default_cameras(48)[:1], masks=False)
+    with pytest.raises(InvalidInput, match="masks of the first frame"):
+        next(estimate_first(models, seen, np.random.default_rng(0)))

@@ -1,0 +1,91 @@
+"""Pictures whose making is known: rendered by models that were changed by an image model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from osfcore.estimation.objective.observed_views import views_of
+from osfcore.estimation.photometry.calibration import Calibrator
+from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.table_check import check_table
+from osfcore.geometry.cameras import default_cameras
+from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, lying, observe, params_of, scene
+
+CAMERAS = default_cameras(64)[2:]  # on the other side than the lamp: they see shadows
+MODEL = ImageModel(np.array([0.7, 0.75, 0.8]), 2.0, np.array([0.5, 0.7, 0.9]))
+
+
+@pytest.fixture(scope="module")
+def truth(models):
+    """Under a low lamp, so that shadows are long."""
+    poses = {BOX: lying(models, BOX, 30, 0.05, -0.08), BOTTLE: lying(models, BOTTLE, 50, -0.06, 0.09)}
+    return scene(poses, (0.6, 0.5, 0.45))
+
+
+def taken(models, state, model):
+    """What cameras see under an image model: `normalized` undone on what `adapted` models show."""
+    shown = observe(model.adapted(models, NAMES), state, CAMERAS)
+    return replace(shown, images=shown.images * (model.gain / model.scale))
+
+
+@pytest.fixture(scope="module")
+def pictures(models, truth):
+    return taken(models, truth, MODEL)
+
+
+def test_image_model_and_lamp_are_found_from_the_poses(models, truth, pictures):
+    elsewhere = params_of(scene({name: truth.pose(name) for name in NAMES}, (-0.7, 0.1, 0.7)))
+    found = Calibrator(models, NAMES).search(views_of(pictures, 32), views_of(pictures, 64), elsewhere)
+    assert np.rad2deg(np.arccos(found.light @ truth.light.direction)) < 5
+    np.testing.assert_allclose(found.model.gain, MODEL.gain, rtol=0.2)
+    np.testing.assert_allclose(found.model.table, MODEL.table, rtol=0.1)
+    assert found.model.ambient == pytest.approx(MODEL.ambient, rel=0.2)
+
+
+def test_refining_with_the_light_held_leaves_it_and_comes_nearer(models, truth, pictures):
+    found = Calibrator(models, NAMES).refine(views_of(pictures, 64, samples=2), params_of(truth), 1.7, hold_light=True)
+    np.testing.assert_array_equal(found.light, truth.light.direction)
+    assert found.model.ambient == pytest.approx(MODEL.ambient, rel=0.06)
+    np.testing.assert_allclose(found.model.gain, MODEL.gain, rtol=0.06)
+    assert found.unexplained < 0.1
+
+
+def test_a_wrong_pose_leaves_more_unexplained(models, truth, pictures):
+    calibrator, views = Calibrator(models, NAMES), views_of(pictures, 64)
+    right = params_of(truth)
+    wrong = replace(right, positions=right.positions + [0.05, 0.0, 0.0])
+    first, second = (calibrator.refine(views, p, MODEL.ambient, hold_light=True) for p in (right, wrong))
+    assert second.unexplained > 1.5 * first.unexplained
+
+
+@pytest.mark.parametrize(
+    ("gain", "ambient", "table", "is_usual"),
+    [
+        (1.0, 1.0, (1.0, 1.0, 1.0), True),
+        (0.7, 1.0, (1.0, 1.0, 1.0), False),
+        (1.4, 1.0, (1.0, 1.0, 1.0), False),
+        (1.0, 0.4, (1.0, 1.0, 1.0), False),
+        (1.0, 3.0, (1.0, 1.0, 1.0), False),
+        (1.0, 1.0, (0.5, 0.7, 1.0), False),
+        (1.0, 1.0, (0.3, 0.3, 0.3), False),
+    ],
+)
+def test_the_table_tells_whether_pictures_are_usual(models, truth, gain, ambient, table, is_usual):
+    model = ImageModel(np.full(3, gain), ambient, np.array(table))
+    verdict = check_table(models, views_of(taken(models, truth, model), 64)).verdict
+    assert (verdict == "usual") == is_usual
+
+
+def test_without_a_visible_shadow_only_colours_tell(models):
+    empty = observe(models, scene({}), CAMERAS)
+    for factor, verdict in ((1.0, "unclear"), (0.8, "unclear"), (np.array([1.0, 0.8, 0.7]), "other")):
+        shown = replace(empty, images=empty.images * factor)
+        assert check_table(models, views_of(shown, 64)).verdict == verdict
+
+
+def test_noise_does_not_make_a_table_unusual(models, truth):
+    usual = taken(models, truth, ImageModel(np.ones(3), 1.0, np.ones(3)))
+    noise = 0.02 * np.random.default_rng(0).standard_normal(usual.images.shape)
+    noisy = replace(usual, images=np.clip(usual.images + noise, 0, 1))
+    assert check_table(models, views_of(noisy, 64)).verdict == "usual"

@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+
+from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.light import AMBIENT, DIFFUSE
+from osfcore.render.types import SceneBatch
+from tests.core.estimation.scenes import BOTTLE, BOX, observe
+
+USUAL = ImageModel(np.ones(3), 1.0, np.ones(3))
+OTHER = ImageModel(np.array([0.6, 0.7, 0.8]), 2.0, np.array([0.5, 0.8, 1.2]))
+
+
+def rendered(models, state):
+    return models.together.render(SceneBatch.of(state), default_cameras(48)[:1]).rgb[0, 0]
+
+
+def test_the_usual_image_model_changes_nothing(models, truth, seen):
+    np.testing.assert_array_equal(rendered(USUAL.adapted(models, (BOX, BOTTLE)), truth), rendered(models, truth))
+    np.testing.assert_array_equal(USUAL.normalized(seen).images, seen.images.astype(np.float32))
+
+
+def test_a_white_surface_that_faces_the_lamp_keeps_its_radiance():
+    assert OTHER.scale * (AMBIENT * OTHER.ambient + DIFFUSE) == pytest.approx(1)
+
+
+def test_radiance_is_linear_in_the_ambient_light(models, truth):
+    """With ambient light r, the scale apart, a picture is that without ambient light plus r times the ambient part."""
+    plain = [
+        rendered(model.adapted(models, truth.names), truth) / model.scale
+        for model in (ImageModel(np.ones(3), r, np.ones(3)) for r in (0.5, 1.0, 1.5))
+    ]
+    np.testing.assert_allclose(plain[0] + plain[2], 2 * plain[1], atol=1e-5)
+
+
+def test_the_tables_colour_does_not_change_objects(models, truth):
+    names = truth.names
+    other = ImageModel(np.ones(3), 1.0, OTHER.table)
+    shown = observe(models, truth, default_cameras(48)[:1])
+    ours, theirs = rendered(models, truth), rendered(other.adapted(models, names), truth)
+    inside = models.together.render(SceneBatch.of(truth), shown.cameras, outputs={"rgb", "opacity"}).opacity[0, 0]
+    solid, bare = inside.sum(axis=0) > 0.999, inside.sum(axis=0) == 0
+    np.testing.assert_allclose(theirs[solid], ours[solid], atol=2e-3)
+    on_table = bare & (ours[..., 0] > 0.15)
+    np.testing.assert_allclose(theirs[on_table], ours[on_table] * OTHER.table, rtol=1e-4)
