@@ -34,12 +34,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from osfcore.control.closed_loop import Episode
+    from osfcore.control.first_frame import estimate_first
     from osfcore.control.goal import GoalImage
     from osfcore.control.scene_models import SceneModels, load_scene_models
     from osfcore.dynamics.push_models import load_push_model
     from osfcore.dynamics.rollout import PushModel
     from osfcore.errors import OsfError
-    from osfcore.estimation.first_frame import estimate_first
     from osfcore.estimation.goal_image import estimate_goal
     from osfcore.estimation.objective.object_models import ObjectModels
     from osfcore.estimation.tracking import estimate_next
@@ -75,7 +75,7 @@ _HOMES = {
     "SceneState": "geometry.states",
     "Tabletop": "world.tabletop",
     "default_cameras": "geometry.cameras",
-    "estimate_first": "estimation.first_frame",
+    "estimate_first": "control.first_frame",
     "estimate_goal": "estimation.goal_image",
     "estimate_next": "estimation.tracking",
     "goal_camera": "geometry.cameras",
