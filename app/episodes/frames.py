@@ -33,6 +33,7 @@ def frame(
     rendered: Float[np.ndarray, "h w 3"],
     views: Float[np.ndarray, "V h w 3"],
     title: str,
+    photo: Float[np.ndarray, "h w 3"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """One picture of an episode.
 
@@ -42,10 +43,11 @@ def frame(
         rendered: the estimate, rendered as the goal image would show it.
         views: the cameras' images; the first four are shown.
         title: a few words over the whole.
+        photo: shown in the place of the goal image, which differences are from all the same.
     """
     difference = np.clip(_DIFFERENCE * np.abs(rendered - goal), 0, 1)
     top = {
-        "goal": goal,
+        "goal": goal if photo is None else photo,
         f"now: {title}": now,
         "estimate, rendered": rendered,
         f"difference x {_DIFFERENCE:g}": difference,

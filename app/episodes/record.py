@@ -83,7 +83,7 @@ class EpisodeRecord:
         self._folder, self._table, self._about = folder, table, about
         self._views: Float[np.ndarray, "V h w 3"] | None = None
         self._goal: GoalFound | None = None
-        self._image = about.image
+        self._image, self._photo = about.image, None
         self._steps: list[dict[str, Any]] = []
         self._notices: list[dict[str, Any]] = []
         self._began = time.perf_counter()
@@ -113,6 +113,7 @@ class EpisodeRecord:
                 self._views = event.observation.images
             case GoalFound():
                 self._goal = event
+                self._photo = event.photo
                 self._keep_image(GoalImage(event.camera, event.image))
             case ActionExecuted():
                 self._actions.append(event.action.tolist())
@@ -147,7 +148,7 @@ class EpisodeRecord:
 
     def _keep_image(self, goal: GoalImage) -> None:
         self._image = goal
-        write_png(self._folder / GOAL_FILE, to_uint8(goal.image))
+        write_png(self._folder / GOAL_FILE, to_uint8(goal.image if self._photo is None else self._photo))
 
     def _step_entry(self, event: Stepped) -> dict[str, Any]:
         """A step as the report has it; lengths in mm, angles in degrees; None for what is not known."""
@@ -177,7 +178,7 @@ class EpisodeRecord:
         scale = TILE_PX / max(camera.width, camera.height)
         now = self._table.photo(camera.resized(round(scale * camera.width), round(scale * camera.height)))
         title = f"step {event.number} of {event.steps}"
-        picture = frame(self._image.image, now, event.rendered, self._views, title)
+        picture = frame(self._image.image, now, event.rendered, self._views, title, self._photo)
         write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps) - 1:03d}.png", picture)
 
     def _write_csv(self) -> None:

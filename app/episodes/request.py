@@ -12,7 +12,7 @@ from PIL import Image
 
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.goal import GoalImage
-from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -110,7 +110,7 @@ def given(order: EpisodeOrder) -> Given:
         OsfError: if the objects, the image or the numbers are not as they must be.
     """
     assets, fields = AssetLibrary(order.data_dir / "objects"), FieldLibrary(order.data_dir)
-    layout = None if order.found is None else layout_of(read_json(order.found, _found))
+    layout = None if order.found is None else _layout(order, read_json(order.found, _found))
     names = order.names if layout is None else tuple(layout.poses)
     for name in names or ():
         fields.info(name)
@@ -127,10 +127,19 @@ def _found(data: object) -> FoundScene:
     return decode(FoundScene, data, "found objects")
 
 
+def _layout(order: EpisodeOrder, found: FoundScene) -> TableLayout:
+    for what, given in (("goal image", order.goal), ("names of objects", order.names)):
+        if given is not None:
+            allowed = "left out with what was found in a photo, which tells goal and objects"
+            raise InvalidInput(what, str(given), allowed)
+    doubts = [each.doubt for each in found.objects if each.doubt]
+    if doubts and not order.settings.despite_doubts:
+        raise OsfError(f"{' '.join(doubts)} Look at its picture, and say --despite-doubts to go on all the same.")
+    return layout_of(found)
+
+
 def _photographed(order: EpisodeOrder, layout: TableLayout, world: Tabletop) -> Given:
     """The goal is the layout at rest; the table is a random one in which the objects lie on the same sides."""
-    if order.goal is not None:
-        raise InvalidInput("goal image", str(order.goal), "left out with what was found in a photo, which is the goal")
     world.arrange(order.seed)
     world.set_light(order.light or layout.light)
     goal = replace(arranged_goal(world, layout.poses, is_measured=True), pusher=None)

@@ -25,7 +25,7 @@ from osfcore.io.files import folder_at_once, read_json
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.output_paths import check_place
 
-FOLDERS = ("objects", "fields", "goals", "sets", "collections", "training", "dynamics", "paper_fields")
+FOLDERS = ("objects", "fields", "goals", "photos", "sets", "collections", "training", "dynamics", "paper_fields")
 MANIFEST = "manifest.json"
 _PROGRAM = "osf-manipulation"
 _MOST_PARTS, _MOST_NAME_BYTES = 16, 200  # of a path, as unpacking takes it

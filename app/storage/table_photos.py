@@ -7,6 +7,7 @@ import json
 import shutil
 import threading
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -106,17 +107,17 @@ class TablePhoto:
             kept = (*self.objects, changed)
         return replace(self, objects=kept)
 
-    def camera(self, T_world_photo: Pose, longest: int) -> Camera:
+    def camera(self, T_world_camera: Pose, longest: int) -> Camera:
         """The camera that took the photo, in another frame and for a smaller picture.
 
         Args:
-            T_world_photo: that maps camera coordinates to the other frame.
+            T_world_camera: that maps camera coordinates to the other frame.
             longest: side of the picture [px].
         """
         scale = min(1.0, longest / max(self.width, self.height))
         width, height = max(round(scale * self.width), 1), max(round(scale * self.height), 1)
         per_axis = np.array([[width / self.width], [height / self.height], [1.0]])
-        return Camera("photo", T_world_photo, self.K * per_axis, width, height)
+        return Camera("photo", T_world_camera, self.K * per_axis, width, height)
 
 
 class _PoseJson(Entry):
@@ -239,16 +240,18 @@ class TablePhotoStore:
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def replace(self, record: TablePhoto, files: dict[Path, bytes | None] | None = None) -> TablePhoto:
-        """Give a photograph other facts, and write files of it before, or remove those that are None.
+    def change(
+        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: dict[Path, bytes | None] | None = None
+    ) -> TablePhoto:
+        """Give a photograph other facts, made of the latest ones, and write files of it before; None removes one.
 
         Raises:
-            UnknownName: if there is none.
+            UnknownName: if there is none, or as `changed`.
             CannotStore: if the disk is full.
         """
         try:
             with self._lock:
-                self.get(record.id)
+                record = changed(self.get(photo))
                 for path, data in (files or {}).items():
                     if data is None:
                         path.unlink(missing_ok=True)
@@ -266,6 +269,10 @@ class TablePhotoStore:
             UnknownName: if there is none.
             CannotStore: if that is not allowed.
         """
+        with self._lock:
+            self._remove(photo)
+
+    def _remove(self, photo: str) -> None:
         self.get(photo)
         trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
         try:

@@ -237,7 +237,7 @@ class Episode:
     # The goal
 
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
-        target, state, estimate, doubts = self._target, self._estimate.state, None, ""
+        target, state, estimate, doubts, photo = self._target, self._estimate.state, None, "", None
         if isinstance(target, GoalImage):
             seen = target.observed(state.names)
             steps = estimate_goal(self._models.appearance, seen, state, self._how.goal)
@@ -245,14 +245,13 @@ class Episode:
             estimate = prefer_current_poses(self._models.appearance, target, estimate, state)
             goal, doubts = PoseGoal(estimate.state.names, estimate.state.poses), estimate.reason
             light, camera, image = estimate.state.light, target.camera, target.image
-        elif isinstance(target, PhotoGoal):
-            goal, light, camera, image = target, state.light, target.photo.camera, target.photo.image
         else:
-            goal, light, camera = target, state.light, goal_camera()
+            goal, light, photo = target, state.light, target.photo if isinstance(target, PhotoGoal) else None
+            camera = goal_camera() if photo is None else photo.camera
             image = self._rendered(replace(state, poses=target.poses_of(state.names)), camera, light)
         self._goal = snap_near_goals(goal, state, self._models.symmetries)
         self._light, self._camera, self._image = light, camera, image
-        yield GoalFound(self._goal, image, camera, estimate)
+        yield GoalFound(self._goal, image, camera, estimate, None if photo is None else photo.image)
         if doubts:
             yield self._noticed("goal", f"The goal image is not explained well: {doubts}.")
             if not self.settings.despite_doubts:

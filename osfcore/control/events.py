@@ -62,12 +62,14 @@ class GoalFound:
         image: how that looks, through the camera: the goal image, or the poses rendered.
         camera: of the image.
         estimate: what the goal image was taken for; None where poses were given.
+        photo: a photograph of the poses through the camera, to look at; None where there is none.
     """
 
     goal: PoseGoal
     image: Float[np.ndarray, "h w 3"]
     camera: Camera
     estimate: EstimatedState | None
+    photo: Float[np.ndarray, "h w 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

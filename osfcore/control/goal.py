@@ -56,7 +56,7 @@ class GoalImage:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoGoal(PoseGoal):
-    """Poses that were found in a photograph, and that photograph, to compare with in pictures."""
+    """Poses that were found in a photograph, and that photograph, as it is encoded, to look at beside the table."""
 
     photo: GoalImage
 

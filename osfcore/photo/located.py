@@ -58,7 +58,10 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
     """
     height, width = raw.encoded.shape[:2]
     scale = max(height, width) / max(raw.sent_size)
-    given = None if focal_px is None else intrinsics_from_focal(width, height, scale * focal_px)
+    given = None
+    if focal_px is not None:
+        intrinsics_from_focal(*raw.sent_size, focal_px)  # refuses it in the user's own pixels
+        given = intrinsics_from_focal(width, height, scale * focal_px)
     notes = list(raw.notes)
     if focal_px is not None and raw.focal_px is not None:
         written = raw.focal_px / scale

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import NoRoom, OverlappingObjects
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, WORKSPACE_HALF_M
 from osfcore.objects.asset import ObjectAsset
 from osfcore.world.physics import Physics, lowest_point
@@ -121,6 +123,12 @@ def _separate(physics: Physics, first: str, second: str, depth_m: float, normal:
         _shift(physics, first if normal[2] > 0 else second, np.array([0.0, 0.0, depth_m]))
     else:
         _shift(physics, first, depth_m * normal)
+
+
+def above_table(state: SceneState) -> SceneState:
+    """The state with no object's centre below the table."""
+    positions = np.maximum(state.poses.position, [-np.inf, -np.inf, 0.0])
+    return replace(state, poses=Pose(positions, state.poses.quaternion))
 
 
 def _shift(physics: Physics, name: str, by: Float[np.ndarray, "3"]) -> None:

@@ -27,7 +27,7 @@ from osfcore.world.imaging.ray_tracer import Picture, RayTracer, masks_of
 from osfcore.world.imaging.tiny_renderer import TinyScene
 from osfcore.world.imaging.traced_mesh import TracedMesh
 from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, body_model
-from osfcore.world.placing import is_calm, move_apart, place_randomly, refuse_overlaps
+from osfcore.world.placing import above_table, is_calm, move_apart, place_randomly, refuse_overlaps
 from osfcore.world.scene_request import SceneRequest, check_object, check_place, check_request
 
 Renderer = Literal["embree", "tiny"]
@@ -193,6 +193,7 @@ class Tabletop:
         Raises:
             UnknownName, MissingAssets, InvalidInput: as `load`.
         """
+        state = above_table(state)
         for name in state.names:
             check_place(name, state.pose(name).position)
         self.restore(state)

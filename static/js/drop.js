@@ -1,6 +1,7 @@
 // A goal image or a mesh may be dropped anywhere on the page: over the 3D view, too, whose frame would swallow it.
 import { byId } from "./dom.js";
 import { uploadGoal } from "./goals.js";
+import { sendPhoto } from "./photo.js";
 import { isMesh, takeMesh } from "./own-object.js";
 import { showTab } from "./tabs.js";
 
@@ -30,6 +31,10 @@ function drop(event) {
   if (!file) return;
   if (isMesh(file)) {
     takeMesh(file);
+    return;
+  }
+  if (!byId("panel-photo").hidden) {
+    sendPhoto(file);
     return;
   }
   showTab("episode");

@@ -33,7 +33,7 @@ const FIELDS = {
     number("seed", "Seed", 0, 0, 2147483647),
   ],
 };
-const LATEST = { train_field: "training", estimate: "estimate", episode: "episode", fetch_assets: "objectWork", add_object: "objectWork", clip: "clip", photo: "photoJob" }; // what the page knows of a kind
+const LATEST = { train_field: "training", estimate: "estimate", episode: "episode", fetch_assets: "objectWork", add_object: "objectWork", clip: "clip" }; // what the page knows of a kind
 const jobs = new Map();
 const nodes = new Map();
 let older = null; // where the jobs that are not shown yet begin
@@ -183,12 +183,14 @@ function latest(kind) {
   return all.find((job) => job.state === "running" || job.state === "paused") ?? all.reduce(newest, undefined);
 }
 
-function tell({ kind }) {
+function tell(job) {
+  const { kind } = job;
   byId("no-jobs").hidden = jobs.size > 0;
   const live = [...jobs.values()].filter((other) => LIVE.has(other.state)).length;
   byId("jobs-count").textContent = live;
   byId("jobs-count").hidden = live === 0;
   if (LATEST[kind]) set(LATEST[kind], latest(kind));
+  if (kind === "photo") set("photoJob", job); // each photo follows its own
 }
 
 export function showJob(job, { isOlder = false } = {}) {

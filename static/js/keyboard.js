@@ -47,7 +47,7 @@ const isPlain = (event) => !(event.ctrlKey || event.metaKey || event.altKey || i
 
 function down(event) {
   if (event.defaultPrevented || !isPlain(event) || isTyping(event.target) || (event.key === " " && isPressed(event.target))) return;
-  if (isLiveShown() && pushKey(event.key, true)) event.preventDefault();
+  if (isLiveShown() && byId("photo-stage").hidden && pushKey(event.key, true)) event.preventDefault();
   else take(event);
 }
 

@@ -14,7 +14,8 @@ let drag = null; // {points, from: where it began on the page}
 
 const stage = () => byId("photo-stage");
 const polygon = (points) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}Z`;
-const clamp = ([x, y]) => [Math.min(Math.max(x, 0), photo.width), Math.min(Math.max(y, 0), photo.height)];
+const tenth = (value) => Math.round(10 * value) / 10;
+const clamp = ([x, y]) => [tenth(Math.min(Math.max(x, 0), photo.width)), tenth(Math.min(Math.max(y, 0), photo.height))];
 const unit = () => Math.max(photo.width, photo.height) / 1000; // about a pixel of the page
 
 /** Where a pointer is in the photo. */
@@ -56,8 +57,9 @@ export function drawMarks(next, name) {
       byId(id).setAttribute("width", photo.width);
       byId(id).setAttribute("height", photo.height);
     }
-    byId("photo-image").setAttribute("href", `api/photos/${photo.id}/photo.jpg`);
   }
+  const picture = `api/photos/${photo.id}/photo.jpg?${new URLSearchParams({ focal: photo.focal_px })}`; // its lens may be another one
+  if (byId("photo-image").getAttribute("href") !== picture) byId("photo-image").setAttribute("href", picture);
   byId("photo-outlines").replaceChildren(...photo.objects.flatMap(marksOf));
 }
 
@@ -109,18 +111,18 @@ function thinned(points) {
 export function setUpMarks({ onBox, onClick, onStroke }) {
   const canvas = byId("photo-svg");
   canvas.addEventListener("pointerdown", (event) => {
-    if (!photo || event.button || stage().classList.contains("busy")) return;
+    if (!photo || event.button || drag || stage().classList.contains("busy")) return;
     wipeTo(0); // or one would mark what is not there
     canvas.setPointerCapture(event.pointerId);
     drag = { points: [at(event)], from: event };
   });
   canvas.addEventListener("pointermove", (event) => {
-    if (!drag) return;
+    if (event.pointerId !== drag?.from.pointerId) return;
     drag.points.push(at(event));
     draw();
   });
   canvas.addEventListener("pointerup", (event) => {
-    if (!drag) return;
+    if (event.pointerId !== drag?.from.pointerId) return;
     const { points, from } = drag;
     drag = null;
     byId("photo-drawn").replaceChildren();
@@ -137,4 +139,5 @@ export function setUpMarks({ onBox, onClick, onStroke }) {
     byId("photo-drawn").replaceChildren();
   });
   byId("photo-wipe-at").addEventListener("input", wipe);
+  byId("photo-drawing").addEventListener("error", () => setDrawing(""));
 }

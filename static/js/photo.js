@@ -12,11 +12,15 @@ import { showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
 
 const NAME_MAX = 100;
+const MOST_MARKS = 50; // clicks or strokes of one outline
 const CHOSEN = "osf-photo"; // what this page has chosen outlives a reload of it
 let photos = [];
 let photo = null;
 let chosen = ""; // the object that is marked next
 let seen = ""; // the state of the search that was drawn last
+let doubtsOf = ""; // the search whose doubts were taken as they are, or not
+let before = null; // {name, mark}: what an outline was before it was mended last
+let isMarking = false;
 
 const path = (rest = "") => `photos/${encodeURIComponent(photo.id)}${rest}`;
 const objectPath = (name, rest = "") => path(`/objects/${encodeURIComponent(name)}${rest}`);
@@ -101,13 +105,14 @@ function drawTogether() {
 }
 
 function drawResult() {
-  const isDoubtful = photo.objects.some(({ found, choice }) => found?.doubt && choice === null);
   byId("photo-result").hidden = !isFound();
-  byId("photo-doubts").hidden = !isDoubtful;
+  byId("photo-doubts").hidden = !photo.doubts.length;
+  if (doubtsOf !== photo.job?.id) byId("photo-despite").checked = false;
+  doubtsOf = photo.job?.id;
   const { light } = photo;
   byId("photo-light").textContent = !light ? "" : light.diffuse ? "The light is diffuse: nothing speaks for one lamp."
+    : !photo.table ? "There is one lamp; where it stands cannot be told without a table."
     : `Lamp ${((Math.asin(Math.min(Math.max(light.direction[2], -1), 1)) * 180) / Math.PI).toFixed(0)}° above the table, ± ${light.std_deg.toFixed(1)}°${light.distance_m === null ? "" : `, ${light.distance_m.toFixed(2)} m away`}.`;
-  for (const id of ["photo-goal", "photo-table"]) byId(id).disabled = !photo.table;
   const choices = photo.objects.map(({ choice }) => choice ?? 0).join("-");
   setDrawing(isFound() && photo.table ? `api/${path(`/drawing.png?${new URLSearchParams({ job: photo.job.id, choices })}`)}` : "");
 }
@@ -139,12 +144,16 @@ function show(next) {
   drawTogether();
   drawJob(photo.job);
   drawResult();
+  byId("photo-undo").hidden = before?.id !== photo.id || !marked(before.name);
   tell();
 }
 
 async function open(id) {
-  show(await get(`photos/${encodeURIComponent(id)}`));
-  choose(chosen);
+  const isAnother = id !== photo?.id;
+  const next = await get(`photos/${encodeURIComponent(id)}`);
+  if (!isAnother && JSON.stringify(next) === JSON.stringify(photo)) return;
+  show(next);
+  if (isAnother) choose(chosen);
 }
 
 /** The photo lies over the 3D view while its tab is open. */
@@ -154,7 +163,8 @@ function drawStage() {
 
 // Doing
 
-async function send(file) {
+/** Sends a photo of a table and shows it. */
+export async function sendPhoto(file) {
   if (!mayDrive()) return;
   const bar = byId("table-photo-bar");
   bar.hidden = false;
@@ -171,11 +181,15 @@ async function send(file) {
 async function mark(body) {
   if (!chosen || !mayDrive()) return;
   setBusy(true);
+  isMarking = true;
   byId("photo-told").textContent = "Finding its outline";
   const name = chosen;
+  const was = marked();
   const next = await tellFailure(() => put(objectPath(name), body), byId("photo-told"));
   setBusy(false);
+  isMarking = false;
   if (!next) return tell();
+  before = was ? { id: photo.id, name, mark: markOf(was) } : null;
   show(next);
   return choose(name, toolOf() === "box" ? "add" : toolOf());
 }
@@ -186,7 +200,12 @@ const markOf = ({ box, on, off, strokes }) => ({ box, on, off, strokes });
 
 function mend(change) {
   const object = marked();
-  if (object) return mark(change(markOf(object)));
+  const next = object && change(markOf(object));
+  if (object && Math.max(next.on.length, next.off.length, next.strokes.length) > MOST_MARKS) {
+    byId("photo-told").textContent = `An outline takes ${MOST_MARKS} clicks and strokes at most; drag its box anew.`;
+    return undefined;
+  }
+  if (object) return mark(next);
   byId("photo-told").textContent = `Drag a box around the ${labelOf(chosen).toLowerCase()} first.`;
   chooseTool("box");
   return undefined;
@@ -228,7 +247,7 @@ export async function refreshPhotos() {
   const wanted = photo?.id ?? sessionStorage.getItem(CHOSEN);
   const there = photos.find(({ id }) => id === wanted) ?? (photo ? photos[0] : null);
   if (!there) show(null);
-  else if (there.id !== photo?.id) await tellFailure(() => open(there.id));
+  else if (!isMarking) await tellFailure(() => open(there.id)); // another page may have marked something
   byId("photo-select").value = photo?.id ?? "";
 }
 
@@ -242,7 +261,7 @@ export function setUpPhoto() {
   byId("upload-table-photo").addEventListener("click", () => file.click());
   file.addEventListener("change", () => {
     const [first] = file.files;
-    if (first) act(byId("upload-table-photo"), () => send(first));
+    if (first) act(byId("upload-table-photo"), () => sendPhoto(first));
     file.value = "";
   });
   byId("photo-select").addEventListener("change", ({ target }) => tellFailure(() => open(target.value)));
@@ -262,7 +281,20 @@ export function setUpPhoto() {
   byId("photo-object").addEventListener("change", ({ target }) => choose(target.value));
   for (const radio of document.getElementsByName("photo-tool")) radio.addEventListener("change", () => chooseTool(radio.value));
   byId("photo-brush").addEventListener("input", ({ target }) => setBrush(Number(target.value)));
-  byId("find-objects").addEventListener("click", () => act(byId("find-objects"), find));
+  byId("find-objects").addEventListener("click", async () => {
+    await act(byId("find-objects"), find);
+    drawJob(photo?.job);
+  });
+  byId("photo-undo").addEventListener("click", () => act(byId("photo-undo"), async () => {
+    choose(before.name, toolOf());
+    await mark(before.mark);
+  }));
+  byId("photo-box-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const box = event.target.elements.box.value.split(",").map(Number);
+    if (box.length === 4 && box.every(Number.isFinite)) act(event.submitter, () => mark({ box, on: [middle(box)], off: [], strokes: [] }));
+    else byId("photo-told").textContent = "A box is four numbers: left, top, right, bottom, in pixels of the photo.";
+  });
   byId("cancel-finding").addEventListener("click", () => act(byId("cancel-finding"), () => remove(`jobs/${photo.job.id}`)));
   byId("photo-goal").addEventListener("click", () => act(byId("photo-goal"), () => make("goal")));
   byId("photo-table").addEventListener("click", () => act(byId("photo-table"), () => make("table")));

@@ -14,7 +14,7 @@ from app.api.open_file import OpenFile
 from app.api.problems import named_in_path
 from app.api.routes import JPEG, PNG, problems
 from app.api.schemas.goals import GoalOut
-from app.api.schemas.limits import GOAL_NAME, NAME, PIXEL, sized
+from app.api.schemas.limits import FOCAL, GOAL_NAME, NAME, sized, within
 from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.api.schemas.photos import (
     ChoiceIn,
@@ -63,7 +63,7 @@ async def create(
     response: Response,
     name: Annotated[str, Query(**sized(GOAL_NAME), description="For people.")] = "Photo",
     focal_px: Annotated[
-        float | None, Query(gt=0, le=PIXEL[1], description="Focal length in pixels, if it is known.")
+        float | None, Query(**within(FOCAL), description="Focal length in pixels, if it is known.")
     ] = None,
 ) -> TablePhotoOut:
     """Keep a photo of a table, of any size and usual format; its camera is found if the printed board is in view."""
@@ -115,7 +115,8 @@ def remove(services: ServicesDep, photo: PhotoDep) -> None:
 @slow
 def mark(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: MarkIn) -> TablePhotoOut:
     """Point at an object, or anew; its mask is found."""
-    return _out(services, services.photos.mark(photo.id, name, body.mark()))
+    with named_in_path():
+        return _out(services, services.photos.mark(photo.id, name, body.mark()))
 
 
 @router.delete("/{photo}/objects/{name}", responses=problems(404, 507))
@@ -130,7 +131,8 @@ def unmark(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> TablePho
 @slow
 def choose(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: ChoiceIn) -> TablePhotoOut:
     """Take one of the poses that were found of an object."""
-    return _out(services, services.photos.choose(photo.id, name, body.choice))
+    with named_in_path():
+        return _out(services, services.photos.choose(photo.id, name, body.choice))
 
 
 @router.post("/{photo}/find", status_code=status.HTTP_202_ACCEPTED, responses=problems(404, 409, 429, 507))
@@ -182,4 +184,5 @@ def drawing(services: ServicesDep, photo: PhotoDep) -> Response:
 def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:
     job = services.photos.job(photo)
     found = services.photos.found(photo) if job is not None and job.state == "done" else None
-    return TablePhotoOut.of(photo, job, found, services.objects.labels())
+    doubts = () if found is None else services.photos.doubts(photo, found)
+    return TablePhotoOut.of(photo, job, found, doubts, services.objects.labels())

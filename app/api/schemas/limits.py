@@ -60,6 +60,8 @@ SEQUENCES = (1, 1000)
 
 # Photos of tables
 PIXEL = (0, 100_000)
+FOCAL = (1, 100_000)
+BRUSH = (0.1, 1000)
 CLICKS = (0, 50)
 STROKES = (0, 50)
 STROKE_POINTS = (1, 500)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import BaseModel, Field, FiniteFloat
@@ -9,7 +10,19 @@ from pydantic import BaseModel, Field, FiniteFloat
 from app.api.schemas.common import Input, SceneOut, Seed
 from app.api.schemas.goals import GoalOut
 from app.api.schemas.jobs import JobOut
-from app.api.schemas.limits import CLICKS, NAME, PIXEL, POSE_CHOICE, STROKE_POINTS, STROKES, TOGETHER, sized, within
+from app.api.schemas.limits import (
+    BRUSH,
+    CLICKS,
+    FOCAL,
+    NAME,
+    PIXEL,
+    POSE_CHOICE,
+    STROKE_POINTS,
+    STROKES,
+    TOGETHER,
+    sized,
+    within,
+)
 from app.api.schemas.paging import PageOut
 from app.jobs.job import Job
 from app.jobs.kinds.photos import sheet_name
@@ -20,14 +33,14 @@ from osfcore.photo.found_scene import FoundLight, FoundPose, FoundScene, TableSo
 Pixel = Annotated[FiniteFloat, Field(**within(PIXEL))]
 PointIn = Annotated[list[Pixel], Field(min_length=2, max_length=2)]
 Clicks = Annotated[list[PointIn], Field(**sized(CLICKS))]
-Focal = Annotated[FiniteFloat, Field(gt=0, le=PIXEL[1], description="Focal length in pixels of the photo as sent.")]
+Focal = Annotated[FiniteFloat, Field(**within(FOCAL), description="Focal length in pixels of the photo as sent.")]
 
 
 class StrokeIn(Input):
     """A line of the brush."""
 
     adds: bool = Field(description="Whether what it covers belongs to the object; else it does not.")
-    radius: Pixel = Field(gt=0, description="Of the brush [px].")
+    radius: float = Field(**within(BRUSH), allow_inf_nan=False, description="Of the brush [px].")
     points: Annotated[list[PointIn], Field(**sized(STROKE_POINTS))]
 
 
@@ -143,10 +156,13 @@ class TablePhotoOut(PhotoFacts):
     job: JobOut | None = Field(description="The search for what is marked now; null if there was none.")
     table: TableSource | None = Field(description="What tells where the table is; null if nothing does, or not yet.")
     light: FoundLight | None = Field(description="In the frame of the poses.")
+    doubts: list[str] = Field(description="Why nothing is made of it unless despite_doubts; empty where nothing is.")
     scene: str | None = Field(description="The table that it became.")
 
     @staticmethod
-    def of(photo: TablePhoto, job: Job | None, found: FoundScene | None, labels: dict[str, str]) -> TablePhotoOut:
+    def of(
+        photo: TablePhoto, job: Job | None, found: FoundScene | None, doubts: Sequence[str], labels: dict[str, str]
+    ) -> TablePhotoOut:
         """From the service's own."""
         each = {} if found is None or job is None else {o.name: _found(job, found, o.name) for o in found.objects}
         marked = [MarkedOut.of(one, labels.get(one.name, one.name), each.get(one.name)) for one in photo.objects]
@@ -157,6 +173,7 @@ class TablePhotoOut(PhotoFacts):
             job=None if job is None else JobOut.of(job),
             table=None if found is None else found.table,
             light=None if found is None else found.light,
+            doubts=list(doubts),
             scene=photo.scene,
         )
 

@@ -44,7 +44,7 @@ class RunEpisode:
     temperature: float = 0.03
     """Of the softmax, as a share of the spread of costs."""
     despite_doubts: bool = False
-    """Go on with a goal image that is not explained well."""
+    """Go on with a goal image that is not explained well, or with objects of a photo that are doubtful."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     data_dir: Path = field(default_factory=default_data_dir)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FOUND = "found.json"
 
 
-class PhotoOrder(Entry):
+class PhotoInput(Entry):
     """One photograph of the job.
 
     Attributes:
@@ -76,7 +76,7 @@ def photo_job(params: dict[str, Any], place: JobContext) -> Iterator[Finding]:
 
     yield Finding(0, 0, "Loading fields")
     names, folder = tuple(params["names"]), place.folder / INPUTS
-    orders = [decode(PhotoOrder, order, "photo") for order in params["photos"]]
+    orders = [decode(PhotoInput, order, "photo") for order in params["photos"]]
     photos = [_photograph(folder, number, order) for number, order in enumerate(orders)]
     fields = FieldLibrary(place.data_dir)
     models = PhotoModels({name: fields.load(name) for name in names})
@@ -98,7 +98,7 @@ def inputs_of(number: int, sent: Path, masks: Mapping[str, Path]) -> dict[str, P
     return {str(number): sent, **{f"{number}_{name}.png": path for name, path in masks.items()}}
 
 
-def _photograph(folder: Path, number: int, order: PhotoOrder) -> Photograph:
+def _photograph(folder: Path, number: int, order: PhotoInput) -> Photograph:
     from osfcore.geometry.poses import Pose
     from osfcore.photo.read_photograph import read_photograph, to_photograph
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,7 +19,7 @@ from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord, Poses
 from app.storage.photo_crop import GOAL_SIDE
 from app.storage.table_photos import TablePhoto
-from osfcore.errors import NoRoom, OsfError
+from osfcore.errors import NoRoom, OsfError, UnknownName
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import encode_png
@@ -32,7 +32,7 @@ _STAYED_M, _STAYED_RAD = 0.02, np.deg2rad(20.0)  # by which an object may move w
 class PhotoDoubtful(OsfError):
     """A photograph in which something was not found for certain."""
 
-    def __init__(self, doubts: list[str]) -> None:
+    def __init__(self, doubts: Sequence[str]) -> None:
         super().__init__(f"{' '.join(doubts)} Nothing was changed; choose a picture of each, or mark it anew.")
 
 
@@ -85,7 +85,8 @@ class PhotoTables:
         record = self._photos.get(photo)
         layout = self._layout(record, despite_doubts=despite_doubts)
         scene = self._runner.create_scene(poses=tuple(layout.poses.items()), light=layout.light, is_measured=True)
-        self._photos.keep(replace(record, scene=scene.id, T_table_photo=layout.T_table_photo))
+        place = layout.T_table_photo
+        self._photos.change(photo, lambda latest: replace(latest, scene=scene.id, T_table_photo=place))
         return TableMade(scene, _moved(layout.poses, scene.initial))
 
     def make_goal(self, photo: str, scene: str | None = None, *, despite_doubts: bool = False) -> GoalMade:
@@ -104,12 +105,21 @@ class PhotoTables:
             SceneHeld, TooManyScenes, TooManyGoals, OsfError: as tables and goals are made.
         """
         record = self._photos.get(photo)
-        layout = self._layout(record, scene or self._runner.current, despite_doubts=despite_doubts)
-        table = self._table(scene, layout)
-        made = self._runner.compose(ComposeGoal(table.id, tuple(layout.poses.items()), is_measured=True))
+        found = self._photos.found(record)
+        home = self._home(scene, {each.name for each in found.objects})
+        layout = self._layout(record, None if home is None else home.id, despite_doubts=despite_doubts)
         camera = record.camera(layout.T_table_camera, GOAL_SIDE)
         png = self._reduced(record, camera.width, camera.height)
-        goal = self._goals.keep_photographed(record.name, table.id, camera, made.poses, png)
+        table = home or self._elsewhere(layout)
+        try:
+            made = self._runner.compose(ComposeGoal(table.id, tuple(layout.poses.items()), is_measured=True))
+            goal = self._goals.keep_photographed(record.name, table.id, camera, made.poses, png)
+        except OsfError:
+            if home is None:
+                self._runner.delete_scene(table.id)
+            raise
+        if home is None:
+            self._runner.activate(table.id)
         return GoalMade(table, _moved(layout.poses, dict(made.poses)), goal)
 
     def drawing(self, photo: str) -> bytes:
@@ -131,8 +141,7 @@ class PhotoTables:
 
     def _layout(self, record: TablePhoto, scene: str | None = None, *, despite_doubts: bool) -> TableLayout:
         found = self._photos.found(record)
-        doubts = [each.doubt for each in found.objects if each.doubt and not _is_settled(record, each.name)]
-        if doubts and not despite_doubts:
+        if not despite_doubts and (doubts := self._photos.doubts(record, found)):
             raise PhotoDoubtful(doubts)
         shared = self._shared_frame(record, scene) if found.table == "board" else None
         return layout_of(found, _choices(record), shared)
@@ -144,38 +153,35 @@ class PhotoTables:
                 return other.T_table_photo
         return None
 
-    def _table(self, scene: str | None, layout: TableLayout) -> SceneRecord:
-        """The table that a goal is for; a new one has the objects as they lie in the photo, but elsewhere."""
+    def _home(self, scene: str | None, names: set[str]) -> SceneRecord | None:
+        """The table that was asked for, else the current one if it holds the objects; None if there is none."""
         if scene is not None:
             return self._runner.scene(scene)
         current = None if self._runner.current is None else self._runner.scene(self._runner.current)
-        if current is not None and set(current.state.names) == set(layout.poses):
-            return current
-        draft = self._runner.create_scene(
-            poses=tuple(layout.poses.items()), light=layout.light, is_measured=True, is_shown=False
-        )
+        return current if current is not None and set(current.state.names) == names else None
+
+    def _elsewhere(self, layout: TableLayout) -> SceneRecord:
+        """A new table, not shown yet, whose objects lie on the same sides as in the photo, but in other places."""
+        poses = tuple(layout.poses.items())
+        draft = self._runner.create_scene(poses=poses, light=layout.light, is_measured=True, is_shown=False)
         try:
-            elsewhere = self._elsewhere(draft)
+            start = self._shifted(draft)
         finally:
             self._runner.delete_scene(draft.id)
-        return self._runner.create_scene(poses=elsewhere, light=layout.light, seed=draft.seed)
+        return self._runner.create_scene(poses=start, light=layout.light, seed=draft.seed, is_shown=False)
 
-    def _elsewhere(self, draft: SceneRecord) -> Poses:
+    def _shifted(self, draft: SceneRecord) -> Poses:
         """A random layout: all objects shifted, or as many as there is room for."""
-        count = len(draft.state.names)
         with contextlib.suppress(NoRoom):
+            count = len(draft.state.names)
             return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed, moved=count)).poses
         return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed)).poses
 
     def _reduced(self, record: TablePhoto, width: int, height: int) -> bytes:
         pixels = cv2.imread(str(self._photos.picture(record.id)), cv2.IMREAD_COLOR)
-        assert pixels is not None
+        if pixels is None:
+            raise UnknownName("photo", record.id, [])
         return encode_png(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1])
-
-
-def _is_settled(record: TablePhoto, name: str) -> bool:
-    """Whether a person has chosen a pose of an object."""
-    return any(entry.name == name and entry.choice is not None for entry in record.objects)
 
 
 def _choices(record: TablePhoto) -> dict[str, int]:

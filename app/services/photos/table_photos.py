@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import threading
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -124,11 +125,10 @@ class TablePhotos:
             UnknownName: if there is none.
             InvalidInput: if the focal length makes no sense.
         """
-        before = self.get(photo)
-        read = self._read(self._store.sent(photo).read_bytes(), focal_px)
-        camera = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
+        read = self._read(self._bytes(self._store.sent(photo), photo), focal_px)
+        facts = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
         files = {self.picture(photo): read.jpeg, self._store.straight(photo): read.straight}
-        return self._changed(replace(before, **camera, notes=read.notes), files)
+        return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
 
     def remove(self, photo: str) -> None:
         """Delete a photograph; tables and goals that were made of it stay.
@@ -137,6 +137,7 @@ class TablePhotos:
             UnknownName: if there is none.
             CannotStore: if that is not allowed.
         """
+        self._end_search(self.get(photo))
         self._store.remove(photo)
         self._runner.storage.outdate()
         self._runner.hub.publish(PhotosChanged())
@@ -155,11 +156,10 @@ class TablePhotos:
             raise UnknownName("object with a field", name[:80], known)
         if len({name, *(entry.name for entry in before.objects)}) > MAX_OBJECTS:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
-        found = self._ask(FindMask(self.picture(photo).read_bytes(), mark))
+        found = self._ask(FindMask(self._bytes(self.picture(photo), photo), mark))
         assert isinstance(found, MaskFound)
-        with self._one_at_a_time:  # others may have marked something meanwhile
-            marked = self.get(photo).with_object(MarkedObject(name, mark, found.outline))
-            return self._changed(marked, {self.mask(photo, name): found.png})
+        entry = MarkedObject(name, mark, found.outline)
+        return self._outdated(photo, lambda latest: latest.with_object(entry), {self.mask(photo, name): found.png})
 
     def unmark(self, photo: str, name: str) -> TablePhoto:
         """Forget what was marked of an object.
@@ -167,11 +167,12 @@ class TablePhotos:
         Raises:
             UnknownName: if there is no such photo, or the object was not marked.
         """
-        with self._one_at_a_time:
-            before = self.get(photo)
-            before.marked(name)
-            kept = tuple(entry for entry in before.objects if entry.name != name)
-            return self._changed(replace(before, objects=kept))
+
+        def without(latest: TablePhoto) -> TablePhoto:
+            latest.marked(name)
+            return replace(latest, objects=tuple(entry for entry in latest.objects if entry.name != name))
+
+        return self._outdated(photo, without)
 
     # What is found
 
@@ -186,6 +187,7 @@ class TablePhotos:
         Raises:
             UnknownName: if there is no such photo.
             NothingMarked: if no object is marked.
+            MissingFields: if an object can no longer be recognised.
             InvalidInput: if several photographs do not all show the board.
             QueueFull, StorageFull: if too many jobs wait, or nothing more may be written.
         """
@@ -198,6 +200,8 @@ class TablePhotos:
         if len(photos) > 1 and boards < len(photos):
             raise InvalidInput("photos with the board in view", f"{boards} of {len(photos)}", "all of them")
         names = list(dict.fromkeys(entry.name for each in photos for entry in each.objects))
+        self._fields.require(names, "ours")
+        self._end_search(first)
         params = {
             "photo": first.id, "title": first.name, "names": names, "seed": seed, "notes": list(first.notes),
             "photos": [_order(each) for each in photos],
@@ -205,7 +209,8 @@ class TablePhotos:
         with self._runner.jobs.new_inputs() as folder:
             self._copy(photos, folder)
             job = self._runner.submit_with_inputs(KIND, params, folder)
-        return self._told(self._store.replace(replace(first, objects=_unchosen(first), job=job.id)))
+        # What was marked meanwhile is not what is looked for.
+        return self.change(photo, lambda latest: replace(latest, job=job.id) if _is_same(latest, first) else latest)
 
     def choose(self, photo: str, name: str, choice: int) -> TablePhoto:
         """Take one of the poses that were found of an object; that settles what is doubtful about it.
@@ -216,12 +221,17 @@ class TablePhotos:
             InvalidInput: if there are fewer poses.
         """
         before = self.get(photo)
+        before.marked(name)
         found = {entry.name: entry for entry in self.found(before).objects}
-        marked = before.marked(name)
         count = len(found[name].poses())
         if not 0 <= choice < count:
             raise InvalidInput("number of the pose", choice, f"0 to {count - 1}")
-        return self._told(self._store.replace(before.with_object(replace(marked, choice=choice))))
+        return self.change(photo, lambda latest: latest.with_object(replace(latest.marked(name), choice=choice)))
+
+    def doubts(self, photo: TablePhoto, found: FoundScene) -> tuple[str, ...]:
+        """Why objects should not be trusted, without those of which a person has chosen a pose."""
+        settled = {entry.name for entry in photo.objects if entry.choice is not None}
+        return tuple(each.doubt for each in found.objects if each.doubt and each.name not in settled)
 
     def job(self, photo: TablePhoto) -> Job | None:
         """The estimate of what is marked now; None if there is none."""
@@ -246,18 +256,38 @@ class TablePhotos:
 
     # Inside
 
-    def keep(self, photo: TablePhoto) -> TablePhoto:
-        """Keep other facts of a photograph whose marks are the same.
+    def change(self, photo: str, changed: Callable[[TablePhoto], TablePhoto]) -> TablePhoto:
+        """Keep other facts of a photograph, made of the latest ones.
 
         Raises:
-            UnknownName: if there is none.
+            UnknownName: if there is none, or as `changed`.
             CannotStore: if the disk is full.
         """
-        return self._told(self._store.replace(photo))
+        return self._told(self._store.change(photo, changed))
 
-    def _changed(self, photo: TablePhoto, files: dict[Path, bytes | None] | None = None) -> TablePhoto:
-        """Keep a photograph of which something else is to be found now."""
-        return self._told(self._store.replace(replace(photo, objects=_unchosen(photo), job=None), files))
+    def _outdated(
+        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: dict[Path, bytes | None] | None = None
+    ) -> TablePhoto:
+        """Keep a photograph of which something else is to be found now; a search for what was before ends."""
+        self._end_search(self.get(photo))
+
+        def then(latest: TablePhoto) -> TablePhoto:
+            after = changed(latest)
+            return replace(after, objects=tuple(replace(each, choice=None) for each in after.objects), job=None)
+
+        return self._told(self._store.change(photo, then, files))
+
+    def _end_search(self, photo: TablePhoto) -> None:
+        job = self.job(photo)
+        if job is not None and not job.is_finished:
+            with contextlib.suppress(OsfError):  # it has just ended by itself
+                self._runner.jobs.cancel(job.id)
+
+    def _bytes(self, path: Path, photo: str) -> bytes:
+        try:
+            return path.read_bytes()
+        except FileNotFoundError:
+            raise UnknownName("photo", photo, [each.id for each in self.all()][:5]) from None
 
     def _told(self, photo: TablePhoto) -> TablePhoto:
         self._runner.hub.publish(PhotosChanged())
@@ -289,9 +319,10 @@ class TablePhotos:
             raise PhotoRefused(late) from None
 
 
-def _unchosen(photo: TablePhoto) -> tuple[MarkedObject, ...]:
-    """The objects without the poses that were chosen."""
-    return tuple(replace(entry, choice=None) for entry in photo.objects)
+def _is_same(one: TablePhoto, other: TablePhoto) -> bool:
+    """Whether the same is marked, in pictures of the same camera."""
+    marks = ([(each.name, each.mark) for each in photo.objects] for photo in (one, other))
+    return next(marks) == next(marks) and np.array_equal(one.K, other.K)
 
 
 def _order(photo: TablePhoto) -> dict[str, object]:

@@ -171,12 +171,12 @@ def test_a_refusal_leaves_no_simulation_behind(order, tmp_path, monkeypatch, cha
         world.truth()
 
 
-def found_file(order, place, table="board", apart_m=0.2):
+def found_file(order, place, table="board", apart_m=0.2, doubt=""):
     """What was found in a photograph of a box and a can that stand on a table somewhere else."""
     camera = Camera.look_at("photo", np.array([1.3, 2.0, 0.6]), np.array([1.0, 2.6, 0.0]))
     objects = [
         {"name": name, "position": [1.0 + shift, 2.6, height], "quaternion": [1.0, 0, 0, 0], "loss": 0.1, "iou": 0.95,
-         "doubt": "", "rivals": []}
+         "doubt": doubt, "rivals": []}
         for name, shift, height in (("009_gelatin_box", 0.0, 0.06), ("005_tomato_soup_can", apart_m, 0.051))
     ]  # fmt: skip
     path = place / "found.json"
@@ -204,5 +204,14 @@ def test_a_photo_that_tells_no_table_or_a_layout_too_wide_is_no_goal(order, tmp_
         orders.given(found_file(order, tmp_path, table=None))
     with pytest.raises(InvalidInput, match="at most 44 cm"):
         orders.given(found_file(order, tmp_path, apart_m=0.6))
-    with pytest.raises(InvalidInput, match="left out"):
-        orders.given(replace(found_file(order, tmp_path), goal=tmp_path / "goal.png"))
+    for more in ({"goal": tmp_path / "goal.png"}, {"names": NAMES}):
+        with pytest.raises(InvalidInput, match="left out"):
+            orders.given(replace(found_file(order, tmp_path), **more))
+
+
+def test_doubtful_objects_of_a_photo_are_taken_only_if_that_is_said(order, tmp_path):
+    doubtful = found_file(order, tmp_path, doubt="It looks the same upside down.")
+    with pytest.raises(OsfError, match="the same upside down"):
+        orders.given(doubtful)
+    with begun(replace(doubtful, settings=replace(doubtful.settings, despite_doubts=True))) as begin:
+        assert len(begin.goal.names) == 2

@@ -191,5 +191,6 @@ def test_every_kind_that_rest_tells_of_exists():
         "clip",
         "estimate",
         "episode",
+        "photo",
     }
     assert JobContext(Path("d"), Path("f")).library.root == Path("d/objects")

@@ -14,7 +14,7 @@ from tests.core.render.scenes import ball
 
 FIELDS = FieldLibrary(None)
 BANANA = "011_banana"
-HOLLOW = {BANANA, "019_pitcher_base", "022_windex_bottle", "025_mug", "035_power_drill"}
+HOLLOW = {BANANA, "019_pitcher_base", "022_windex_bottle", "024_bowl", "025_mug", "035_power_drill"}
 
 
 def test_a_network_of_this_machine_comes_first(tmp_path):

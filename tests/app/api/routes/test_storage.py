@@ -25,7 +25,7 @@ def test_the_data_directory_is_told_by_kind(service, services):
     told = service.get("/api/storage").json()
     assert told["total"] == sum(told["bytes"].values()) > told["bytes"]["objects"] > 0
     assert set(told["bytes"]) == {
-        "objects", "fields", "goals", "sets", "jobs", "training", "downloads", "other"
+        "objects", "fields", "goals", "photos", "sets", "jobs", "training", "downloads", "other"
     }  # fmt: skip
     assert told["allowed"] == services.settings.max_data_bytes
     assert told["free"] > told["must_stay_free"] == services.settings.min_free_bytes

@@ -93,10 +93,10 @@ def test_what_makes_no_sense_is_told(service):
     refuses(service.post(f"{path}/find", json={}), 409, "No object is marked")
     refuses(service.post(f"{path}/goal", json={}), 409, "have not been found yet")
     refuses(service.get(f"{path}/drawing.png"), 409, "have not been found yet")
-    refuses(mark(service, photo, "teapot", [5.0, 5.0, 40.0, 40.0]), 422, "teapot")
+    refuses(mark(service, photo, "teapot", [5.0, 5.0, 40.0, 40.0]), 404, "teapot")
     refuses(mark(service, photo, BOX, [100.0, 5.0, 140.0, 40.0]), 422, "64 x 48")
     refuses(service.delete(f"{path}/objects/{BOX}"), 404, BOX)
-    refuses(service.post(f"{path}/objects/{BOX}/choice", json={"choice": 0}), 409, "have not been found yet")
+    refuses(service.post(f"{path}/objects/{BOX}/choice", json={"choice": 0}), 404, BOX)
     assert service.get(path).json()["objects"] == []
 
 
