@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -61,6 +62,27 @@ def propose_mask(
     if not mask.any():
         raise InvalidInput(_WHAT, _told(box), "around something that differs from what surrounds it")
     return mask
+
+
+def propose_masks(
+    image: UInt8[np.ndarray, "h w 3"], boxes: Mapping[str, Box], clicks: Mapping[str, Float[np.ndarray, "k 2"]]
+) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """The masks of several objects: what a click says is one of them is background for the others.
+
+    Args:
+        image: encoded RGB, as people see it.
+        boxes: around each object, by its name [px].
+        clicks: on each object.
+
+    Raises:
+        InvalidInput: as `propose_mask`.
+    """
+    return {name: propose_mask(image, box, clicks[name], others_of(clicks, name)) for name, box in boxes.items()}
+
+
+def others_of(clicks: Mapping[str, Float[np.ndarray, "k 2"]], name: str) -> Float[np.ndarray, "j 2"]:
+    """Clicks on other objects than one."""
+    return np.concatenate([np.zeros((0, 2)), *(points for other, points in clicks.items() if other != name)])
 
 
 @dataclass(frozen=True, slots=True)

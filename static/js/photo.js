@@ -194,7 +194,6 @@ async function mark(body) {
   return choose(name, toolOf() === "box" ? "add" : toolOf());
 }
 
-const middle = ([left, top, right, bottom]) => [(left + right) / 2, (top + bottom) / 2];
 const isInside = ([x, y], [left, top, right, bottom]) => x >= left && x < right && y >= top && y < bottom;
 const markOf = ({ box, on, off, strokes }) => ({ box, on, off, strokes });
 
@@ -253,7 +252,7 @@ export async function refreshPhotos() {
 
 export function setUpPhoto() {
   setUpMarks({
-    onBox: (box) => mark({ box, on: [middle(box)], off: [], strokes: [] }),
+    onBox: (box) => mark({ box, on: [], off: [], strokes: [] }),
     onClick: click,
     onStroke: (points, radius, tool) => mend((mark) => ({ ...mark, strokes: [...mark.strokes, { adds: tool === "add", radius, points }] })),
   });
@@ -292,7 +291,7 @@ export function setUpPhoto() {
   byId("photo-box-form").addEventListener("submit", (event) => {
     event.preventDefault();
     const box = event.target.elements.box.value.split(",").map(Number);
-    if (box.length === 4 && box.every(Number.isFinite)) act(event.submitter, () => mark({ box, on: [middle(box)], off: [], strokes: [] }));
+    if (box.length === 4 && box.every(Number.isFinite)) act(event.submitter, () => mark({ box, on: [], off: [], strokes: [] }));
     else byId("photo-told").textContent = "A box is four numbers: left, top, right, bottom, in pixels of the photo.";
   });
   byId("cancel-finding").addEventListener("click", () => act(byId("cancel-finding"), () => remove(`jobs/${photo.job.id}`)));

@@ -156,7 +156,9 @@ class TablePhotos:
             raise UnknownName("object with a field", name[:80], known)
         if len({name, *(entry.name for entry in before.objects)}) > MAX_OBJECTS:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
-        found = self._ask(FindMask(self._bytes(self.picture(photo), photo), mark))
+        others = tuple(point for each in before.objects if each.name != name for point in each.mark.on)
+        told = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
+        found = self._ask(FindMask(self._bytes(self.picture(photo), photo), told))
         assert isinstance(found, MaskFound)
         entry = MarkedObject(name, mark, found.outline)
         return self._outdated(photo, lambda latest: latest.with_object(entry), {self.mask(photo, name): found.png})

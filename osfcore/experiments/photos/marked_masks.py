@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from osfcore.experiments.photos.folders import PhotoFolder
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.segmentation import Box, propose_mask
+from osfcore.photo.segmentation import Box, propose_masks
 
 LOOSE = 0.04  # of the box's sides, on each side: people do not draw to the pixel
 
@@ -32,7 +32,9 @@ def masks_from_boxes(scene: PhotoFolder) -> dict[str, Bool[np.ndarray, "h w"]]:
         InvalidInput: if nothing is found in a box.
     """
     picture = _eight_bit(scene.encoded)
-    return {name: propose_mask(picture, *box_and_click(mask)) for name, mask in scene.photo.masks.items()}
+    marks = {name: box_and_click(mask) for name, mask in scene.photo.masks.items()}
+    boxes, clicks = ({name: mark[part] for name, mark in marks.items()} for part in (0, 1))
+    return propose_masks(picture, boxes, clicks)
 
 
 def mask_iou(used: Photograph, given: Photograph, name: str) -> float:
