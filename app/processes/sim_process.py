@@ -265,7 +265,7 @@ class Simulation:
             if name not in state.names:
                 raise UnknownName("object on the table", name, state.names)
         every = [poses.get(name, state.pose(name)) for name in state.names]
-        stacked = Pose(np.array([p.position for p in every]), np.array([p.quaternion for p in every]))
+        stacked = Pose.stacked(every)
         time_s = self._time_s(record.id)
         world.load(SceneState(state.names, stacked, state.light, state.pusher))
         self._time_offsets[record.id] = time_s

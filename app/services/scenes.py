@@ -8,8 +8,6 @@ import uuid
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from app.processes.messages.scene_messages import (
     Act,
     AdoptScene,
@@ -345,6 +343,5 @@ def _check_poses(poses: tuple[tuple[str, Pose], ...]) -> None:
 
 def _stacked(poses: list[Pose]) -> Pose:
     """Poses as one batch, with quaternions checked."""
-    quaternions = np.array([pose.quaternion for pose in poses], float).reshape(-1, 4)
-    positions = np.array([pose.position for pose in poses], float).reshape(-1, 3)
-    return Pose(positions, unit_quaternion(quaternions, "quaternions"))
+    stacked = Pose.stacked(poses)
+    return Pose(stacked.position, unit_quaternion(stacked.quaternion, "quaternions"))

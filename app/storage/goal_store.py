@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import shutil
-import threading
-import uuid
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import FiniteFloat
 
-from app.storage.durable import put_in_place
 from app.storage.photo_crop import PhotoCrop
-from app.storage.schema import CannotStore
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
+from app.storage.record_folders import RecordFolders
+from osfcore.errors import InvalidInput, OsfError, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.io.files import read_json
@@ -26,7 +21,6 @@ from osfcore.io.scene_file import CameraJson, ObjectJson, camera_to_json
 Source = Literal["upload", "composed", "drawn", "photo"]
 Poses = tuple[tuple[str, Pose], ...]
 IMAGE, PHOTO, _FACTS = "goal.png", "photo.jpg", "goal.json"
-_TEMPORARY_PREFIX = ".new-"
 
 
 class TooManyGoals(OsfError):
@@ -109,7 +103,7 @@ class GoalJson(Entry):
     photo: PhotoJson | None = None
 
 
-class GoalStore:
+class GoalStore(RecordFolders[GoalRecord]):
     """The goals of one data directory. Any thread may call.
 
     Args:
@@ -118,34 +112,7 @@ class GoalStore:
     """
 
     def __init__(self, root: Path, max_goals: int) -> None:
-        self._root = root
-        self._max_goals = max_goals
-        self._lock = threading.Lock()
-
-    def start(self) -> None:
-        """Remove what an earlier service left half done."""
-        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
-            shutil.rmtree(folder, ignore_errors=True)
-
-    def all(self) -> tuple[GoalRecord, ...]:
-        """All goals, newest first."""
-        records = []
-        for path in self._root.glob(f"[!.]*/{_FACTS}"):
-            with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
-                records.append(_read(path))
-        return tuple(sorted(records, key=lambda record: (record.created_at, record.id), reverse=True))
-
-    def get(self, goal: str) -> GoalRecord:
-        """One goal.
-
-        Raises:
-            UnknownName: if there is none.
-        """
-        records = self.all()
-        for record in records:
-            if record.id == goal:
-                return record
-        raise UnknownName("goal", goal[:80], [record.id for record in records][:5])
+        super().__init__(root, "goal", _FACTS, _read, max_goals, TooManyGoals)
 
     def image(self, goal: str) -> Path:
         """The image of a goal that exists."""
@@ -162,17 +129,7 @@ class GoalStore:
             TooManyGoals: if there are too many.
             CannotStore: if the disk is full.
         """
-        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            with self._lock:  # others may come in at the same time
-                if len(self.all()) >= self._max_goals:
-                    raise TooManyGoals(self._max_goals)
-                self._write(folder, record, png, photo)
-                put_in_place(folder, self._root / record.id)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        self._keep(record.id, {IMAGE: png, PHOTO: photo, _FACTS: _facts(record)})
 
     def replace(self, record: GoalRecord, png: bytes) -> None:
         """Give a goal another image, and other facts.
@@ -181,45 +138,16 @@ class GoalStore:
             UnknownName: if there is none.
             CannotStore: if the disk is full.
         """
-        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            with self._lock:
-                self.get(record.id)
-                self._write(folder, record, png, None)
-                for name in (IMAGE, _FACTS):  # the photo stays
-                    (folder / name).replace(self._root / record.id / name)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-    @staticmethod
-    def _write(folder: Path, record: GoalRecord, png: bytes, photo: bytes | None) -> None:
-        folder.mkdir(parents=True)
-        (folder / IMAGE).write_bytes(png)
-        if photo is not None:
-            (folder / PHOTO).write_bytes(photo)
-        (folder / _FACTS).write_text(json.dumps(_to_json(record), indent=1) + "\n", encoding="utf-8")
-
-    def remove(self, goal: str) -> None:
-        """Delete a goal; episodes that had it keep their own copy.
-
-        Raises:
-            UnknownName: if there is none.
-            CannotStore: if that is not allowed.
-        """
-        self.get(goal)
-        trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            (self._root / goal).rename(trash)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-        shutil.rmtree(trash, ignore_errors=True)
+        self._replace(record.id, {IMAGE: png, _FACTS: _facts(record)})
 
 
 def poses_to_json(poses: Poses) -> list[dict[str, Any]]:
     """Poses as in scene.json."""
     return [encode(ObjectJson.of(name, pose)) for name, pose in poses]
+
+
+def _facts(record: GoalRecord) -> bytes:
+    return (json.dumps(_to_json(record), indent=1) + "\n").encode()
 
 
 def _to_json(record: GoalRecord) -> dict[str, Any]:

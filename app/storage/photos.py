@@ -14,17 +14,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from app.processes.child_process import limit_memory
+from app.processes.pictures.photo_process import PhotoRefused
 from app.processes.process_client import ProcessClient, ProcessHangs
 from app.processes.process_server import ProcessServer
-from osfcore.errors import CorruptFile, OsfError
+from osfcore.errors import CorruptFile
 from osfcore.photo.read_photograph import read_photograph
 
 _PATIENCE_S = 20.0  # sound photos take two, and a busy machine some to start the process
 _MEMORY_BYTES = 3 << 29  # sound photos take two thirds of it
-
-
-class PhotoRefused(OsfError):
-    """A photo that cannot be used."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import shutil
-import threading
-import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from app.processes.messages.photo_messages import CameraSource, Mark, Points
-from app.storage.durable import put_in_place
-from app.storage.schema import CannotStore
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
+from app.storage.record_folders import RecordFolders
+from osfcore.errors import InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
-from osfcore.io.files import read_json, write_atomically
+from osfcore.io.files import read_json
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode, encode
 
 SENT, STRAIGHT, PICTURE, _FACTS = "sent", "straight.png", "photo.jpg", "photo.json"
-_TEMPORARY_PREFIX = ".new-"
+_NO_FILES: Mapping[str, bytes | None] = MappingProxyType({})
 
 
 class TooManyPhotos(OsfError):
@@ -157,7 +153,7 @@ class _PhotoJson(Entry):
     T_table_photo: _PoseJson | None
 
 
-class TablePhotoStore:
+class TablePhotoStore(RecordFolders[TablePhoto]):
     """The photographs of one data directory. Any thread may call.
 
     Args:
@@ -166,34 +162,7 @@ class TablePhotoStore:
     """
 
     def __init__(self, root: Path, max_photos: int) -> None:
-        self._root = root
-        self._max_photos = max_photos
-        self._lock = threading.RLock()
-
-    def start(self) -> None:
-        """Remove what an earlier service left half done."""
-        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
-            shutil.rmtree(folder, ignore_errors=True)
-
-    def all(self) -> tuple[TablePhoto, ...]:
-        """All photographs, newest first."""
-        photos = []
-        for path in self._root.glob(f"[!.]*/{_FACTS}"):
-            with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
-                photos.append(_read(path))
-        return tuple(sorted(photos, key=lambda photo: (photo.created_at, photo.id), reverse=True))
-
-    def get(self, photo: str) -> TablePhoto:
-        """One photograph.
-
-        Raises:
-            UnknownName: if there is none.
-        """
-        photos = self.all()
-        for record in photos:
-            if record.id == photo:
-                return record
-        raise UnknownName("photo", photo[:80], [record.id for record in photos][:5])
+        super().__init__(root, "photo", _FACTS, _read, max_photos, TooManyPhotos)
 
     def picture(self, photo: str) -> Path:
         """What is shown of a photograph that exists."""
@@ -209,7 +178,7 @@ class TablePhotoStore:
 
     def mask(self, photo: str, name: str) -> Path:
         """The mask of an object that was marked."""
-        return self._root / photo / f"mask_{name}.png"
+        return self._root / photo / mask_file(name)
 
     def keep(self, record: TablePhoto, sent: bytes, picture: bytes, straight: bytes | None = None) -> None:
         """Keep a new photograph.
@@ -224,62 +193,26 @@ class TablePhotoStore:
             TooManyPhotos: if there are too many.
             CannotStore: if the disk is full.
         """
-        folder = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            with self._lock:
-                if len(self.all()) >= self._max_photos:
-                    raise TooManyPhotos(self._max_photos)
-                folder.mkdir(parents=True)
-                files = {SENT: sent, STRAIGHT: straight, PICTURE: picture, _FACTS: _facts(record)}
-                for name, data in files.items():
-                    if data is not None:
-                        (folder / name).write_bytes(data)
-                put_in_place(folder, self._root / record.id)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        self._keep(record.id, {SENT: sent, STRAIGHT: straight, PICTURE: picture, _FACTS: _facts(record)})
 
     def change(
-        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: dict[Path, bytes | None] | None = None
+        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: Mapping[str, bytes | None] = _NO_FILES
     ) -> TablePhoto:
-        """Give a photograph other facts, made of the latest ones, and write files of it before; None removes one.
+        """Give a photograph other facts, made of the latest ones, and other files; None removes one.
 
         Raises:
             UnknownName: if there is none, or as `changed`.
             CannotStore: if the disk is full.
         """
-        try:
-            with self._lock:
-                record = changed(self.get(photo))
-                for path, data in (files or {}).items():
-                    if data is None:
-                        path.unlink(missing_ok=True)
-                    else:
-                        write_atomically(path, data)
-                write_atomically(self._root / record.id / _FACTS, _facts(record))
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
+        with self._lock:
+            record = changed(self.get(photo))
+            self._replace(photo, {**files, _FACTS: _facts(record)})
         return record
 
-    def remove(self, photo: str) -> None:
-        """Delete a photograph.
 
-        Raises:
-            UnknownName: if there is none.
-            CannotStore: if that is not allowed.
-        """
-        with self._lock:
-            self._remove(photo)
-
-    def _remove(self, photo: str) -> None:
-        self.get(photo)
-        trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
-        try:
-            (self._root / photo).rename(trash)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-        shutil.rmtree(trash, ignore_errors=True)
+def mask_file(name: str) -> str:
+    """The file with an object's mask."""
+    return f"mask_{name}.png"
 
 
 def _facts(record: TablePhoto) -> bytes:

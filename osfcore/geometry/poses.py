@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,6 +128,14 @@ class Pose:
     def joined(*batches: Pose) -> Pose:
         """One batch of several, along the first axis."""
         return Pose(np.concatenate([b.position for b in batches]), np.concatenate([b.quaternion for b in batches]))
+
+    @staticmethod
+    def stacked(poses: Iterable[Pose]) -> Pose:
+        """One batch of single poses, or of batches of one size along a new first axis; none is a batch of 0."""
+        every = list(poses)
+        if not every:
+            return Pose.identity(0)
+        return Pose(np.stack([p.position for p in every]), np.stack([p.quaternion for p in every]))
 
     @staticmethod
     def from_matrix(matrix: Float[np.ndarray, "*batch 4 4"]) -> Pose:

@@ -109,7 +109,7 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
         if name not in state.names:
             raise UnknownName("object on the table", name, state.names)
     every = [poses.get(name, state.pose(name)) for name in state.names]
-    stacked = Pose(np.array([p.position for p in every]), np.array([p.quaternion for p in every]))
+    stacked = Pose.stacked(every)
     (world.load_measured if is_measured else world.load)(SceneState(state.names, stacked, state.light, None))
     for _ in world.settle():
         pass

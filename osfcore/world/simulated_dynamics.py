@@ -68,7 +68,7 @@ class SimulatedPushes:
                 for _ in range(SUBSTEPS):
                     self._physics.step(action)
                 now = [self._physics.pose(name) for name in state.names]
-                poses.append(Pose(np.array([p.position for p in now]), np.array([p.quaternion for p in now])))
+                poses.append(Pose.stacked(now))
             pusher.append(self._physics.pusher)
         return np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses]), np.stack(pusher)
 

@@ -143,9 +143,7 @@ class Tabletop:
         return SceneState(self._names, self._poses(), light, self._bodies.pusher)
 
     def _poses(self) -> Pose:
-        poses = [self._bodies.pose(name) for name in self._names]
-        positions = np.array([p.position for p in poses]).reshape(-1, 3)
-        return Pose(positions, np.array([p.quaternion for p in poses]).reshape(-1, 4))
+        return Pose.stacked(self._bodies.pose(name) for name in self._names)
 
     def arrange(self, seed: int) -> None:
         """Like `reset`, without taking images.
@@ -245,7 +243,7 @@ class Tabletop:
             touched |= self._advance(velocity)
             if step % stride == 0:
                 poses.append(self._poses())
-        return touched, Pose(np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses]))
+        return touched, Pose.stacked(poses)
 
     def settle(self, rate_hz: float = 60.0) -> Iterator[SceneState]:
         """Let everything come to rest, at most 3 s, telling the state on the way."""

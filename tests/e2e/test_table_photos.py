@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from osfcore.geometry.cameras import goal_camera
-from osfcore.photo.camera_response import srgb_of_linear
+from tests.app.api.routes.test_table_photos import box_around, jpeg_of
 from tests.e2e.conftest import watch_errors
 from tests.live import call, free_port, start_service, stop_service
 
@@ -37,10 +37,7 @@ def scene(port):
 def photo(port, scene):
     """JPEG of the table, encoded as cameras do."""
     png = call(port, "GET", f"scenes/{scene['id']}/images/goal.png?size={SIDE}&pusher=false")
-    linear = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) / 255
-    data = io.BytesIO()
-    Image.fromarray(np.round(255 * srgb_of_linear(linear)).astype(np.uint8)).save(data, "JPEG", quality=95)
-    return data.getvalue()
+    return jpeg_of(np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) / 255)
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +46,7 @@ def boxes(port, scene):
 
     def around(name):
         png = call(port, "GET", f"scenes/{scene['id']}/masks/goal/{name}.png?size={SIDE}")
-        ys, xs = np.nonzero(np.asarray(Image.open(io.BytesIO(png))) > 127)
-        return xs.min() - 5, ys.min() - 5, xs.max() + 5, ys.max() + 5
+        return box_around(np.asarray(Image.open(io.BytesIO(png))) > 127)
 
     return {name: around(name) for name in TABLE}
 

@@ -19,7 +19,7 @@ from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord, Poses
 from app.storage.photo_crop import GOAL_SIDE
 from app.storage.table_photos import TablePhoto
-from osfcore.errors import NoRoom, OsfError, UnknownName
+from osfcore.errors import NoRoom, OsfError
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import encode_png
@@ -132,12 +132,11 @@ class PhotoTables:
         """
         record = self._photos.get(photo)
         layout = layout_of(self._photos.found(record), _choices(record))
-        state = SceneState(tuple(layout.poses), _stacked(layout.poses), layout.light, None)
+        state = SceneState(tuple(layout.poses), Pose.stacked(layout.poses.values()), layout.light, None)
         camera = record.camera(layout.T_table_camera, _DRAWN_SIDE)
-        masks = tuple(self._photos.mask(photo, entry.name).read_bytes() for entry in record.objects)
-        return self._link.call(
-            DrawPhoto(uuid.uuid4().hex, state, camera, self._photos.picture(photo).read_bytes(), masks)
-        )
+        masks = tuple(self._photos.read(self._photos.mask(photo, entry.name), photo) for entry in record.objects)
+        picture = self._photos.read(self._photos.picture(photo), photo)
+        return self._link.call(DrawPhoto(uuid.uuid4().hex, state, camera, picture, masks))
 
     def _layout(self, record: TablePhoto, scene: str | None = None, *, despite_doubts: bool) -> TableLayout:
         found = self._photos.found(record)
@@ -178,19 +177,14 @@ class PhotoTables:
         return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed)).poses
 
     def _reduced(self, record: TablePhoto, width: int, height: int) -> bytes:
-        pixels = cv2.imread(str(self._photos.picture(record.id)), cv2.IMREAD_COLOR)
-        if pixels is None:
-            raise UnknownName("photo", record.id, [])
+        jpeg = self._photos.read(self._photos.picture(record.id), record.id)
+        pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        assert pixels is not None, "it was encoded here"
         return encode_png(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1])
 
 
 def _choices(record: TablePhoto) -> dict[str, int]:
     return {entry.name: entry.choice or 0 for entry in record.objects}
-
-
-def _stacked(poses: Mapping[str, Pose]) -> Pose:
-    positions, quaternions = ([getattr(pose, part) for pose in poses.values()] for part in ("position", "quaternion"))
-    return Pose(np.array(positions), np.array(quaternions))
 
 
 def _moved(asked: Mapping[str, Pose], rests: SceneState | Mapping[str, Pose]) -> tuple[str, ...]:

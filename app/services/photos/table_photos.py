@@ -6,9 +6,10 @@ import contextlib
 import shutil
 import threading
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from app.processes.process_client import ProcessClient, ProcessHangs
 from app.services.fields import FieldCatalogue
 from app.services.runner import Runner
 from app.storage.database import CannotStore, now_utc
-from app.storage.table_photos import MarkedObject, TablePhoto, TablePhotoStore
+from app.storage.table_photos import PICTURE, STRAIGHT, MarkedObject, TablePhoto, TablePhotoStore, mask_file
 from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json
@@ -28,6 +29,7 @@ from osfcore.io.json_codec import decode
 from osfcore.photo.found_scene import FoundScene
 
 KIND = "photo"
+_NO_FILES: Mapping[str, bytes | None] = MappingProxyType({})
 _PATIENCE_S = 30.0  # sound photos take three, and a busy machine some to start the process
 
 
@@ -125,9 +127,9 @@ class TablePhotos:
             UnknownName: if there is none.
             InvalidInput: if the focal length makes no sense.
         """
-        read = self._read(self._bytes(self._store.sent(photo), photo), focal_px)
+        read = self._read(self.read(self._store.sent(photo), photo), focal_px)
         facts = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
-        files = {self.picture(photo): read.jpeg, self._store.straight(photo): read.straight}
+        files = {PICTURE: read.jpeg, STRAIGHT: read.straight}
         return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
 
     def remove(self, photo: str) -> None:
@@ -158,10 +160,10 @@ class TablePhotos:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
         others = tuple(point for each in before.objects if each.name != name for point in each.mark.on)
         told = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
-        found = self._ask(FindMask(self._bytes(self.picture(photo), photo), told))
+        found = self._ask(FindMask(self.read(self.picture(photo), photo), told))
         assert isinstance(found, MaskFound)
         entry = MarkedObject(name, mark, found.outline)
-        return self._outdated(photo, lambda latest: latest.with_object(entry), {self.mask(photo, name): found.png})
+        return self._outdated(photo, lambda latest: latest.with_object(entry), {mask_file(name): found.png})
 
     def unmark(self, photo: str, name: str) -> TablePhoto:
         """Forget what was marked of an object.
@@ -268,7 +270,7 @@ class TablePhotos:
         return self._told(self._store.change(photo, changed))
 
     def _outdated(
-        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: dict[Path, bytes | None] | None = None
+        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: Mapping[str, bytes | None] = _NO_FILES
     ) -> TablePhoto:
         """Keep a photograph of which something else is to be found now; a search for what was before ends."""
         self._end_search(self.get(photo))
@@ -285,7 +287,12 @@ class TablePhotos:
             with contextlib.suppress(OsfError):  # it has just ended by itself
                 self._runner.jobs.cancel(job.id)
 
-    def _bytes(self, path: Path, photo: str) -> bytes:
+    def read(self, path: Path, photo: str) -> bytes:
+        """A file of a photograph, which may just have been deleted.
+
+        Raises:
+            UnknownName: if so.
+        """
         try:
             return path.read_bytes()
         except FileNotFoundError:

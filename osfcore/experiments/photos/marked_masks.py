@@ -33,7 +33,7 @@ def masks_from_boxes(scene: PhotoFolder) -> dict[str, Bool[np.ndarray, "h w"]]:
     """
     picture = _eight_bit(scene.encoded)
     marks = {name: box_and_click(mask) for name, mask in scene.photo.masks.items()}
-    boxes, clicks = ({name: mark[part] for name, mark in marks.items()} for part in (0, 1))
+    boxes, clicks = {name: box for name, (box, _) in marks.items()}, {name: on for name, (_, on) in marks.items()}
     return propose_masks(picture, boxes, clicks)
 
 

@@ -79,7 +79,6 @@ def lit_pixels(
     surfels: Mapping[str, Surfels],
     *,
     covered_m: tuple[float, float] | None = None,
-    shared_exposure: bool = False,
 ) -> LitPixels:
     """Pixels that show objects, and where the table's plane is known, the table.
 
@@ -88,7 +87,6 @@ def lit_pixels(
         poses: of the objects in the world.
         surfels: of each object.
         covered_m: sides of a print that lies around the world's origin and hides the table, along x and y [m].
-        shared_exposure: all photographs have the same exposure and white balance.
 
     Raises:
         InvalidInput: if too few pixels show anything known.
@@ -96,12 +94,11 @@ def lit_pixels(
     shadows = Shadows([surfels[name] for name in poses], list(poses.values()))
     parts = []
     for view, photo in enumerate(photos):
-        group = 0 if shared_exposure else view
         for owner, (name, pose) in enumerate(poses.items()):
             if name in photo.masks:
-                parts.append((*_object_pixels(photo, name, pose, surfels[name]), owner, group))
+                parts.append((*_object_pixels(photo, name, pose, surfels[name]), owner, view))
         if photo.on_table:
-            parts.append((*_table_pixels(photo, shadows.centre, covered_m), TABLE, group))
+            parts.append((*_table_pixels(photo, shadows.centre, covered_m), TABLE, view))
     columns = [np.concatenate([np.zeros((0, 3)), *(part[k] for part in parts)]) for k in range(4)]
     owner, view = (np.repeat([p[k] for p in parts], [len(p[0]) for p in parts]).astype(int) for k in (4, 5))
     return LitPixels(columns[0], columns[1], columns[2], columns[3], owner, view, shadows)

@@ -48,7 +48,6 @@ def photo_lamp(
     surfels: Sequence[Surfels],
     *,
     covered_m: tuple[float, float] | None = None,
-    shared_exposure: bool = False,
 ) -> NearLampFit:
     """The lamp and its place, from objects, the shadows that they cast and the table where that is known.
 
@@ -59,12 +58,11 @@ def photo_lamp(
         objects: what was found in them.
         surfels: of each object.
         covered_m: sides of a print that lies around the world's origin and hides the table, along x and y [m].
-        shared_exposure: all photographs have the same exposure and white balance.
 
     Raises:
         InvalidInput: if too few pixels show anything known.
     """
     poses = {found.name: found.best.pose for found in objects}
     known = dict(zip(poses, surfels, strict=True))
-    pixels = lit_pixels(photos, poses, known, covered_m=covered_m, shared_exposure=shared_exposure)
+    pixels = lit_pixels(photos, poses, known, covered_m=covered_m)
     return fit_near_lamp(pixels, np.zeros(3) if all(p.on_table for p in photos) else pixels.shadows.centre)

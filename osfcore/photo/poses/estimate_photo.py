@@ -154,7 +154,8 @@ def _on_table(
     )
     pose = table.T_world_camera.inverse() @ align(sharp, table.T_world_camera @ found.best.pose)[0]
     best = _photo_poses(pose[None], plain)[0]
-    return replace(found, best=best, refine_s=found.refine_s + time.perf_counter() - start)
+    doubt = doubt_of(found.name, best, found.rivals, plain)
+    return replace(found, best=best, doubt=doubt, refine_s=found.refine_s + time.perf_counter() - start)
 
 
 def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
@@ -194,7 +195,7 @@ def find_object(
     )
     poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
     ends = [align(sharp, poses[k])[0] for k in range(len(poses.position))]
-    poses = Pose(np.stack([p.position for p in ends]), np.stack([p.quaternion for p in ends]))
+    poses = Pose.stacked(ends)
     ready = _photo_poses(poses, fine)
     best, *rivals = (ready[k] for k in distinct(poses, np.array([p.loss for p in ready]), _ALIGNED, _APART_DEG))
     doubt = doubt_of(name, best, rivals, fine)

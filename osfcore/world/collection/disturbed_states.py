@@ -124,7 +124,7 @@ class _Track:
         for _ in range(_TICKS):
             physics.step(self._episode.actions[step // SUBSTEPS])
         poses = [physics.pose(name) for name in names]
-        return Pose(np.array([p.position for p in poses]), np.array([p.quaternion for p in poses]))
+        return Pose.stacked(poses)
 
 
 def _noise(

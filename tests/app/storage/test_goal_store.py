@@ -96,12 +96,17 @@ def test_names_that_lead_elsewhere_name_nothing(store, tmp_path, name):
     assert left(tmp_path) == ["a"]
 
 
-@pytest.mark.parametrize("step", ["mkdir", "write_bytes", "write_text", "rename"])
-def test_a_full_disk_is_told_and_leaves_nothing(store, tmp_path, monkeypatch, step):
+@pytest.mark.parametrize(
+    ("step", "file"), [("mkdir", None), ("write_bytes", "goal.png"), ("write_bytes", "goal.json"), ("rename", None)]
+)
+def test_a_full_disk_is_told_and_leaves_nothing(store, tmp_path, monkeypatch, step, file):
     store.keep(goal(), PNG)
+    usual = getattr(Path, step)
 
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
+    def full(path, *given, **named):
+        if file in (None, path.name):
+            raise OSError(28, "No space left on device")
+        return usual(path, *given, **named)
 
     monkeypatch.setattr(Path, step, full)
     with pytest.raises(CannotStore, match="No space left"):

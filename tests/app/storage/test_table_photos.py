@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.processes.messages.photo_messages import Mark, Stroke
-from app.storage.table_photos import MarkedObject, TablePhoto, TablePhotoStore, TooManyPhotos
+from app.storage.table_photos import MarkedObject, TablePhoto, TablePhotoStore, TooManyPhotos, mask_file
 from osfcore.errors import UnknownName
 from osfcore.geometry.poses import Pose
 
@@ -49,7 +49,7 @@ def test_a_photo_without_a_board_has_no_pose(store):
 def test_other_facts_take_the_place_of_those_before_with_files(store):
     store.keep(record(objects=()), b"", b"")
     with_choice = (replace(MUG, choice=2),)
-    files = {store.mask("p1", MUG.name): b"png"}
+    files = {mask_file(MUG.name): b"png"}
     store.change("p1", lambda latest: replace(latest, objects=with_choice), files)
     assert store.get("p1").marked(MUG.name).choice == 2
     assert store.mask("p1", MUG.name).read_bytes() == b"png"

@@ -1,11 +1,8 @@
 """Two photos of one table with the printed board: how it is, and how it should be."""
 
-import io
-
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
@@ -13,12 +10,11 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import Board
-from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.world.conditions import Conditions
 from osfcore.world.imaging.optics import TableSurface
 from osfcore.world.physics import lowest_point
 from osfcore.world.tabletop import Tabletop
-from tests.app.api.routes.test_table_photos import ANY, WAIT_S, mark
+from tests.app.api.routes.test_table_photos import ANY, WAIT_S, box_around, jpeg_of, mark
 from tests.app.conftest import until
 
 BOX, CAN = NAMES = ("003_cracker_box", "005_tomato_soup_can")
@@ -49,14 +45,8 @@ def photograph(world, library, places, camera):
     stacked = Pose(np.array([p.position for p in poses]), np.array([p.quaternion for p in poses]))
     world.load(SceneState(NAMES, stacked, Light(np.array([0.2, -0.3, 1.0])), None))
     seen = world.render((camera,), masks=True, with_pusher=False)
-    data = io.BytesIO()
-    encoded = np.round(255 * srgb_of_linear(np.clip(seen.images[0], 0, 1))).astype(np.uint8)
-    Image.fromarray(encoded).save(data, "JPEG", quality=95)
-    boxes = {}
-    for name, mask in zip(NAMES, seen.masks[0], strict=True):
-        ys, xs = np.nonzero(mask)
-        boxes[name] = [float(v) for v in (xs.min() - 6, ys.min() - 6, xs.max() + 6, ys.max() + 6)]
-    return data.getvalue(), boxes
+    boxes = {name: box_around(mask) for name, mask in zip(NAMES, seen.masks[0], strict=True)}
+    return jpeg_of(np.clip(seen.images[0], 0, 1)), boxes
 
 
 def looked_at(service, jpeg, boxes, name):
