@@ -111,7 +111,7 @@ function thinned(points) {
 export function setUpMarks({ onBox, onClick, onStroke }) {
   const canvas = byId("photo-svg");
   canvas.addEventListener("pointerdown", (event) => {
-    if (!photo || event.button || drag || stage().classList.contains("busy")) return;
+    if (!photo || event.button || drag) return;
     wipeTo(0); // or one would mark what is not there
     canvas.setPointerCapture(event.pointerId);
     drag = { points: [at(event)], from: event };

@@ -21,6 +21,7 @@ let seen = ""; // the state of the search that was drawn last
 let doubtsOf = ""; // the search whose doubts were taken as they are, or not
 let before = null; // {name, mark}: what an outline was before it was mended last
 let isMarking = false;
+let marking = Promise.resolve(); // the mark that was made last
 
 const path = (rest = "") => `photos/${encodeURIComponent(photo.id)}${rest}`;
 const objectPath = (name, rest = "") => path(`/objects/${encodeURIComponent(name)}${rest}`);
@@ -222,6 +223,14 @@ function click(point, tool) {
   });
 }
 
+/** Marks wait for those before them: each changes what the one before has left. */
+function inTurn(work) {
+  return (...mark) => {
+    const { id } = photo;
+    marking = marking.then(() => tellFailure(async () => (photo?.id === id ? work(...mark) : undefined)));
+  };
+}
+
 async function find() {
   const together = [...byId("photo-together").querySelectorAll("input:checked")].map(({ value }) => value);
   show(await post(path("/find"), { together, seed: 0 }));
@@ -252,9 +261,9 @@ export async function refreshPhotos() {
 
 export function setUpPhoto() {
   setUpMarks({
-    onBox: (box) => mark({ box, on: [], off: [], strokes: [] }),
-    onClick: click,
-    onStroke: (points, radius, tool) => mend((mark) => ({ ...mark, strokes: [...mark.strokes, { adds: tool === "add", radius, points }] })),
+    onBox: inTurn((box) => mark({ box, on: [], off: [], strokes: [] })),
+    onClick: inTurn(click),
+    onStroke: inTurn((points, radius, tool) => mend((mark) => ({ ...mark, strokes: [...mark.strokes, { adds: tool === "add", radius, points }] }))),
   });
   const file = byId("table-photo-file");
   byId("upload-table-photo").addEventListener("click", () => file.click());

@@ -65,8 +65,9 @@ class Driver:
             raise NotDriving
 
     def may_drive(self, visitor: str | None) -> bool:
-        """Whether a page drives, or nobody does; programs, which have no name, always may."""
-        return visitor is None or self.now().driver in (None, visitor)
+        """Whether a page drives, or no page is open that could; programs, which have no name, always may."""
+        with self._lock:
+            return visitor is None or self._driver in (None, visitor) or not self._streams
 
     def arrive(self, visitor: str) -> None:
         """A page has opened its stream; the first one drives."""

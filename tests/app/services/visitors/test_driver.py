@@ -95,3 +95,12 @@ def test_somebody_drives_exactly_while_pages_are_open(moves):
         assert now == told[-1]
         assert now.visitors == len(set(open_pages))
         assert now.driver in (open_pages or [None])
+
+
+def test_who_comes_alone_need_not_wait_for_a_driver_who_left():
+    driver = Driver(lambda _: None, grace_s=60.0)
+    driver.arrive("a")
+    driver.leave("a")
+    assert driver.may_drive("b"), "its stream may open a moment later"
+    driver.arrive("c")
+    assert [driver.may_drive(who) for who in "ac"] == [False, True]
