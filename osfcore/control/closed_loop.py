@@ -8,15 +8,13 @@ drawn anew.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
+from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.estimators import Estimators
 from osfcore.control.events import (
@@ -38,9 +36,9 @@ from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels
 from osfcore.control.sight import Sight
+from osfcore.control.stage_timer import StageTimer
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
-from osfcore.estimation.goal_image import estimate_goal
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import expected_residuals
 from osfcore.geometry.cameras import Camera, goal_camera
@@ -55,7 +53,6 @@ from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.render.types import Quality, SceneBatch
 
-StepT = TypeVar("StepT")
 _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
@@ -99,7 +96,8 @@ class Episode:
         self._progress, self._sight = ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
         self._searches = 0
-        self._seconds: dict[str, float] = {}
+        self._timer = StageTimer()
+        self._usual_models = self._scene = self._of_goal = AdaptedModels(models.appearance)
         self._before: SceneState | None = None  # one action before the estimate
         self._expected: SceneState | None = None  # what the last action should have led to
 
@@ -139,11 +137,16 @@ class Episode:
         self._check_objects(observation.names)
         if self._start is None:
             steps = self._how.first_frame(self._models.appearance, observation, self._rng)
-            self._estimate = yield from self._look("first", observation, steps)
+            found = yield from self._look("first", observation, steps)
+            self._estimate = found.estimate
+            self._scene = self._of_goal = self._scene.to(found.image_model, observation.names)
+            observation = self._scene.normalized(observation)
+            if found.image_model is not None:
+                yield self._noticed("pictures", f"The pictures are {found.image_model.told}; allowed for.")
         else:
             self._estimate = self._start
         self._estimate = self._estimate.with_pusher(observation.pusher)
-        self._usual = expected_residuals(self._models.appearance, observation, self._estimate.state)
+        self._usual = expected_residuals(self._scene.models, observation, self._estimate.state)
         self._weak = frozenset(self._estimate.doubted)
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
@@ -154,20 +157,20 @@ class Episode:
         observation, changes = self._sight.take(raw)
         for change in changes:
             yield self._noticed(change.matter, change.text)
-        return observation
+        return self._scene.normalized(observation)
 
     def _look(
         self, look: Look, observation: Observation, steps: Iterator[EstimateStep]
-    ) -> Iterator[Event]:  # returns the EstimatedState
+    ) -> Iterator[Event]:  # returns the last EstimateStep
         """What was prepared, if it fits; else what an estimator finds."""
-        with self._measure_time(look):
+        with self._timer.stage(look):
             step = None if self._prepared is None else self._prepared.step(look, self._models.appearance, observation)
         if step is None:
             return (yield from self._run_estimator(look, steps))
         yield Looking(self._number, look, step)
         what = "first frame" if look == "first" else "goal image"
         yield self._noticed("prepared", f"The estimate of the {what} was prepared with this example.")
-        return step.estimate
+        return step
 
     def _check_objects(self, names: tuple[str, ...]) -> None:
         if isinstance(self._target, PoseGoal) and set(self._target.names) != set(names):
@@ -175,21 +178,22 @@ class Episode:
 
     def _run_estimator(
         self, look: Look, steps: Iterator[EstimateStep]
-    ) -> Iterator[Event]:  # returns the EstimatedState
-        estimate = None
-        for step in self._timed(look if look in ("first", "goal") else "estimate", steps):
-            estimate = step.estimate
+    ) -> Iterator[Event]:  # returns the last EstimateStep
+        last = None
+        for step in self._timer.steps(look if look in ("first", "goal") else "estimate", steps):
+            last = step
             yield Looking(self._number, look, step)
-        assert estimate is not None, "the last step brings the estimate"
-        return estimate
+        assert last is not None
+        assert last.estimate is not None, "the last step brings the estimate"
+        return last
 
     def _look_again(self) -> Iterator[Event]:
         observation = yield from self._observe()
         before = self._estimate
         expected = before.state if self._expected is None else self._expected
-        models = self._models.appearance
-        steps = self._how.later_frame(models, observation, expected, self._rng, self._usual)
-        self._estimate = (yield from self._run_estimator("next", steps)).with_pusher(observation.pusher)
+        steps = self._how.later_frame(self._scene.models, observation, expected, self._rng, self._usual)
+        found = yield from self._run_estimator("next", steps)
+        self._estimate = found.estimate.with_pusher(observation.pusher)
         yield from self._noticed_changes(before, expected)
         yield from self._find_lost()
         self._expected = None
@@ -218,8 +222,9 @@ class Episode:
         if self.settings.acting:
             yield from self._retreat()
         observation = yield from self._observe()
-        steps = relocalize(self._models.appearance, observation, self._estimate, self._rng, self._how.goal)
-        self._estimate = (yield from self._run_estimator("search", steps)).with_pusher(observation.pusher)
+        steps = relocalize(self._scene.models, observation, self._estimate, self._rng, self._how.goal)
+        found = yield from self._run_estimator("search", steps)
+        self._estimate = found.estimate.with_pusher(observation.pusher)
         self._planner.reset()
         self._before = None
         if self._estimate.trusted:
@@ -239,12 +244,14 @@ class Episode:
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
         target, state, estimate, doubts, photo = self._target, self._estimate.state, None, "", None
         if isinstance(target, GoalImage):
-            seen = target.observed(state.names)
-            steps = estimate_goal(self._models.appearance, seen, state, self._how.goal)
-            estimate = yield from self._look("goal", seen, steps)
-            estimate = prefer_current_poses(self._models.appearance, target, estimate, state)
+            steps = estimate_goal_image(self._usual_models, self._scene, target, state, self._how.goal)
+            found = yield from self._look("goal", target.observed(state.names), steps)
+            self._of_goal = self._usual_models if found.image_model is None else self._scene
+            shown = self._of_goal.normalized_goal(target)
+            estimate = prefer_current_poses(self._of_goal.models, shown, found.estimate, state)
             goal, doubts = PoseGoal(estimate.state.names, estimate.state.poses), estimate.reason
-            light, camera, image = estimate.state.light, target.camera, target.image
+            light, camera, image = estimate.state.light, target.camera, shown.image
+            photo = None if shown is target else target
         else:
             goal, light, photo = target, state.light, target.photo if isinstance(target, PhotoGoal) else None
             camera = goal_camera() if photo is None else photo.camera
@@ -268,13 +275,13 @@ class Episode:
         self._planner.settings = replace(plan, horizon=min(plan.horizon, left))
         self._goal = nearest_symmetric_goal(self._goal, self._estimate.state, self._models.symmetries)
         rounds = self._planner.plan(self._estimate.state, self._goal, self._cost(), self._rng, self._before)
-        for one in self._timed("plan", rounds):
+        for one in self._timer.steps("plan", rounds):
             yield Planning(self._number, one)
 
     def _cost(self) -> Cost:
         if self.settings.cost == "pose":
             return PoseCost(self._goal)
-        return ImageCost(self._models.appearance.together, self._camera, self._image, self._light)
+        return ImageCost(self._of_goal.models.together, self._camera, self._image, self._light)
 
     def _act(self) -> Iterator[Event]:
         actions = self._planner.nominal(min(self.settings.replan_every, self.settings.steps - self._number))
@@ -287,28 +294,10 @@ class Episode:
         self._expected = _future(futures, len(actions), state)
 
     def _execute(self, action: Float[np.ndarray, "3"]) -> ActionExecuted:
-        with self._measure_time("act"):
+        with self._timer.stage("act"):
             self._world.act(action)
         self._number += 1
         return ActionExecuted(self._number, action)
-
-    # Time: what whoever drives this takes between two events does not count
-
-    @contextmanager
-    def _measure_time(self, stage: str) -> Iterator[None]:
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - began
-
-    def _timed(self, stage: str, steps: Iterator[StepT]) -> Iterator[StepT]:
-        while True:
-            with self._measure_time(stage):
-                step = next(steps, None)
-            if step is None:
-                return
-            yield step
 
     # Telling
 
@@ -328,13 +317,13 @@ class Episode:
         far, turned = offsets(self._goal, estimate.state)
         rendered = self._rendered(estimate.state, self._camera, self._light)
         cost = float(((rendered - self._image) ** 2).mean())
-        seconds, self._seconds = self._seconds, {}
-        return Stepped(self._number, self.settings.steps, estimate, far, turned, cost, rendered, seconds)
+        taken = self._timer.taken()
+        return Stepped(self._number, self.settings.steps, estimate, far, turned, cost, rendered, taken)
 
     def _rendered(self, state: SceneState, camera: Camera, light: Light) -> Float[np.ndarray, "h w 3"]:
         """The scene without the pusher, as the goal image would show it."""
         batch = SceneBatch.of(replace(state, light=light, pusher=None))
-        return self._models.appearance.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
+        return self._of_goal.models.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
 
     def _noticed(self, matter: str, text: str, names: tuple[str, ...] = ()) -> Noticed:
         return Noticed(self._number, matter, text, names)  # pyright: ignore[reportArgumentType]

@@ -17,7 +17,7 @@ from osfcore.planning.mppi import PlanRound
 from osfcore.planning.pose_cost import PoseGoal
 
 Look = Literal["first", "goal", "next", "search"]
-Matter = Literal["goal", "lamp", "object", "lost", "found", "stalled", "camera", "brightness", "prepared"]
+Matter = Literal["goal", "lamp", "object", "lost", "found", "stalled", "camera", "brightness", "pictures", "prepared"]
 Outcome = Literal["reached", "out of steps", "refused"]
 
 

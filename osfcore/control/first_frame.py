@@ -3,14 +3,14 @@
 Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where no shadow
 tells, it is asked first, and its answer taken if the image model at its poses is the usual one. Otherwise an image
 model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
-linear pictures and once for sRGB ones; what leaves less unexplained is taken. Pictures and fields are made to agree,
-and the usual estimator finds poses and lamp. With these the image model is fitted once more, and Gauss-Newton does the
-last millimetres.
+linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one if objects are
+doubted at its end. Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the
+image model is fitted once more, and Gauss-Newton does the last millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -22,12 +22,11 @@ from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.photometry.calibration import Calibration, Calibrator
-from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.estimation.photometry.table_check import check_table
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
 from osfcore.estimation.search.pose_initialization import OVERHEAD, initial_poses
 from osfcore.estimation.step_reporter import StepReporter
-from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.steps import EstimateStep, all_but_last
 from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import Observation
@@ -65,7 +64,7 @@ def estimate_first(
         return
     calibrator = Calibrator(models, observation.names)
     if verdict == "unclear":
-        last = yield from _all_but_last(estimate_usual(models, observation, rng, config))
+        last = yield from all_but_last(estimate_usual(models, observation, rng, config))
         assert last.estimate is not None
         params = SceneParameters.of(last.estimate.state, observation.pusher)
         views = views_of(observation, _COARSE_SIDE, samples=2)
@@ -73,26 +72,33 @@ def estimate_first(
             yield last
             return
     poses = _rough_poses(models, observation)
-    rough = min((_calibrated(calibrator, observation, poses, e) for e in get_args(Encoding)), key=lambda r: r.loss)
-    if rough.is_sane:
-        yield from _steps(models, calibrator, rough, rng, config)
+    both = sorted(
+        (_calibrated(calibrator, observation, poses, e) for e in get_args(Encoding)), key=lambda one: one.loss
+    )
+    found: list[EstimateStep] = []
+    for one in (one for one in both if one.is_sane):
+        if found:  # and it is doubtful
+            yield replace(found[0], estimate=None)
+        found.append((yield from all_but_last(_steps(models, calibrator, one, rng, config))))
+        if not _doubted(found[-1]):
+            break
+    if found:
+        yield min(found, key=_doubted)
     else:
         yield from estimate_usual(models, observation, rng, config)
 
 
-def _all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None, EstimateStep]:
-    """Steps of an estimate but for the last one, which is returned."""
-    before = next(steps)
-    for step in steps:
-        yield before
-        before = step
-    return before
+def _doubted(last: EstimateStep) -> int:
+    """How many objects an estimate is not sure of."""
+    assert last.estimate is not None
+    return len(last.estimate.doubted)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Calibrated:
     """Pictures as a camera response makes them linear, and the image model that explains them."""
 
+    encoding: Encoding
     observation: Observation
     found: Calibration
 
@@ -120,7 +126,8 @@ def _calibrated(
     """The image model of pictures that are encoded so, from rough poses."""
     images = linear_from_encoded(observation.images, encoding).astype(np.float32)
     linear = replace(observation, images=images)
-    return _Calibrated(linear, calibrator.search(views_of(linear, _ROUGH_SIDE), views_of(linear, _COARSE_SIDE), params))
+    found = calibrator.search(views_of(linear, _ROUGH_SIDE), views_of(linear, _COARSE_SIDE), params)
+    return _Calibrated(encoding, linear, found)
 
 
 def _steps(
@@ -137,18 +144,14 @@ def _steps(
     assert before.estimate is not None
     reporter = StepReporter(before.progress.total + more)
     reporter.done = before.progress.total - 1
-    yield from _polished(models, calibrator, model, linear, before.estimate, reporter)
+    yield from _polished(models, calibrator, rough, before.estimate, reporter)
 
 
 def _polished(
-    models: ObjectModels,
-    calibrator: Calibrator,
-    model: ImageModel,
-    linear: Observation,
-    estimate: EstimatedState,
-    reporter: StepReporter,
+    models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, estimate: EstimatedState, reporter: StepReporter
 ) -> Iterator[EstimateStep]:
     """Image model, poses and lamp in turn."""
+    model, linear = rough.found.model, rough.observation
     at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
     middle, fine = (views_of(linear, side, samples=2) for side in (_COARSE_SIDE, FINE_SIDE))
     for number, (views, is_light_held) in enumerate(((middle, False), (fine, True)), 1):
@@ -163,4 +166,5 @@ def _polished(
         if number == _ROUNDS:
             fit = evaluate_fit(adapted, sharp, at.params)
             rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
-            yield reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))
+            last = reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))
+            yield replace(last, image_model=replace(model, encoding=rough.encoding))

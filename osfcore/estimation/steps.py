@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
@@ -31,6 +33,7 @@ class EstimateStep:
         losses: of each object, in the units of the stage.
         loss: of the whole, likewise.
         estimate: the result; only in the last step.
+        image_model: with it, of pictures that fields were not made for; None for usual pictures.
     """
 
     progress: Progress
@@ -42,3 +45,13 @@ class EstimateStep:
     losses: tuple[float, ...] = ()
     loss: float = float("nan")
     estimate: EstimatedState | None = None
+    image_model: ImageModel | None = None
+
+
+def all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None, EstimateStep]:
+    """Steps of an estimate but for the last one, which is returned."""
+    before = next(steps)
+    for step in steps:
+        yield before
+        before = step
+    return before

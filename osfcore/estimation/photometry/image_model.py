@@ -22,6 +22,7 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table_field import TableField
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.states import Observation
+from osfcore.photo.camera_response import Encoding, linear_from_encoded
 
 _USUAL = 0.12  # of the logarithm of each factor
 _ALBEDO = slice(1, 4)  # among a field's features
@@ -35,11 +36,13 @@ class ImageModel:
         gain: G, exposure and white balance, per colour.
         ambient: r, factor on the ambient light against the direct one.
         table: T, factors on the table's albedo, per colour.
+        encoding: of the values that pictures hold.
     """
 
     gain: Float[np.ndarray, "3"]
     ambient: float
     table: Float[np.ndarray, "3"]
+    encoding: Encoding = "linear"
 
     @property
     def scale(self) -> float:
@@ -50,11 +53,18 @@ class ImageModel:
     def is_usual(self) -> bool:
         """Whether fields were made for such pictures, within what a fit to right poses may be off."""
         factors = np.array([*self.gain, self.ambient, *self.table])
-        return bool(np.all(np.abs(np.log(factors)) < _USUAL))
+        return self.encoding == "linear" and bool(np.all(np.abs(np.log(factors)) < _USUAL))
+
+    @property
+    def told(self) -> str:
+        """What is unusual about the pictures, for a person."""
+        gain, table = float(np.mean(self.gain)), ", ".join(f"{factor:.2f}" for factor in self.table)
+        coded = "sRGB-encoded, " if self.encoding == "srgb" else ""
+        return f"{coded}exposed by {gain:.2f}, ambient light by {self.ambient:.2f}, the table by {table} of the usual"
 
     def normalized(self, observation: Observation) -> Observation:
         """The observation as it would be at the usual exposure."""
-        images = observation.images * (self.scale / self.gain)
+        images = linear_from_encoded(observation.images, self.encoding) * (self.scale / self.gain)
         return replace(observation, images=images.astype(np.float32))
 
     def adapted(self, models: ObjectModels, names: Iterable[str]) -> ObjectModels:

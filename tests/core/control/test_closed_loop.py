@@ -11,15 +11,18 @@ from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
+from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
+from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.planning.mppi import PlanSettings
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.progress import Progress
 from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, models, sure, table
 
+DARK = ImageModel(np.full(3, 0.67), 1.0, np.ones(3), "srgb")
 SMALL = EpisodeSettings(steps=12, plan=PlanSettings(samples=48, horizon=10))
 KNOWN = models()
 
@@ -92,7 +95,7 @@ def test_a_goal_image_that_is_not_explained_moves_nothing_unless_told_to(world, 
     state = replace(world.truth(), poses=goal.poses, pusher=None)
     found = sure(state, ("it differs", ""))
     step = EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=found)
-    monkeypatch.setattr(module, "estimate_goal", lambda *_: iter([step]))
+    monkeypatch.setattr(module, "estimate_goal_image", lambda *_: iter([step]))
     monkeypatch.setattr(module, "prefer_current_poses", lambda _models, _goal, found, _now: found)
     image = GoalImage(goal_camera(), np.zeros((128, 128, 3), np.float32))
     settings = replace(SMALL, steps=1, despite_doubts=despite)
@@ -190,6 +193,47 @@ def test_the_first_look_needs_masks_unless_it_is_known(world, told):
     events = list(begun(world, shifted(world), start=sure(state)).run())
     assert not any(isinstance(event, Looking) for event in events)
     assert events[0].observation.masks is None
+
+
+class DarkCameras:
+    """A world whose cameras hand over sRGB values at two thirds of the exposure."""
+
+    def __init__(self, world):
+        self._world, self.act = world, world.act
+
+    def observe(self, *, masks=False):
+        seen = self._world.observe(masks=masks)
+        return replace(seen, images=srgb_of_linear(DARK.gain * seen.images))
+
+
+def test_the_image_model_of_the_first_frame_holds_for_later_ones(world, told, monkeypatch):
+    """Later frames come at the usual exposure again, and the goal is compared with a table of the usual look."""
+    done = EstimateStep(Progress(1, 1, "Done"), "done", world.truth(), estimate=sure(world.truth()))
+    first = replace(done, image_model=DARK)
+    later = []
+
+    def next_steps(models, seen, *_, usual):
+        later.append(seen)
+        return iter([done])
+
+    monkeypatch.setattr(estimators, "estimate_first", lambda *_: iter([first]))
+    monkeypatch.setattr(estimators, "estimate_next", next_steps)
+    events = list(begun(DarkCameras(world), toward_middle(world), replace(SMALL, steps=1)).run())
+    np.testing.assert_allclose(later[-1].images, world.observe().images, atol=1e-4)
+    (told_of,) = (event for event in events if isinstance(event, Noticed))
+    assert told_of.matter == "pictures"
+    assert "sRGB" in told_of.text
+
+
+def test_by_real_eyes_later_frames_of_odd_pictures_are_right(world):
+    """Nobody tells that the cameras encode and expose otherwise; poses are right before and after a push."""
+    goal = toward_middle(world)
+    stepped = [e for e in begun(DarkCameras(world), goal, replace(SMALL, steps=3)).run() if isinstance(e, Stepped)]
+    truth = world.truth()
+    assert len(stepped) == 4
+    assert stepped[-1].estimate.trusted, stepped[-1].estimate.reason
+    for name in NAMES:
+        assert stepped[-1].estimate.state.pose(name).position == pytest.approx(truth.pose(name).position, abs=0.005)
 
 
 def test_by_real_eyes_a_lamp_and_an_object_moved_by_hand_are_survived(world):

@@ -42,6 +42,11 @@ def test_usual_pictures_are_estimated_as_ever_to_the_last_bit(models, truth):
 
 
 @pytest.mark.slow
+def test_usual_pictures_have_no_image_model_of_their_own(models, truth):
+    assert steps_of(estimate_first, models, observe(models, truth, default_cameras(48)[2:]))[-1].image_model is None
+
+
+@pytest.mark.slow
 def test_poses_and_light_of_an_srgb_picture_of_another_table_at_another_exposure(models, truth):
     shown = observe(OTHER.adapted(models, NAMES), truth, default_cameras(96)[1:])
     linear = np.clip(shown.images * (OTHER.gain / OTHER.scale), 0, 1)
@@ -52,6 +57,9 @@ def test_poses_and_light_of_an_srgb_picture_of_another_table_at_another_exposure
     assert np.rad2deg(turn).max() < 5
     assert np.rad2deg(light) < 5
     assert estimate.trusted, estimate.reason
+    found = steps[-1].image_model
+    assert found.encoding == "srgb"
+    np.testing.assert_allclose([*found.gain, found.ambient], [*OTHER.gain, OTHER.ambient], rtol=0.15)
     assert [step.progress.done for step in steps] == list(range(1, len(steps) + 1))
     assert {step.progress.total for step in steps} == {len(steps)}
     assert [step.estimate is None for step in steps] == [True] * (len(steps) - 1) + [False]

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import AMBIENT, DIFFUSE
+from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.render.types import SceneBatch
 from tests.core.estimation.scenes import BOTTLE, BOX, observe
 
@@ -18,6 +21,16 @@ def rendered(models, state):
 def test_the_usual_image_model_changes_nothing(models, truth, seen):
     np.testing.assert_array_equal(rendered(USUAL.adapted(models, (BOX, BOTTLE)), truth), rendered(models, truth))
     np.testing.assert_array_equal(USUAL.normalized(seen).images, seen.images.astype(np.float32))
+
+
+def test_encoded_pictures_are_decoded_and_brought_to_the_usual_exposure(seen):
+    taken = replace(seen, images=srgb_of_linear(seen.images * (OTHER.gain / OTHER.scale)))
+    np.testing.assert_allclose(replace(OTHER, encoding="srgb").normalized(taken).images, seen.images, atol=1e-5)
+
+
+def test_it_tells_what_is_unusual():
+    told = replace(OTHER, encoding="srgb").told
+    assert all(word in told for word in ("sRGB", "0.70", "2.00", "0.50, 0.80, 1.20"))
 
 
 def test_a_white_surface_that_faces_the_lamp_keeps_its_radiance():
