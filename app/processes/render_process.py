@@ -107,7 +107,7 @@ class NeuralRenderer:
     def _photograph(self, order: DrawPhoto) -> bytes:
         import cv2
 
-        from osfcore.photo.camera_response import linear_from_encoded, srgb_of_linear
+        from osfcore.estimation.photometry.camera_response import linear_from_encoded, srgb_of_linear
         from osfcore.render.types import EXACT
 
         def sized(picture: np.ndarray) -> np.ndarray:

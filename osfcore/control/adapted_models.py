@@ -9,6 +9,7 @@ from osfcore.control.goal import GoalImage
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.scaled_fields import adapted
 from osfcore.estimation.steps import EstimateStep, all_but_last
 from osfcore.geometry.states import Observation, SceneState
 
@@ -32,7 +33,7 @@ class AdaptedModels:
             image_model: of the pictures; None leaves everything as it is.
             names: of the objects that are needed.
         """
-        return self if image_model is None else AdaptedModels(image_model.adapted(self.models, names), image_model)
+        return self if image_model is None else AdaptedModels(adapted(self.models, names, image_model), image_model)
 
     def normalized(self, observation: Observation) -> Observation:
         """Pictures as these models show them."""
@@ -64,10 +65,10 @@ def estimate_goal_image(
 
 
 def _estimated(
-    adapted: AdaptedModels, goal: GoalImage, prior: SceneState, config: GoalImageConfig | None
+    models: AdaptedModels, goal: GoalImage, prior: SceneState, config: GoalImageConfig | None
 ) -> Iterator[EstimateStep]:
-    for step in estimate_goal(adapted.models, adapted.normalized_goal(goal).observed(prior.names), prior, config):
-        yield step if step.estimate is None else replace(step, image_model=adapted.image_model)
+    for step in estimate_goal(models.models, models.normalized_goal(goal).observed(prior.names), prior, config):
+        yield step if step.estimate is None else replace(step, image_model=models.image_model)
 
 
 def _is_trusted(step: EstimateStep) -> bool:

@@ -22,6 +22,8 @@ from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.photometry.calibration import Calibration, Calibrator
+from osfcore.estimation.photometry.camera_response import Encoding, linear_from_encoded
+from osfcore.estimation.photometry.scaled_fields import adapted
 from osfcore.estimation.photometry.table_check import check_table
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
 from osfcore.estimation.search.pose_initialization import OVERHEAD, initial_poses
@@ -30,7 +32,6 @@ from osfcore.estimation.steps import EstimateStep, all_but_last
 from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import Observation
-from osfcore.photo.camera_response import Encoding, linear_from_encoded
 from osfcore.progress import Progress
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
@@ -135,7 +136,7 @@ def _steps(
 ) -> Iterator[EstimateStep]:
     """The usual estimator on pictures and models that agree, then both once more."""
     model, linear, more = rough.found.model, rough.observation, _ROUNDS * _ITERATIONS
-    usual = estimate_usual(model.adapted(models, linear.names), model.normalized(linear), rng, config)
+    usual = estimate_usual(adapted(models, linear.names, model), model.normalized(linear), rng, config)
     before = next(usual)
     for step in usual:
         progress = before.progress
@@ -157,14 +158,14 @@ def _polished(
     for number, (views, is_light_held) in enumerate(((middle, False), (fine, True)), 1):
         found = calibrator.refine(views, at.params, model.ambient, hold_light=is_light_held)
         model = found.model
-        adapted, normal = model.adapted(models, linear.names), model.normalized(linear)
+        fitting, normal = adapted(models, linear.names, model), model.normalized(linear)
         sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
         at = GaussNewtonState.at(replace(at.params, light=found.light))
-        for step in gauss_newton(adapted, sharp, at, iterations=_ITERATIONS, light=soft):
+        for step in gauss_newton(fitting, sharp, at, iterations=_ITERATIONS, light=soft):
             at = step
             yield reporter.refinement("Exposure and table", at)
         if number == _ROUNDS:
-            fit = evaluate_fit(adapted, sharp, at.params)
+            fit = evaluate_fit(fitting, sharp, at.params)
             rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
             last = reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))
             yield replace(last, image_model=replace(model, encoding=rough.encoding))

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels
 from osfcore.photo.poses.object_window import object_windows

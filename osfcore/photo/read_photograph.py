@@ -19,8 +19,8 @@ from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 
 from osfcore.errors import CorruptFile, OsfError, check_ranges, shown
+from osfcore.estimation.photometry.camera_response import Encoding, linear_from_encoded
 from osfcore.geometry.poses import Pose
-from osfcore.photo.camera_response import Encoding, linear_from_encoded
 from osfcore.photo.photograph import Photograph
 
 FORMATS = ("PNG", "JPEG", "WEBP", "HEIF", "AVIF", "TIFF", "GIF", "BMP")

@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float, Float32
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
-from osfcore.estimation.photometry.image_model import ImageModel, scaled_field, scaled_table
+from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.scaled_fields import scaled_field, scaled_table
 from osfcore.estimation.search.light_search import hemisphere
 from osfcore.render.types import SceneBatch
 

@@ -11,21 +11,16 @@ which faces the lamp has radiance 1 again, because errors are judged in radiance
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.table_field import TableField
+from osfcore.estimation.photometry.camera_response import Encoding, linear_from_encoded
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.states import Observation
-from osfcore.photo.camera_response import Encoding, linear_from_encoded
 
 _USUAL = 0.12  # of the logarithm of each factor
-_ALBEDO = slice(1, 4)  # among a field's features
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -66,24 +61,3 @@ class ImageModel:
         """The observation as it would be at the usual exposure."""
         images = linear_from_encoded(observation.images, self.encoding) * (self.scale / self.gain)
         return replace(observation, images=images.astype(np.float32))
-
-    def adapted(self, models: ObjectModels, names: Iterable[str]) -> ObjectModels:
-        """Models of some objects that show what `normalized` pictures do."""
-        return models.changed(
-            names,
-            lambda field: scaled_field(field, self.scale, self.ambient),
-            lambda table: scaled_table(table, self.scale * self.table, self.ambient),
-        )
-
-
-def scaled_field(field: KiloOSF, albedo: float, ambient: float) -> KiloOSF:
-    """A field with factors on its albedo and on its ambient light."""
-    rows = field.rows.copy()
-    rows[:, _ALBEDO] *= np.float32(albedo)
-    return replace(field, rows=rows, ambient=field.ambient * np.float32(ambient))
-
-
-def scaled_table(table: TableField, albedo: Float[np.ndarray, "3"], ambient: float) -> TableField:
-    """A table with factors on its albedo, per colour, and on its ambient light."""
-    factors = np.asarray(albedo, np.float32)
-    return replace(table, albedo=table.albedo * factors, ambient=table.ambient * np.float32(ambient))

@@ -24,10 +24,10 @@ from jaxtyping import Bool, Float
 from pydantic import Field, FiniteFloat
 
 from osfcore.errors import CorruptFile
+from osfcore.estimation.photometry.camera_response import linear_from_encoded
 from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode
-from osfcore.photo.camera_response import linear_from_encoded
 from osfcore.photo.photograph import Photograph
 
 PHOTO_FILE = "photo.json"

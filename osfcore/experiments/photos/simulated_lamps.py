@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from osfcore.estimation.photometry.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
@@ -18,7 +19,6 @@ from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import Observation
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.photo.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.photo.photograph import Photograph
 from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.conditions import Conditions

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from osfcore.estimation.photometry.camera_response import linear_of_srgb, srgb_of_linear
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.io.image_file import to_uint8
-from osfcore.photo.camera_response import linear_of_srgb, srgb_of_linear
 
 ImageChange = Literal["none", "noise", "jpeg", "srgb_8bit", "srgb_8bit_decoded", "srgb_noise_jpeg"]
 NOISE_SIGMA = 0.02  # of each channel of each pixel

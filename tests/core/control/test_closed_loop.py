@@ -11,12 +11,12 @@ from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
+from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.planning.mppi import PlanSettings
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.progress import Progress

@@ -9,9 +9,10 @@ from osfcore.control.first_frame import estimate_first
 from osfcore.errors import InvalidInput
 from osfcore.estimation.first_frame import FirstFrameConfig
 from osfcore.estimation.first_frame import estimate_first as estimate_usual
+from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.scaled_fields import adapted
 from osfcore.geometry.cameras import default_cameras
-from osfcore.photo.camera_response import srgb_of_linear
 from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, apart, lying, observe, scene, shipped_models
 
 QUICK = FirstFrameConfig(2, 6, 2, 8, 2, 3, 2)
@@ -48,7 +49,7 @@ def test_usual_pictures_have_no_image_model_of_their_own(models, truth):
 
 @pytest.mark.slow
 def test_poses_and_light_of_an_srgb_picture_of_another_table_at_another_exposure(models, truth):
-    shown = observe(OTHER.adapted(models, NAMES), truth, default_cameras(96)[1:])
+    shown = observe(adapted(models, NAMES, OTHER), truth, default_cameras(96)[1:])
     linear = np.clip(shown.images * (OTHER.gain / OTHER.scale), 0, 1)
     steps = steps_of(estimate_first, models, replace(shown, images=srgb_of_linear(linear)))
     estimate = steps[-1].estimate

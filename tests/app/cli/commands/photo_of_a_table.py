@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.experiments.photos.board_views import board_photograph
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.board import Board
-from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 

@@ -8,6 +8,7 @@ import pytest
 from osfcore.estimation.objective.observed_views import views_of
 from osfcore.estimation.photometry.calibration import Calibrator
 from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.scaled_fields import adapted
 from osfcore.estimation.photometry.table_check import check_table
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, lying, observe, params_of, scene
@@ -25,7 +26,7 @@ def truth(models):
 
 def taken(models, state, model):
     """What cameras see under an image model: `normalized` undone on what `adapted` models show."""
-    shown = observe(model.adapted(models, NAMES), state, CAMERAS)
+    shown = observe(adapted(models, NAMES, model), state, CAMERAS)
     return replace(shown, images=shown.images * (model.gain / model.scale))
 
 

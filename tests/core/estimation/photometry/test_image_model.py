@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.photometry.scaled_fields import adapted
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import AMBIENT, DIFFUSE
-from osfcore.photo.camera_response import srgb_of_linear
 from osfcore.render.types import SceneBatch
 from tests.core.estimation.scenes import BOTTLE, BOX, observe
 
@@ -19,7 +20,7 @@ def rendered(models, state):
 
 
 def test_the_usual_image_model_changes_nothing(models, truth, seen):
-    np.testing.assert_array_equal(rendered(USUAL.adapted(models, (BOX, BOTTLE)), truth), rendered(models, truth))
+    np.testing.assert_array_equal(rendered(adapted(models, (BOX, BOTTLE), USUAL), truth), rendered(models, truth))
     np.testing.assert_array_equal(USUAL.normalized(seen).images, seen.images.astype(np.float32))
 
 
@@ -40,7 +41,7 @@ def test_a_white_surface_that_faces_the_lamp_keeps_its_radiance():
 def test_radiance_is_linear_in_the_ambient_light(models, truth):
     """With ambient light r, the scale apart, a picture is that without ambient light plus r times the ambient part."""
     plain = [
-        rendered(model.adapted(models, truth.names), truth) / model.scale
+        rendered(adapted(models, truth.names, model), truth) / model.scale
         for model in (ImageModel(np.ones(3), r, np.ones(3)) for r in (0.5, 1.0, 1.5))
     ]
     np.testing.assert_allclose(plain[0] + plain[2], 2 * plain[1], atol=1e-5)
@@ -50,7 +51,7 @@ def test_the_tables_colour_does_not_change_objects(models, truth):
     names = truth.names
     other = ImageModel(np.ones(3), 1.0, OTHER.table)
     shown = observe(models, truth, default_cameras(48)[:1])
-    ours, theirs = rendered(models, truth), rendered(other.adapted(models, names), truth)
+    ours, theirs = rendered(models, truth), rendered(adapted(models, names, other), truth)
     inside = models.together.render(SceneBatch.of(truth), shown.cameras, outputs={"rgb", "opacity"}).opacity[0, 0]
     solid, bare = inside.sum(axis=0) > 0.999, inside.sum(axis=0) == 0
     np.testing.assert_allclose(theirs[solid], ours[solid], atol=2e-3)

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
+from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.experiments.rearrangement.sensor import CameraError, received, resized_masks
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import rotation_angle
-from osfcore.photo.camera_response import srgb_of_linear
 
 IMAGE = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 1, (48, 64, 3)), (0, 0), 2).astype(np.float32)
 CAMERA = Camera.look_at("above", (0, 0, 0.9), (0, 0, 0))
