@@ -1,4 +1,4 @@
-"""How far lamps that photographs tell are from true ones, in simulated scenes."""
+"""How far lamps that photographs tell are from true ones, in simulated scenes; poses are estimated from masks alone."""
 
 from __future__ import annotations
 
@@ -13,13 +13,18 @@ import numpy as np
 from osfcore.errors import check_ranges, check_seed
 from osfcore.experiments.photos.simulated_lamps import LampScene, lamp_scene
 from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose
 from osfcore.io.files import write_json
+from osfcore.metrics.pose_errors import rotation_error
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.objects.catalogue import CATALOGUE
 from osfcore.photo.light.photo_light import photo_lamp
-from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels
-from osfcore.photo.poses.photo_steps import PhotoObject, PhotoPose
+from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels, estimate_photo
+from osfcore.photo.poses.photo_steps import PhotoObject
+from osfcore.random_streams import Stream, stream_rng
 
 _RIGHT_DEG, _RIGHT_PERCENT = 5.0, 15.0
+_CLOSE_M, _CLOSE_DEG = 0.015, 10.0
 _FAR_EVERY = 4  # near lamps there is a distant one
 _MOST_TASKS = 1000
 _MOST_VIEWS = 4
@@ -55,7 +60,9 @@ class LampScore:
         true_m: distance from there; None for a distant lamp.
         distance_m: that was found; None if it was said to be unknown.
         is_diffuse: the light was called diffuse.
-        seconds: that it took.
+        poses: objects that were found.
+        right_poses: of them, those within 15 mm and 10 deg, symmetries counted.
+        seconds: that the lamp took.
     """
 
     number: int
@@ -66,6 +73,8 @@ class LampScore:
     true_m: float | None
     distance_m: float | None
     is_diffuse: bool
+    poses: int
+    right_poses: int
     seconds: float
 
     @property
@@ -102,6 +111,8 @@ class LampReport:
             "distant_tasks": len(far),
             **_figures("distant_direction_deg", [s.direction_deg for s in far]),
             "distant_undetermined": sum(s.distance_m is None for s in far),
+            "poses_total": sum(s.poses for s in self.scores),
+            "poses_15mm_10deg": sum(s.right_poses for s in self.scores) / max(sum(s.poses for s in self.scores), 1),
             "lamp_s_median": float(np.median([s.seconds for s in self.scores])) if self.scores else None,
             "scores": [asdict(s) for s in self.scores],
         }
@@ -139,27 +150,34 @@ def evaluate_lamps(config: EvaluateLamps, library: AssetLibrary, fields: FieldLi
         yield LampsStep(done, len(cases), f"A {'near' if is_near else 'distant'} lamp")
         wooden = bool(number % 2)
         scene = lamp_scene(library, names, config.seed, number, config.views, is_near=is_near, is_wooden=wooden)
-        scores.append(_score(models, scene, number, wooden))
+        rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, number, int(is_near))
+        scores.append(_score(models, scene, number, rng, is_wooden=wooden))
     report = LampReport(tuple(scores))
     write_json(config.folder / "report.json", report.to_json())
     yield LampsStep(len(cases), len(cases), "Everything is measured", report)
 
 
-def _score(models: PhotoModels, scene: LampScene, number: int, is_wooden: bool) -> LampScore:
-    objects = [
-        PhotoObject(name, PhotoPose(pose, 0.0, 1.0, 0.0, 1.0), (), "", 0.0, 0.0)
-        for name, pose in zip(scene.names, scene.poses, strict=True)
-    ]
-    surfels = [models.surfels(name, FINE_ACROSS) for name in scene.names]
+def _score(
+    models: PhotoModels, scene: LampScene, number: int, rng: np.random.Generator, *, is_wooden: bool
+) -> LampScore:
+    *_, last = estimate_photo(models, scene.photos, tuple(scene.poses), rng)
+    surfels = [models.surfels(name, FINE_ACROSS) for name in scene.poses]
     start = time.perf_counter()
-    found = photo_lamp(scene.photos, objects, surfels)
+    found = photo_lamp(scene.photos, last.found, surfels)
     seconds = time.perf_counter() - start
     angle = float(np.rad2deg(np.arccos(np.clip(found.direction @ scene.direction, -1, 1))))
     true_m = None if scene.spot is None else scene.spot.distance
     distance_m = found.distance if found.distance_known else None
     std_deg = float(np.rad2deg(found.std))
-    is_near = scene.spot is not None
-    return LampScore(number, is_near, is_wooden, angle, std_deg, true_m, distance_m, found.is_diffuse, seconds)
+    is_near, right = scene.spot is not None, sum(_is_right(one, scene.poses[one.name]) for one in last.found)
+    return LampScore(number, is_near, is_wooden, angle, std_deg, true_m, distance_m, found.is_diffuse,
+                     len(last.found), right, seconds)  # fmt: skip
+
+
+def _is_right(found: PhotoObject, truth: Pose) -> bool:
+    pose = found.best.pose
+    turn_rad = float(rotation_error(CATALOGUE[found.name].symmetry, pose.quaternion, truth.quaternion))
+    return bool(np.linalg.norm(pose.position - truth.position) <= _CLOSE_M and np.rad2deg(turn_rad) <= _CLOSE_DEG)
 
 
 def _figures(name: str, values: Sequence[float]) -> dict[str, float | None]:

@@ -1,12 +1,12 @@
 """Simulated photographs of a table under a lamp: near ones with a cone, and distant ones for comparison.
 
 Three objects lie on the table; up to four views are taken, exposed such that little is saturated, with a white balance
-of their own, noise, and eight bits of sRGB. Poses are off by what the estimator of photographs leaves.
+of their own, noise, and eight bits of sRGB. Masks are exact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from osfcore.estimation.photometry.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.geometry.poses import Pose
 from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import Observation
 from osfcore.io.image_file import to_uint8
@@ -33,9 +33,9 @@ _DISTANCES_M, _ELEVATIONS_DEG = (0.4, 1.5), (20.0, 80.0)
 _AIM_M = 0.05
 _OUTER_DEG, _INNER_SHARE = (20.0, 50.0), (0.5, 0.9)
 _AMBIENT = 0.1, 0.5  # over ambient and diffuse together
-_SHIFT_M, _TURN_DEG = 2e-3, 1.0  # standard deviations of poses, in all
 _BRIGHT, _LEVEL = 99.0, (0.6, 0.95)  # percentile that is exposed to this level
 _BALANCE, _NOISE = 0.1, 0.004
+_FEWEST = 100  # pixels of an object; what shows less is not marked
 _SATURATED, _BLACK = 251, 2  # of eight bits
 
 
@@ -45,15 +45,13 @@ class LampScene:
 
     Attributes:
         photos: of one scene, on the table.
-        names: of the objects.
-        poses: of the objects in the world, with errors.
+        poses: of the objects that are seen, in the world.
         spot: the lamp; None if it is distant.
         direction: unit vector from the table's centre toward the lamp.
     """
 
     photos: tuple[Photograph, ...]
-    names: tuple[str, ...]
-    poses: tuple[Pose, ...]
+    poses: Mapping[str, Pose]
     spot: SpotLamp | None
     direction: np.ndarray
 
@@ -89,8 +87,8 @@ def lamp_scene(
     finally:
         world.close()
     photos = tuple(_taken(observed, k, rng) for k in range(views))
-    poses = tuple(_perturbed(truth.poses[k], rng) for k in range(len(truth.names)))
-    return LampScene(photos, truth.names, poses, spot if is_near else None, light.direction)
+    poses = {name: truth.pose(name) for name in truth.names if any(name in photo.masks for photo in photos)}
+    return LampScene(photos, poses, spot if is_near else None, light.direction)
 
 
 def random_spot(rng: np.random.Generator) -> SpotLamp:
@@ -112,11 +110,6 @@ def _taken(observed: Observation, view: int, rng: np.random.Generator) -> Photog
     stored = to_uint8(srgb_of_linear(np.clip(noisy, 0, 1)))
     linear = linear_from_encoded(stored / 255.0, "srgb").astype(np.float32)
     exposed = np.all(stored < _SATURATED, axis=-1) & np.any(stored > _BLACK, axis=-1)
-    masks = {name: observed.masks[view, k] for k, name in enumerate(observed.names) if observed.masks[view, k].any()}
+    shown = {name: observed.masks[view, k] for k, name in enumerate(observed.names)}
+    masks = {name: mask for name, mask in shown.items() if mask.sum() >= _FEWEST}
     return Photograph(linear, exposed, camera.intrinsics, camera.T_world_camera, True, masks)
-
-
-def _perturbed(pose: Pose, rng: np.random.Generator) -> Pose:
-    shift, turn = rng.standard_normal((2, 3)) / np.sqrt(3)
-    turned = quaternion_multiply(quaternion_exp(np.deg2rad(_TURN_DEG) * turn), pose.quaternion)
-    return Pose(pose.position + _SHIFT_M * shift, turned)

@@ -11,7 +11,7 @@ from osfcore.experiments.photos.lamp_evaluation import EvaluateLamps, LampReport
 from osfcore.experiments.photos.simulated_lamps import lamp_scene, random_spot
 from osfcore.fields.field_library import FieldLibrary
 
-SCORE = LampScore(0, True, False, 2.0, 1.0, 1.0, 1.1, False, 0.5)
+SCORE = LampScore(0, True, False, 2.0, 1.0, 1.0, 1.1, False, 3, 2, 0.5)
 
 
 def test_figures_of_known_and_unknown_lamps():
@@ -24,6 +24,7 @@ def test_figures_of_known_and_unknown_lamps():
     assert report["lamp_within_5deg"] == 0.5
     assert report["lamp_within_15percent"] == 1
     assert report["distant_undetermined"] == 1
+    assert report["poses_15mm_10deg"] == pytest.approx(2 / 3)
 
 
 def test_lamps_are_drawn_where_they_are_asked_for():
@@ -50,6 +51,8 @@ def test_near_lamps_are_found_and_distant_ones_told(library, tmp_path):
     assert report["lamp_direction_deg_median"] < 5
     assert report["lamp_distance_percent_median"] < 15
     assert report["lamp_diffuse"] == 0
+    assert report["poses_total"] > 10
+    assert report["poses_15mm_10deg"] > 0.6
     assert report["distant_undetermined"] == report["distant_tasks"] == 1
     assert json.loads((tmp_path / "report.json").read_text())["lamp_tasks"] == 4
 
