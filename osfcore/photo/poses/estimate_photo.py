@@ -20,7 +20,8 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.poses import Pose
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses.object_window import object_windows
-from osfcore.photo.poses.photo_doubt import doubt_of
+from osfcore.photo.poses.occlusion import without_others
+from osfcore.photo.poses.photo_doubt import doubt_of, fits_outline
 from osfcore.photo.poses.photo_steps import PhotoObject, PhotoPose, PhotoStep
 from osfcore.photo.poses.pose_alignment import align
 from osfcore.photo.poses.pose_loss import LossKind, PoseLoss
@@ -126,15 +127,36 @@ def estimate_photo(
     for number, name in enumerate(names):
         yield PhotoStep(Progress(number, len(names) + 1, f"Looking for {name}"), tuple(found))
         found.append(find_object(models, photos, name, rng, config))
-    yield PhotoStep(Progress(len(names), len(names) + 1, "The table that they lie on"), tuple(found))
+    again = [number for number, one in enumerate(found) if not fits_outline(one.best)] if len(found) > 1 else []
+    total, seen = len(names) + len(again) + 1, {name: photos for name in names}
+    for done, number in enumerate(again, len(names)):
+        name = names[number]
+        yield PhotoStep(Progress(done, total, f"Looking for {name} behind the others"), tuple(found))
+        surfels = {other: models.surfels(other, FINE_ACROSS) for other in names}
+        without = without_others(photos, name, found, surfels)
+        other = _found_behind(models, without, name, rng, config)
+        if other is not None and other.best.iou > found[number].best.iou:
+            found[number], seen[name] = other, without
+    yield PhotoStep(Progress(total - 1, total, "The table that they lie on"), tuple(found))
     table = None
     if not on_table[0]:
         table = table_from_objects([models.table_prior(name) for name in names], [o.best.pose for o in found])
         if table is not None:
             lying = set(table.supported)
-            found = [_on_table(models, photos[0], o, table, config) if k in lying else o for k, o in enumerate(found)]
-    done = Progress(len(names) + 1, len(names) + 1, "All objects were looked for")
-    yield PhotoStep(done, tuple(found), table)
+            found = [
+                _on_table(models, seen[o.name][0], o, table, config) if k in lying else o for k, o in enumerate(found)
+            ]
+    yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table)
+
+
+def _found_behind(
+    models: PhotoModels, photos: Sequence[Photograph], name: str, rng: np.random.Generator, config: PhotoConfig
+) -> PhotoObject | None:
+    """What is found in masks without the other objects; None if hardly anything is left of them."""
+    try:
+        return find_object(models, photos, name, rng, config)
+    except InvalidInput:
+        return None
 
 
 def _on_table(

@@ -13,6 +13,11 @@ _MOST_RESIDUAL = 0.55
 _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
 
 
+def fits_outline(best: PhotoPose) -> bool:
+    """Whether the drawn outline is that of the mask."""
+    return best.iou >= _LEAST_IOU
+
+
 def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: PoseLoss) -> str:
     """The first reason that applies; "" if none does.
 
@@ -22,7 +27,7 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
         rivals: other orientations, the best first.
         loss: whose windows the pose was found in.
     """
-    if best.iou < _LEAST_IOU:
+    if not fits_outline(best):
         return (
             f"The outline of {name} does not fit its mask (they share {100 * best.iou:.0f} %); "
             "check the name, the mask and the camera."
