@@ -3,8 +3,8 @@
 Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where no shadow
 tells, it is asked first, and its answer taken if the image model at its poses is the usual one. Otherwise an image
 model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
-linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one if objects are
-doubted at its end. Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the
+linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one too if objects are
+doubted at its end: then the lower loss decides. Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the
 image model is fitted once more, and Gauss-Newton does the last millimetres.
 """
 
@@ -80,19 +80,15 @@ def estimate_first(
     for one in (one for one in both if one.is_sane):
         if found:  # and it is doubtful
             yield replace(found[0], estimate=None)
-        found.append((yield from all_but_last(_steps(models, calibrator, one, rng, config))))
-        if not _doubted(found[-1]):
+        last = yield from all_but_last(_steps(models, calibrator, one, rng, config))
+        assert last.estimate is not None
+        found.append(last)
+        if not last.estimate.doubted:
             break
     if found:
-        yield min(found, key=_doubted)
+        yield min(found, key=lambda last: last.loss)
     else:
         yield from estimate_usual(models, observation, rng, config)
-
-
-def _doubted(last: EstimateStep) -> int:
-    """How many objects an estimate is not sure of."""
-    assert last.estimate is not None
-    return len(last.estimate.doubted)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
