@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from osfcore.control.goal import GoalImage
@@ -45,7 +45,12 @@ class AdaptedModels:
 
 
 def estimate_goal_image(
-    usual: AdaptedModels, scene: AdaptedModels, goal: GoalImage, prior: SceneState, config: GoalImageConfig | None
+    usual: AdaptedModels,
+    scene: AdaptedModels,
+    goal: GoalImage,
+    prior: SceneState,
+    config: GoalImageConfig | None = None,
+    allowed: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
     """The goal image as the scene's cameras would take it and, should that be doubtful, as fields were made for.
 
@@ -55,19 +60,25 @@ def estimate_goal_image(
         goal: one view.
         prior: how the objects lie now.
         config: how much work to do.
+        allowed: by object, residuals that the first frame has as well.
     """
-    best = yield from all_but_last(_estimated(scene, goal, prior, config))
+    best = yield from all_but_last(_estimated(scene, goal, prior, config, allowed))
     if scene.image_model is not None and not _is_trusted(best):
         yield replace(best, estimate=None)
-        other = yield from all_but_last(_estimated(usual, goal, prior, config))
+        other = yield from all_but_last(_estimated(usual, goal, prior, config, allowed))
         best = other if _is_trusted(other) else best
     yield best
 
 
 def _estimated(
-    models: AdaptedModels, goal: GoalImage, prior: SceneState, config: GoalImageConfig | None
+    models: AdaptedModels,
+    goal: GoalImage,
+    prior: SceneState,
+    config: GoalImageConfig | None,
+    allowed: Mapping[str, float] | None,
 ) -> Iterator[EstimateStep]:
-    for step in estimate_goal(models.models, models.normalized_goal(goal).observed(prior.names), prior, config):
+    seen = models.normalized_goal(goal).observed(prior.names)
+    for step in estimate_goal(models.models, seen, prior, config, allowed):
         yield step if step.estimate is None else replace(step, image_model=models.image_model)
 
 

@@ -40,7 +40,7 @@ from osfcore.control.stage_timer import StageTimer
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.tracking import expected_residuals
+from osfcore.estimation.uncertainty import allowed_residuals, expected_residuals
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -244,7 +244,9 @@ class Episode:
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
         target, state, estimate, doubts, photo = self._target, self._estimate.state, None, "", None
         if isinstance(target, GoalImage):
-            steps = estimate_goal_image(self._usual_models, self._scene, target, state, self._how.goal)
+            allowed = dict(zip(state.names, allowed_residuals(self._usual), strict=True))
+            allowed = {name: most for name, most in allowed.items() if name not in self._weak}
+            steps = estimate_goal_image(self._usual_models, self._scene, target, state, self._how.goal, allowed)
             found = yield from self._look("goal", target.observed(state.names), steps)
             self._of_goal = self._usual_models if found.image_model is None else self._scene
             shown = self._of_goal.normalized_goal(target)

@@ -3,9 +3,9 @@
 Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where no shadow
 tells, it is asked first, and its answer taken if the image model at its poses is the usual one. Otherwise an image
 model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
-linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one too if objects are
-doubted at its end: then the lower loss decides. Pictures and fields are made to agree, and the usual estimator finds poses and lamp. With these the
-image model is fitted once more, and Gauss-Newton does the last millimetres.
+linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one too if the loss
+at its end is high: then the lower one decides. Pictures and fields are made to agree, and the usual estimator finds
+poses and lamp. With these the image model is fitted once more, and Gauss-Newton does the last millimetres.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newto
 from osfcore.estimation.search.pose_initialization import OVERHEAD, initial_poses
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, all_but_last
-from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit
+from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit, relative_allowance
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import Observation
 from osfcore.progress import Progress
@@ -38,6 +38,7 @@ _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
 _TINT = 0.1  # weight of the gains' spread over the colours: lamps are nearly white
 _LEAST_GAIN, _MOST_GAIN = 0.05, 20.0  # beyond, pictures show nothing, or nothing else
 _ROUNDS, _ITERATIONS = 2, 2
+_SETTLED = 2e-4  # photometric loss; pictures decoded wrongly ended at 3e-4 and more
 
 
 def estimate_first(
@@ -78,12 +79,10 @@ def estimate_first(
     )
     found: list[EstimateStep] = []
     for one in (one for one in both if one.is_sane):
-        if found:  # and it is doubtful
+        if found:  # and leaves much unexplained
             yield replace(found[0], estimate=None)
-        last = yield from all_but_last(_steps(models, calibrator, one, rng, config))
-        assert last.estimate is not None
-        found.append(last)
-        if not last.estimate.doubted:
+        found.append((yield from all_but_last(_steps(models, calibrator, one, rng, config))))
+        if found[-1].loss < _SETTLED:
             break
     if found:
         yield min(found, key=lambda last: last.loss)
@@ -163,5 +162,6 @@ def _polished(
         if number == _ROUNDS:
             fit = evaluate_fit(fitting, sharp, at.params)
             rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
-            last = reporter.finish(at, estimate_with_uncertainty(at.params, at.normals, fit, rivals))
+            sure = estimate_with_uncertainty(at.params, at.normals, fit, rivals, allowed=relative_allowance(fit))
+            last = reporter.finish(at, sure)
             yield replace(last, image_model=replace(model, encoding=rough.encoding))

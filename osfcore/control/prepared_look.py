@@ -15,7 +15,7 @@ from jaxtyping import Float
 from osfcore.errors import InvalidInput
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.tracking import expected_residuals
+from osfcore.estimation.uncertainty import expected_residuals
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import Observation
 from osfcore.io.json_codec import Entry, decode, encode

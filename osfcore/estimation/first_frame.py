@@ -27,7 +27,7 @@ from osfcore.estimation.search.multistart_cma import SHIFT_M, TURN_RAD, Multista
 from osfcore.estimation.search.pose_initialization import OVERHEAD, RankedPoses, initial_poses, rank_poses
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit
+from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit, relative_allowance
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
 
@@ -223,8 +223,8 @@ class _FirstFrameEstimator:
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
         fit = evaluate_fit(self._models, self._fine, at.params)
         estimate = estimate_with_uncertainty(
-            at.params, at.normals, fit, self._rivals, light_held=self._held is not None
-        )  # fmt: skip
+            at.params, at.normals, fit, self._rivals, light_held=self._held is not None, allowed=relative_allowance(fit)
+        )
         return self._reporter.finish(at, estimate)
 
     def _initial_guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:

@@ -7,7 +7,7 @@ now, since goals are mostly reached by pushing. Combinations of matches are rank
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +64,11 @@ class GoalImageConfig:
 
 
 def estimate_goal(
-    models: ObjectModels, observation: Observation, prior: SceneState, config: GoalImageConfig | None = None
+    models: ObjectModels,
+    observation: Observation,
+    prior: SceneState,
+    config: GoalImageConfig | None = None,
+    allowed: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
     """Find poses and light of a goal image; the last step holds the estimate.
 
@@ -73,6 +77,7 @@ def estimate_goal(
         observation: one view without the pusher; masks play no part.
         prior: how the objects lie now; where they lie plays no part.
         config: how much work to do.
+        allowed: by object, the residual below which its images are not doubted, see `allowed_residuals`.
 
     Raises:
         InvalidInput: if there is more than one view, or the prior is of other objects.
@@ -83,15 +88,21 @@ def estimate_goal(
         raise InvalidInput("number of views of a goal", len(observation.cameras), "1")
     if set(prior.names) != set(observation.names):
         raise InvalidInput("objects of the prior", ", ".join(prior.names), ", ".join(observation.names))
-    yield from _GoalImageEstimator(models, observation, prior, config or GoalImageConfig()).steps()
+    yield from _GoalImageEstimator(models, observation, prior, config or GoalImageConfig(), allowed or {}).steps()
 
 
 class _GoalImageEstimator:
     """One estimation; `steps` runs it."""
 
     def __init__(
-        self, models: ObjectModels, observation: Observation, prior: SceneState, config: GoalImageConfig
+        self,
+        models: ObjectModels,
+        observation: Observation,
+        prior: SceneState,
+        config: GoalImageConfig,
+        allowed: Mapping[str, float],
     ) -> None:
+        self._allowed = np.array([allowed.get(name, 0.0) for name in observation.names])
         self._models, self._config, self._prior = models, config, prior
         self._names = observation.names
         self._fine = views_of(observation, FINE_SIDE, samples=2)
@@ -273,7 +284,9 @@ class _GoalImageEstimator:
         fit, poses = evaluate_fit(self._models, self._fine, at.params), at.params.state().poses
         lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
         held = self._config.held_light is not None
-        return estimate_with_uncertainty(at.params, at.normals, fit, rivals, lowest=lowest, light_held=held)
+        return estimate_with_uncertainty(
+            at.params, at.normals, fit, rivals, lowest=lowest, light_held=held, allowed=self._allowed
+        )
 
     def _step(
         self,

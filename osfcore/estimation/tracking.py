@@ -42,11 +42,15 @@ from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newto
 from osfcore.estimation.search.light_search import light_loss_ratio, search_light
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.estimation.uncertainty import FitQuality, estimate_with_uncertainty, evaluate_fit, object_residuals
+from osfcore.estimation.uncertainty import (
+    FitQuality,
+    allowed_residuals,
+    estimate_with_uncertainty,
+    evaluate_fit,
+    object_residuals,
+)
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation, SceneState
-
-_ALLOWANCE, _MOST_USUAL = 1.25, 0.06  # times what is usual, which is no more than this [radiance]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,19 +94,6 @@ class TrackingConfig:
     reach: float = 0.03
 
 
-def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
-    """RMS residual of each object where it stands [radiance]: fields err; what is normal here tells later what is not.
-
-    Args:
-        models: fields of the objects and the table.
-        observation: one or more views; masks play no part.
-        state: what to render, an estimate from this observation; the pusher is the observation's.
-    """
-    return object_residuals(
-        evaluate_fit(models, views_of(observation, FINE_SIDE, samples=2), SceneParameters.of(state, observation.pusher))
-    )
-
-
 def estimate_next(
     models: ObjectModels,
     observation: Observation,
@@ -128,7 +119,7 @@ def estimate_next(
     models.check(observation.names)
     if set(expected.names) != set(observation.names):
         raise InvalidInput("objects of the expected state", ", ".join(expected.names), ", ".join(observation.names))
-    allowed = np.zeros(len(expected.names)) if usual is None else _ALLOWANCE * np.minimum(usual, _MOST_USUAL)
+    allowed = np.zeros(len(expected.names)) if usual is None else allowed_residuals(usual)
     yield from _Tracker(models, observation, expected, rng, config or TrackingConfig(), allowed).steps()
 
 
@@ -331,9 +322,8 @@ class _Tracker:
         return at
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        estimate = estimate_with_uncertainty(
-            at.params, at.normals, self._fit_finely(at.params), self._rivals, light_held=True
-        )
+        fit, allowed = self._fit_finely(at.params), self._allowed
+        estimate = estimate_with_uncertainty(at.params, at.normals, fit, self._rivals, light_held=True, allowed=allowed)
         return self._reporter.finish(at, estimate)
 
     def _step(self, stage: Stage, note: str, at: GaussNewtonState) -> EstimateStep:

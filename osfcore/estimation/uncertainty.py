@@ -10,13 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import ObservedViews
+from osfcore.estimation.objective.observed_views import FINE_SIDE, ObservedViews, views_of
 from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
 from osfcore.estimation.search.gauss_newton import difference_steps
 from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import Observation, SceneState
 from osfcore.render.types import SceneBatch
 
 # Calibrated on scenes that no reported figure uses.
@@ -24,6 +25,8 @@ _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
 _MAX_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
+_RELATIVE_RESIDUAL = 0.5  # of the object's contrast, where masks bear out the pose; wrong ones were at 0.66 and more
+_ALLOWANCE, _MOST_USUAL = 1.25, 0.1  # times what is usual, which is no more than this [radiance]
 _MIN_OVERLAP = 0.75  # of silhouette and mask
 _MIN_PIXELS = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
@@ -39,6 +42,7 @@ class FitQuality:
     Attributes:
         residuals: root of mean square error over the pixels of each object in each view; 0 where it shows in none.
         pixels: of each object in each view, by its rendered opacity.
+        contrast: standard deviation of the image over the pixels of each object in all views [radiance].
         overlap: of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
         surroundings: root of mean square error over all other pixels.
         spread: estimated variance of a pixel's error.
@@ -46,6 +50,7 @@ class FitQuality:
 
     residuals: Float[np.ndarray, "V N"]
     pixels: Float[np.ndarray, "V N"]
+    contrast: Float[np.ndarray, "N"]
     overlap: Float[np.ndarray, "N"]
     surroundings: float
     spread: float
@@ -73,13 +78,45 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
         either = np.maximum(opacity, views.masks).sum(axis=(0, 2, 3))
         overlap = both / np.maximum(either, 1e-6)
     surroundings = float(np.sqrt((elsewhere * squares).sum() / max(elsewhere.sum(), 1e-6)))
-    return FitQuality(residuals * (pixels > 0), pixels, overlap, surroundings, float(squares.mean()))
+    spread = float(squares.mean())
+    return FitQuality(
+        residuals * (pixels > 0), pixels, _contrasts(opacity, views.images), overlap, surroundings, spread
+    )
+
+
+def _contrasts(opacity: Float[np.ndarray, "V N h w"], images: Float32[np.ndarray, "V h w 3"]) -> Float[np.ndarray, "N"]:
+    total = np.maximum(opacity.sum(axis=(0, 2, 3)), 1e-6)[:, None]
+    first, second = (np.einsum("vnhw,vhwc->nc", opacity, images**power) / total for power in (1, 2))
+    return np.sqrt(np.maximum(second - first**2, 0).mean(axis=-1))
+
+
+def relative_allowance(fit: FitQuality) -> Float[np.ndarray, "N"]:
+    """Residuals that may be of a right pose, of each object, where masks bear it out: a share of its contrast."""
+    return _RELATIVE_RESIDUAL * fit.contrast
 
 
 def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
     """Root of mean square error of each object over its pixels in all views."""
     total = np.maximum(fit.pixels.sum(axis=0), 1e-6)
     return np.sqrt((fit.pixels * fit.residuals**2).sum(axis=0) / total)
+
+
+def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
+    """RMS residual of each object where it stands [radiance]: fields err; what is normal here tells later what is not.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: one or more views; masks play no part.
+        state: what to render, an estimate from this observation; the pusher is the observation's.
+    """
+    return object_residuals(
+        evaluate_fit(models, views_of(observation, FINE_SIDE, samples=2), SceneParameters.of(state, observation.pusher))
+    )
+
+
+def allowed_residuals(usual: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+    """Residuals that are nothing new where `expected_residuals` are usual [radiance]."""
+    return _ALLOWANCE * np.minimum(usual, _MOST_USUAL)
 
 
 def estimate_with_uncertainty(
@@ -90,6 +127,7 @@ def estimate_with_uncertainty(
     *,
     light_held: bool = False,
     lowest: Float[np.ndarray, "N"] | None = None,
+    allowed: Float[np.ndarray, "N"] | None = None,
 ) -> EstimatedState:
     """A guess with its uncertainty and the doubts about it.
 
@@ -100,6 +138,7 @@ def estimate_with_uncertainty(
         rivals: by object, the best loss of a different orientation over the loss of the one chosen.
         light_held: the light was given, not searched.
         lowest: height of each object's lowest point [m], if objects can only stand on the table.
+        allowed: residuals below which an object's images are not doubted, should these be more than is usual.
 
     Returns:
         The estimate.
@@ -111,8 +150,9 @@ def estimate_with_uncertainty(
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
     light = 0.0 if light_held else _LIGHT_FACTOR * float(np.sqrt((deviations[-LIGHT:] ** 2).mean()))
     heights = np.zeros(count) if lowest is None else lowest
+    most = np.maximum(_MAX_RESIDUAL, 0.0 if allowed is None else allowed) * np.ones(count)
     doubts = tuple(
-        _reason_for_doubt(fit, n, position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
+        _reason_for_doubt(fit, n, most[n], position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
         for n in range(count)
     )
     doubtful = [f"{name}: {doubt}" for name, doubt in zip(params.names, doubts, strict=True) if doubt]
@@ -131,14 +171,16 @@ def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.
     return np.concatenate(found)
 
 
-def _reason_for_doubt(fit: FitQuality, n: int, position_std: float, rotation_std: float, rival: float) -> str:
+def _reason_for_doubt(
+    fit: FitQuality, n: int, most: float, position_std: float, rotation_std: float, rival: float
+) -> str:
     pixels = fit.pixels[:, n]
     if pixels.sum() < _MIN_PIXELS:
         return "it is hardly visible"
     residual = object_residuals(fit)[n]
     if fit.overlap[n] < _MIN_OVERLAP:
         return f"its silhouette covers its masks by {fit.overlap[n]:.0%} only"
-    if residual > _MAX_RESIDUAL:
+    if residual > most:
         return f"its images differ from what was rendered by {residual:.2f}"
     if rival < _MIN_RIVAL_RATIO:
         return AMBIGUOUS

@@ -10,7 +10,7 @@ import numpy as np
 
 from osfcore.dynamics.push_models import load_push_model
 from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.tracking import expected_residuals
+from osfcore.estimation.uncertainty import expected_residuals
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light

@@ -6,7 +6,13 @@ import pytest
 from osfcore.estimation.objective.observed_views import QUALITY, views_of
 from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
-from osfcore.estimation.uncertainty import FitQuality, estimate_with_uncertainty, evaluate_fit, object_residuals
+from osfcore.estimation.uncertainty import (
+    FitQuality,
+    allowed_residuals,
+    estimate_with_uncertainty,
+    evaluate_fit,
+    object_residuals,
+)
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOX, own_views, params_of
 
@@ -25,7 +31,9 @@ def end(models, truth, views):
 
 
 def fit_of(count=1, **change) -> FitQuality:
-    plain = FitQuality(np.full((2, count), 0.01), np.full((2, count), 50.0), np.ones(count), 0.01, 1e-4)
+    plain = FitQuality(
+        np.full((2, count), 0.01), np.full((2, count), 50.0), np.full(count, 0.1), np.ones(count), 0.01, 1e-4
+    )
     return replace(plain, **change)
 
 
@@ -161,3 +169,24 @@ def test_what_nothing_tells_about_is_not_known():
     partly = estimate_with_uncertainty(params(), [flat, nothing[1]], fit_of(), {})
     assert np.isfinite(partly.position_std[0])
     assert partly.position_std[0] > estimate_with_uncertainty(params(), normals(), fit_of(), {}).position_std[0]
+
+
+def test_contrast_is_the_spread_of_what_an_object_shows(models, views, truth):
+    """Twice the radiance has twice of it; more light everywhere leaves it as it is."""
+    plain, twice, shifted = (
+        evaluate_fit(models, replace(views, images=images), params_of(truth)).contrast
+        for images in (views.images, 2 * views.images, views.images + np.float32(0.1))
+    )
+    np.testing.assert_allclose(twice, 2 * plain, rtol=1e-4)
+    np.testing.assert_allclose(shifted, plain, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("allowed", "is_doubted"), [(None, True), (np.array([0.05]), True), (np.array([0.07]), False)])
+def test_residuals_that_are_allowed_are_not_doubted(allowed, is_doubted):
+    fit = fit_of(residuals=np.full((2, 1), 0.06))
+    estimate = estimate_with_uncertainty(params(), normals(), fit, {}, allowed=allowed)
+    assert bool(estimate.doubted) == is_doubted
+
+
+def test_what_is_usual_is_allowed_up_to_a_bound():
+    np.testing.assert_allclose(allowed_residuals(np.array([0.0, 0.04, 0.1, 0.5])), [0.0, 0.05, 0.125, 0.125])
