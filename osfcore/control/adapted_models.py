@@ -71,15 +71,15 @@ def estimate_goal_image(
 
 
 def _estimated(
-    models: AdaptedModels,
+    fitting: AdaptedModels,
     goal: GoalImage,
     prior: SceneState,
     config: GoalImageConfig | None,
     allowed: Mapping[str, float] | None,
 ) -> Iterator[EstimateStep]:
-    seen = models.normalized_goal(goal).observed(prior.names)
-    for step in estimate_goal(models.models, seen, prior, config, allowed):
-        yield step if step.estimate is None else replace(step, image_model=models.image_model)
+    seen = fitting.normalized_goal(goal).observed(prior.names)
+    for step in estimate_goal(fitting.models, seen, prior, config, allowed):
+        yield step if step.estimate is None else replace(step, image_model=fitting.image_model)
 
 
 def _is_trusted(step: EstimateStep) -> bool:

@@ -141,8 +141,8 @@ class Episode:
             self._estimate = found.estimate
             self._scene = self._of_goal = self._scene.to(found.image_model, observation.names)
             observation = self._scene.normalized(observation)
-            if found.image_model is not None:
-                yield self._noticed("pictures", f"The pictures are {found.image_model.told}; allowed for.")
+            if found.image_model is not None and found.image_model.told:
+                yield self._noticed("pictures", f"The pictures are unusual ({found.image_model.told}); allowed for.")
         else:
             self._estimate = self._start
         self._estimate = self._estimate.with_pusher(observation.pusher)

@@ -164,10 +164,8 @@ async function runLive() {
 
 function usePhoto() {
   closeStory();
-  showTab("episode");
-  byId("goal-card").open = true;
-  byId("goal-drop").scrollIntoView({ block: "center" });
-  byId("goal-file").click();
+  showTab("photo");
+  byId("table-photo-file").click();
 }
 
 function moveLamp() {

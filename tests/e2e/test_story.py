@@ -81,7 +81,7 @@ def test_closed_it_stays_away_and_comes_back_on_demand(page):
 def test_a_photo_or_the_lamp_are_one_click_away(page):
     with page.expect_file_chooser(timeout=WAIT_MS):
         page.click("#story-photo", timeout=WAIT_MS)
-    assert page.is_visible("#goal-drop")
+    assert page.is_visible("#panel-photo")
     page.click("#story-button")
     page.click("#story-lamp")
     assert page.is_visible("#azimuth")

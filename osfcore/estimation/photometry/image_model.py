@@ -52,10 +52,12 @@ class ImageModel:
 
     @property
     def told(self) -> str:
-        """What is unusual about the pictures, for a person."""
-        gain, table = float(np.mean(self.gain)), ", ".join(f"{factor:.2f}" for factor in self.table)
-        coded = "sRGB-encoded, " if self.encoding == "srgb" else ""
-        return f"{coded}exposed by {gain:.2f}, ambient light by {self.ambient:.2f}, the table by {table} of the usual"
+        """What is unusual about the pictures, for a person; "" if nothing is."""
+        parts = ["sRGB values"] if self.encoding == "srgb" else []
+        for what, factor in (("exposure", self.gain), ("ambient light", self.ambient), ("table", self.table)):
+            if np.abs(np.log(factor)).max() > _USUAL:
+                parts.append(f"{what} {' '.join(f'{each:.2f}' for each in np.atleast_1d(factor))} times the usual")
+        return ", ".join(parts)
 
     def normalized(self, observation: Observation) -> Observation:
         """The observation as it would be at the usual exposure."""
