@@ -130,13 +130,8 @@ def estimate_photo(
     again = [number for number, one in enumerate(found) if not fits_outline(one.best)] if len(found) > 1 else []
     total, seen = len(names) + len(again) + 1, {name: photos for name in names}
     for done, number in enumerate(again, len(names)):
-        name = names[number]
-        yield PhotoStep(Progress(done, total, f"Looking for {name} behind the others"), tuple(found))
-        surfels = {other: models.surfels(other, FINE_ACROSS) for other in names}
-        without = without_others(photos, name, found, surfels)
-        other = _found_behind(models, without, name, rng, config)
-        if other is not None and other.best.iou > found[number].best.iou:
-            found[number], seen[name] = other, without
+        yield PhotoStep(Progress(done, total, f"Looking for {names[number]} behind the others"), tuple(found))
+        found[number], seen[names[number]] = _found_behind(models, photos, found, number, rng, config)
     yield PhotoStep(Progress(total - 1, total, "The table that they lie on"), tuple(found))
     table = None
     if not on_table[0]:
@@ -150,13 +145,22 @@ def estimate_photo(
 
 
 def _found_behind(
-    models: PhotoModels, photos: Sequence[Photograph], name: str, rng: np.random.Generator, config: PhotoConfig
-) -> PhotoObject | None:
-    """What is found in masks without the other objects; None if hardly anything is left of them."""
+    models: PhotoModels,
+    photos: Sequence[Photograph],
+    found: Sequence[PhotoObject],
+    number: int,
+    rng: np.random.Generator,
+    config: PhotoConfig,
+) -> tuple[PhotoObject, Sequence[Photograph]]:
+    """An object in masks without the others, and these masks; as before if its outline fits them no better."""
+    before = found[number]
+    surfels = {other.name: models.surfels(other.name, FINE_ACROSS) for other in found}
+    without = without_others(photos, before.name, found, surfels)
     try:
-        return find_object(models, photos, name, rng, config)
-    except InvalidInput:
-        return None
+        now = find_object(models, without, before.name, rng, config)
+    except InvalidInput:  # hardly anything is left of its mask
+        return before, photos
+    return (now, without) if now.best.iou > before.best.iou else (before, photos)
 
 
 def _on_table(
