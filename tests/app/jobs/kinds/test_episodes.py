@@ -21,7 +21,7 @@ from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
 from app.jobs.worker import KINDS, run_job
 from app.processes.messages.job_messages import RunJob
 from app.processes.plan_summary import PlanSketch
-from osfcore.control import estimators
+from osfcore.control import adapted_models, estimators
 from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
@@ -181,14 +181,14 @@ def test_a_goal_image_is_read_from_the_inputs_as_its_own_camera_saw_it(place, st
     image = stage.world.render((camera,), with_pusher=False).images[0]
     write_png(place.folder / INPUTS / GOAL_FILE, to_uint8(image))
 
-    def explained(_models, observation, _prior, _config):
+    def explained(_models, observation, *_):
         np.testing.assert_allclose(observation.images[0], image, atol=1 / 255)
         assert observation.cameras[0].name == "mine"
         np.testing.assert_allclose(observation.cameras[0].intrinsics, camera.intrinsics)
         state = stage.world.truth()
         yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 
-    monkeypatch.setattr(core, "estimate_goal", explained)
+    monkeypatch.setattr(adapted_models, "estimate_goal", explained)
     monkeypatch.setattr(core, "prefer_current_poses", lambda _models, _goal, found, _now: found)
     goal = {"id": "g", "camera": camera_to_json(camera), "poses": None, "truth": entries(stage.world.truth())}
     told = list(episode_job(params(stage, **goal), place))

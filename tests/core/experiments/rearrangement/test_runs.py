@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import osfcore.control.closed_loop as episode
+import osfcore.control.adapted_models as adapted_models
 import osfcore.control.estimators as estimators
 import osfcore.experiments.rearrangement.runs as module
 from osfcore.control.episode_settings import EpisodeSettings
@@ -73,7 +73,7 @@ def eyes(monkeypatch, task, worlds):
 
     monkeypatch.setattr(estimators, "estimate_first", lambda *_: told(worlds[0].truth()))
     monkeypatch.setattr(estimators, "estimate_next", lambda *_, **__: told(worlds[0].truth()))
-    monkeypatch.setattr(episode, "estimate_goal", lambda *_: told(task.goal))
+    monkeypatch.setattr(adapted_models, "estimate_goal", lambda *_: told(task.goal))
 
 
 def parts(models):
@@ -122,7 +122,7 @@ def test_who_is_told_every_truth_needs_no_image(task, library, models, worlds, m
 
     for name in ("estimate_first", "estimate_next"):
         monkeypatch.setattr(estimators, name, refuse)
-    monkeypatch.setattr(episode, "estimate_goal", refuse)
+    monkeypatch.setattr(adapted_models, "estimate_goal", refuse)
     few = replace(QUICK, steps=1)
     variant = Variant(truths=frozenset(TRUTHS), views=1)
     events = list(run_from_images(task, library, parts(models), few, np.random.default_rng(0), variant=variant))
