@@ -74,11 +74,9 @@ def estimate_first(
             yield last
             return
     poses = _rough_poses(models, observation)
-    both = sorted(
-        (_calibrated(calibrator, observation, poses, e) for e in get_args(Encoding)), key=lambda one: one.loss
-    )
+    both = (_calibrated(calibrator, observation, poses, encoding) for encoding in get_args(Encoding))
     found: list[EstimateStep] = []
-    for one in (one for one in both if one.is_sane):
+    for one in sorted((one for one in both if one.is_sane), key=lambda one: one.loss):
         if found:  # and leaves much unexplained
             yield replace(found[0], estimate=None)
         found.append((yield from all_but_last(_steps(models, calibrator, one, rng, config))))
