@@ -31,7 +31,7 @@ from osfcore.control.events import (
     Stepped,
 )
 from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
-from osfcore.control.monitor import ProgressMonitor, lamp_moved, moved_by_hand, offsets
+from osfcore.control.monitor import ProgressMonitor, lamp_moved, lies_otherwise, moved_by_hand, offsets
 from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels
@@ -305,9 +305,11 @@ class Episode:
 
     def _outcome(self) -> tuple[Outcome, str] | None:
         far, turned = offsets(self._goal, self._estimate.state)
-        if far.max() <= self.settings.reached_m and turned.max() <= self.settings.reached_rad:
+        rolled = lies_otherwise(self._goal, self._estimate.state)  # which pushes are not planned to undo
+        if far.max() <= self.settings.reached_m and np.all(turned[~rolled] <= self.settings.reached_rad):
             text = "The table looks like the goal." if self._number else "The table looks like the goal already."
-            return "reached", text
+            names = ", ".join(np.array(self._estimate.state.names)[rolled])
+            return "reached", f"Everything is in its place, but {names} lies on another side." if names else text
         if self._number >= self.settings.steps:
             where = f"{100 * far.max():.1f} cm away from its place and by {np.rad2deg(turned.max()):.0f}° turned"
             return "out of steps", f"All {self._number} pushes are done; objects are up to {where}."

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import rotation_angle
+from osfcore.geometry.poses import planar_turn, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from osfcore.planning.pose_cost import PoseGoal
 
-_MAX_STALLED = 8  # actions without progress
+_MAX_STALLED = 16  # actions without progress
 _PROGRESS_M = 0.003
 _LAMP_RAD = np.deg2rad(4.0)
 _MOVED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
@@ -25,6 +25,12 @@ def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], 
     return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
 
 
+def lies_otherwise(goal: PoseGoal, state: SceneState) -> Bool[np.ndarray, "N"]:
+    """Which objects lie on another side than in the goal: turning them about the vertical would not do."""
+    turns = (planar_turn(state.pose(name).quaternion, goal.pose(name).quaternion) for name in state.names)
+    return np.array([turn is None for turn in turns], bool)
+
+
 class ProgressMonitor:
     """Detects that the distance to the goal no longer shrinks."""
 
@@ -32,7 +38,7 @@ class ProgressMonitor:
         self._least, self._since = np.inf, 0
 
     def is_stalled(self, distance_m: float) -> bool:
-        """Take the distance after each action; true once it has not shrunk for 8 actions, and counting restarts."""
+        """Take the distance after each action; true once it has not shrunk for 16 actions, and counting restarts."""
         if distance_m < self._least - _PROGRESS_M:
             self._least, self._since = distance_m, 0
             return False

@@ -199,7 +199,7 @@ def _nearest_parts(parts: Solids, first: Int[Tensor, "E"], second: Int[Tensor, "
 
 
 def _separation_bound(parts: Solids, a: Int[Tensor, "R"], b: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-    """Largest separation of two parts along the directions of their outlines; `_FAR_M` where one lies well above the other [m].
+    """Largest separation of two parts along the directions of outlines; `_FAR_M` where one is well above the other [m].
 
     It is a few millimetres less than their distance at most, and tells which of many pairs are worth comparing exactly:
     two hollow objects side by side have hundreds.

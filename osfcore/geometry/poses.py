@@ -17,6 +17,7 @@ from osfcore.errors import InvalidInput
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 _ROUNDING = 8 * np.finfo(float).eps
+_UPRIGHT_RAD = 0.08  # of tilt: more is another side of an object
 
 
 def quaternion_multiply(
@@ -88,6 +89,15 @@ def rotation_angle(
     """Angle of the rotation between two orientations [rad], in [0, pi]; q and -q are the same orientation."""
     difference = quaternion_multiply(quaternion_conjugate(a), b)
     return 2.0 * np.arctan2(np.linalg.norm(difference[..., 1:], axis=-1), np.abs(difference[..., 0]))
+
+
+def planar_turn(before: Float[np.ndarray, "4"], after: Float[np.ndarray, "4"]) -> float | None:
+    """Turn about the vertical between two orientations, in -pi to pi [rad]; None if it tilts by more than 0.08 rad."""
+    turn = quaternion_multiply(after, quaternion_conjugate(before))
+    if 2 * np.arcsin(min(float(np.linalg.norm(turn[1:3])), 1.0)) > _UPRIGHT_RAD:
+        return None
+    angle = 2 * np.arctan2(turn[3], turn[0])
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") -> Float[np.ndarray, "*batch 4"]:

@@ -9,9 +9,9 @@ and the next plan is warm-started from it, shifted by the actions that were exec
 Deviations: samples are not drawn around the nominal sequence alone but from three sources (the nominal sequence, push
 proposals, random walks), and the average is taken in a second round of samples around the best of the first: the mean
 of a path around the left and one around the right of an object leads into it. The second round has a shorter horizon,
-since later actions are planned again before they are executed. lambda is relative to the spread of the costs,
-temperature * (median S - min S). Noise is added to the pusher's path at knots, not to its velocity, so that its
-variance does not grow along the horizon.
+since later actions are planned again before they are executed; only every third plan has a first round. lambda is
+relative to the spread of the costs, temperature * (median S - min S). Noise is added to the pusher's path at knots, not
+to its velocity, so that its variance does not grow along the horizon.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from osfcore.errors import check_ranges
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
+from osfcore.planning.path_planning import actions_along
 from osfcore.planning.pose_cost import Cost, PoseGoal
 
 _RANDOM_WALK_M = 0.06  # standard deviation of random walks at their knots
@@ -63,6 +64,7 @@ class PlanSettings:
         noise_m: sigma of the pusher's path around the plan [m].
         knot_every: actions between the places where the noise is drawn, with straight lines between them.
         refined: actions that the second round looks at and changes.
+        proposals_every: plans of which one has a first round; the others refine the nominal sequence alone.
     """
 
     samples: int = 160
@@ -71,6 +73,7 @@ class PlanSettings:
     noise_m: float = 0.008
     knot_every: int = 3
     refined: int = 12
+    proposals_every: int = 3
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -85,6 +88,7 @@ class PlanSettings:
             ("noise [m]", self.noise_m, 0.0, PUSHER_REACH_M),
             ("actions between knots", self.knot_every, 1, MAX_HORIZON),
             ("refined actions", self.refined, 1, MAX_HORIZON),
+            ("plans of which one draws proposals", self.proposals_every, 1, MAX_HORIZON),
         )
 
 
@@ -124,6 +128,7 @@ class MPPIPlanner:
         self._rollout, self._proposals = rollout, proposals
         self.settings = settings or PlanSettings()
         self._nominal: Float[np.ndarray, "T 3"] | None = None
+        self._refinements = 0  # plans since the last first round
 
     def reset(self) -> None:
         """Drop the nominal sequence: the goal or the scene is another one."""
@@ -142,7 +147,10 @@ class MPPIPlanner:
     def plan(
         self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None = None
     ) -> Iterator[PlanRound]:
-        """Plan in two rounds; the actions of the last one are the plan.
+        """Plan in two rounds, or in the second one alone; the actions of the last one are the plan.
+
+        What was proposed a moment ago is still worth refining, so that proposals are drawn in every third plan, and
+        whenever the nominal sequence has ended.
 
         Args:
             state: of the scene, with its pusher.
@@ -152,14 +160,20 @@ class MPPIPlanner:
             before: the same objects one action ago, for their velocities.
 
         Yields:
-            The two rounds.
+            The rounds.
         """
-        samples = self._sample_first_round(state, goal, rng)
-        round_ = self._evaluate(0, state, samples, cost, before)
-        yield round_
-        begin, rest = np.split(round_.actions, [self.settings.refined])
+        self._refinements += 1
+        if self._nominal is None or self._refinements >= self.settings.proposals_every or not self._nominal[0].any():
+            self._refinements = 0
+            round_ = self._evaluate(0, state, self._sample_first_round(state, goal, rng), cost, before)
+            yield round_
+            nominal = round_.actions
+        else:
+            nominal = self._resized(self._nominal)
+        begin, rest = np.split(nominal, [self.settings.refined])
         keep_end = self.settings.knot_every < len(begin) and len(rest) > 0
         second = self._perturbed(begin, self.settings.samples, rng, self.settings.noise_m, keep_end=keep_end)
+        second[1] = _hurried(begin)
         round_ = self._evaluate(1, state, second, cost, before)
         mean = np.einsum("k,kta->ta", _mppi_weights(round_.costs, self.settings.temperature), second)
         self._nominal = np.concatenate([mean, rest])
@@ -182,6 +196,8 @@ class MPPIPlanner:
         share = settings.samples // 8
         walks = self._perturbed(zero, share, rng, _RANDOM_WALK_M)
         around = self._perturbed(nominal, share, rng, settings.noise_m)
+        if share > 1:
+            around[1] = _hurried(nominal)
         pushes = self._proposals.draw(state, goal, settings.samples - 2 * share, settings.horizon, rng)
         return np.concatenate([around, walks, pushes])
 
@@ -224,6 +240,12 @@ class MPPIPlanner:
         path = (1 - share) * knots[:, low] + share * knots[:, low + 1]
         velocity = np.pad(np.diff(path, axis=1) / STEP_S, ((0, 0), (0, 0), (0, 1)))
         return (plan + velocity).clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
+
+
+def _hurried(plan: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:
+    """The same path as fast as the pusher can, for the average of sequences that hesitate somewhere hesitates."""
+    path = STEP_S * np.pad(np.cumsum(plan[:, :2], axis=0), ((1, 0), (0, 0)))
+    return actions_along(path, len(plan))
 
 
 def _mppi_weights(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:

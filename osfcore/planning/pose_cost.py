@@ -14,7 +14,9 @@ from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 
-ARM_M = 0.03  # a rotation by an angle counts as the angle times this
+ARM_M = 0.06  # a small rotation by an angle counts as the angle times this
+_SMALL_RAD = 0.5  # what exceeds it counts less, or nothing would be moved that rolls on its way
+_LARGE_SHARE = 1 / 3
 _TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
 
 
@@ -71,11 +73,13 @@ class PoseGoal:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseCost:
-    """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*), horizontally [m].
+    """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * f(angle(q_n(t), q_n*)), horizontally [m].
+
+    f(a) = a up to 0.5 rad, and beyond that grows by a third of what a does.
 
     Attributes:
         goal: where that is.
-        arm_m: what a rotation by 1 rad counts [m]; 0 to leave rotations out.
+        arm_m: what a small rotation counts [m/rad]; 0 to leave rotations out.
     """
 
     goal: PoseGoal
@@ -88,6 +92,7 @@ class PoseCost:
         cost = np.linalg.norm(shift, axis=-1)
         if self.arm_m > 0:
             target = np.broadcast_to(self.goal.poses.quaternion[order], rollouts.quaternions[:, 1:].shape)
-            cost = cost + self.arm_m * rotation_angle(rollouts.quaternions[:, 1:], target)
+            angle = rotation_angle(rollouts.quaternions[:, 1:], target)
+            cost = cost + self.arm_m * (angle - (1 - _LARGE_SHARE) * np.maximum(angle - _SMALL_RAD, 0))
         running_cost = cost.sum(axis=2)
         return running_cost.mean(axis=1) + _TERMINAL_WEIGHT * running_cost[:, -1]

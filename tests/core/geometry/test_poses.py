@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import (
     Pose,
+    planar_turn,
     quaternion_conjugate,
     quaternion_exp,
     quaternion_from_matrix,
@@ -97,3 +98,11 @@ def test_batches_are_joined_along_the_first_axis():
     both = Pose.joined(one, two)
     np.testing.assert_array_equal(both.position, [[0, 0, 0], [0, 0, 0], [1, 1, 1]])
     np.testing.assert_array_equal(both.quaternion[:, 1], [0, 0, 1])
+
+
+@pytest.mark.parametrize("yaw", [-3.0, -0.1, 0.0, 1.5])
+def test_a_turn_about_the_vertical_is_told_and_a_tilt_is_not_one(yaw):
+    before = quaternion_exp(np.array([0.4, -1.0, 0.3]))
+    after = quaternion_multiply(quaternion_exp(np.array([0.0, 0.0, yaw])), before)
+    assert planar_turn(before, after) == pytest.approx(yaw, abs=1e-9)
+    assert planar_turn(before, quaternion_multiply(quaternion_exp(np.array([0.2, 0.0, 0.0])), after)) is None

@@ -132,6 +132,24 @@ def test_what_was_executed_is_dropped(shapes, start):
     assert planned(planner, start, goal)[-1].actions.shape == (20, 3)
 
 
+def test_proposals_are_drawn_in_every_third_plan_and_when_there_is_none(shapes, start):
+    planner, goal = MPPIPlanner(carried, PushProposals(shapes), SMALL), goal_of(start, (0.12, -0.08))
+    assert [len(planned(planner, start, goal, seed)) for seed in range(7)] == [2, 1, 1, 2, 1, 1, 2]
+    planner.reset()
+    assert len(planned(planner, start, goal)) == 2
+
+
+def test_a_plan_that_hesitates_is_hurried(start):
+    class Slow:
+        def draw(self, state, goal, count, horizon, rng):
+            return np.broadcast_to([0.03, 0.0, 0.0], (count, horizon, 3))
+
+    planner, goal = MPPIPlanner(carried, Slow(), PlanSettings(samples=64, horizon=24)), goal_of(start, (0.1, 0.0))
+    for seed in range(2):
+        planned(planner, start, goal, seed)
+    assert planner.nominal(1)[0, 0] > 0.2
+
+
 @pytest.mark.slow
 def test_a_can_is_brought_to_its_goal_by_the_shipped_network(shapes, start):
     """Planned and executed in the network's own world; the way there leads around the can."""

@@ -5,7 +5,7 @@ import pytest
 
 from osfcore.dynamics.push_models import load_push_model, load_shapes
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.planning.push_proposals import PushProposals
@@ -47,7 +47,7 @@ def test_pushes_go_around_the_object_and_bring_it_nearer_to_its_goal(shapes, mod
     assert np.median(left) < 0.1
     assert left.min() < 0.03
     early = np.linalg.norm(futures.positions[:, 2, 0, :2] - state.poses.position[0, :2], axis=1)
-    assert early.max() < 1e-3  # not the wrong way at first
+    assert early.max() < 5e-3  # not the wrong way at first
 
 
 def test_pushes_start_behind_the_object_and_lead_past_it(shapes):
@@ -65,10 +65,25 @@ def test_what_is_where_it_should_be_is_left_alone(shapes):
     assert PushProposals(shapes).draw(state, goal, 8, HORIZON, np.random.default_rng(0)).shape == (0, HORIZON, 3)
 
 
-def test_where_there_is_no_room_for_the_pusher_nothing_is_proposed(shapes):
-    state = scene(shapes, {CAN: (0.33, 0.0)}, pusher=(0.0, 0.0))
-    goal = moved(state, CAN, (-0.1, 0.0))
-    assert len(PushProposals(shapes).draw(state, goal, 8, HORIZON, np.random.default_rng(0))) == 0
+def test_where_there_is_no_room_for_the_pusher_nothing_is_proposed():
+    beside, across = ((boxes(((0.0, 0.0, 0.0), size))) for size in ((0.02, 0.07, 0.02), (0.07, 0.02, 0.02)))
+    walled = {"a": boxes(((0.0, 0.0, 0.0), (0.02, 0.02, 0.02))), "b": beside, "c": beside, "d": across, "e": across}
+    places = {"a": (0.0, 0.0), "b": (0.045, 0.0), "c": (-0.045, 0.0), "d": (0.0, 0.045), "e": (0.0, -0.045)}
+    state = scene(walled, places, pusher=(0.2, 0.2))
+    goal = moved(state, "a", (-0.2, 0.0))
+    assert len(PushProposals(walled).draw(state, goal, 8, HORIZON, np.random.default_rng(0))) == 0
+
+
+def test_what_is_in_place_but_turned_is_turned_back(shapes, model):
+    state = scene(shapes, {BOX: (0.0, 0.0)}, pusher=(0.0, -0.2))
+    here = state.pose(BOX)
+    turn = quaternion_exp(np.array([0.0, 0.0, 0.5]))
+    goal = PoseGoal.of(state, {BOX: Pose(here.position, quaternion_multiply(turn, here.quaternion))})
+    actions = PushProposals(shapes).draw(state, goal, 40, 30, np.random.default_rng(0))
+    futures = model.rollout(state, actions)
+    left = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.poses.quaternion[0], (len(actions), 4)))
+    shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - here.position[:2], axis=1)
+    assert left[shift < 0.03].min() < 0.2
 
 
 def test_the_same_draws_give_the_same_pushes(shapes):

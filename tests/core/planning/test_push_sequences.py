@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
+from osfcore.planning.path_planning import FreeSpace, actions_along
+from osfcore.planning.push_sequences import ObjectPushes, around_loop
+from tests.core.dynamics.scenes import BOX, scene
+
+FIELDS = FieldLibrary(None)
+PUSHER = np.array([0.0, -0.2])
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return load_shapes(None, FIELDS, (BOX,))
+
+
+@pytest.fixture(scope="module")
+def pushes(shapes):
+    return ObjectPushes(ShapeTable((shapes[BOX],)), scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX))
+
+
+def turned(pose: Pose, yaw: float, shift=(0.0, 0.0)) -> Pose:
+    turn = quaternion_exp(np.array([0.0, 0.0, yaw]))
+    return Pose(pose.position + [*shift, 0.0], quaternion_multiply(turn, pose.quaternion))
+
+
+def test_an_object_that_is_only_turned_is_turned_back(shapes, pushes):
+    """The learned dynamics confirm what the search by the limit surface chose."""
+    state = scene(shapes, {BOX: (0.0, 0.0)}, pusher=tuple(PUSHER))
+    goal = turned(state.pose(BOX), 0.6)
+    ways = pushes.draw(state.pose(BOX), goal, FreeSpace([]), PUSHER, 30, np.random.default_rng(0))
+    model = load_push_model(None, FIELDS, (BOX,))
+    actions = np.array([actions_along(np.vstack([PUSHER, way]), 30) for way in ways])
+    futures = model.rollout(state, actions)
+    turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
+    shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - goal.position[:2], axis=1)
+    assert (turn + shift / 0.1).min() < 0.25
+
+
+@pytest.mark.parametrize("yaw", [-0.7, 1.1])
+def test_pushes_turn_with_the_scene(shapes, pushes, yaw):
+    pose = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX)
+    goal = turned(pose, 0.4, (0.05, 0.02))
+    plain = pushes.draw(pose, goal, FreeSpace([]), PUSHER, 5, np.random.default_rng(0))
+    spin = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    around = quaternion_exp(np.array([0.0, 0.0, yaw]))
+    places = (np.array([*spin @ one.position[:2], one.position[2]]) for one in (pose, goal))
+    both = [
+        Pose(place, quaternion_multiply(around, one.quaternion))
+        for place, one in zip(places, (pose, goal), strict=True)
+    ]
+    other = pushes.draw(*both, FreeSpace([]), spin @ PUSHER, 5, np.random.default_rng(0))
+    for a, b in zip(plain, other, strict=True):
+        np.testing.assert_allclose(a @ spin.T, b, atol=1e-9)
+
+
+def test_the_shorter_way_is_taken_around_an_object():
+    angles = 2 * np.pi * np.arange(36) / 36
+    loop = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    way = around_loop(loop, loop[3] * 0.9, loop[30] * 1.1)
+    np.testing.assert_allclose(way, loop[[3, 2, 1, 0, 35, 34, 33, 32, 31, 30]])
