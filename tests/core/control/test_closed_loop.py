@@ -74,12 +74,15 @@ def test_the_table_becomes_what_was_asked_for(world, told):
     acted = [event.number for event in events if isinstance(event, ActionExecuted)]
     assert acted == list(range(1, events[-1].number + 1))
     steps = [event for event in events if isinstance(event, Stepped)]
-    assert [step.number for step in steps] == [0, *acted]
+    looks = [step.number for step in steps]
+    assert (looks[0], looks[-1]) == (0, acted[-1])
+    assert set(np.diff(looks)) == {1, 3}  # three actions at once where the pusher only walks
     assert steps[-1].offsets_m.max() == pytest.approx(left.max(), abs=1e-9)
     assert steps[-1].image_cost < 0.3 * steps[0].image_cost
     kinds = Counter(type(event) for event in events)
     assert kinds[GoalFound] == 1
-    assert kinds[Planning] == 2 * len(acted)
+    plans = len(looks) - 1
+    assert plans < kinds[Planning] < 2 * plans  # some plans only refine the last one
     assert all(set(step.seconds) == {"estimate", "plan", "act"} for step in steps[1:])
 
 
@@ -121,7 +124,7 @@ def test_without_acting_plans_are_shown_and_nothing_moves(world, told):
         if sum(isinstance(one, Stepped) for one in seen) == 3:
             break
     events.close()
-    assert sum(isinstance(event, Planning) for event in seen) == 4
+    assert sum(isinstance(event, Planning) for event in seen) == 2 + 1  # rounds of two plans
     assert not any(isinstance(event, ActionExecuted) for event in seen)
     np.testing.assert_array_equal(world.truth().poses.position, before.poses.position)
 
@@ -140,8 +143,8 @@ def test_without_planning_the_last_plan_is_followed_to_its_end(world, told):
 
 
 def test_a_plan_serves_for_as_many_actions_as_asked(world, told):
-    events = list(begun(world, toward_middle(world, length=0.15), replace(SMALL, steps=5, replan_every=2)).run())
-    assert sum(isinstance(event, Planning) for event in events) == 2 * 3
+    events = list(begun(world, toward_middle(world, length=0.15), replace(SMALL, steps=5, replan_every=4)).run())
+    assert sum(isinstance(event, Planning) for event in events) == 2 + 1  # rounds of two plans
     assert sum(isinstance(event, ActionExecuted) for event in events) == 5
 
 
@@ -155,9 +158,9 @@ def test_settings_count_from_the_next_step_on(world, told):
 
 
 def test_nothing_coming_nearer_is_noticed(world, told):
-    events = list(begun(world, toward_middle(world), replace(SMALL, planning=False)).run())
+    events = list(begun(world, toward_middle(world), replace(SMALL, steps=18, planning=False)).run())
     stalled = [event for event in events if isinstance(event, Noticed) and event.matter == "stalled"]
-    assert [event.number for event in stalled] == [9]
+    assert [event.number for event in stalled] == [17]
 
 
 def test_a_lamp_and_an_object_moved_by_hand_are_noticed(world, told):
@@ -230,7 +233,7 @@ def test_by_real_eyes_later_frames_of_odd_pictures_are_right(world):
     goal = toward_middle(world)
     stepped = [e for e in begun(DarkCameras(world), goal, replace(SMALL, steps=3)).run() if isinstance(e, Stepped)]
     truth = world.truth()
-    assert len(stepped) == 4
+    assert stepped[-1].number == 3
     assert stepped[-1].estimate.trusted, stepped[-1].estimate.reason
     for name in NAMES:
         assert stepped[-1].estimate.state.pose(name).position == pytest.approx(truth.pose(name).position, abs=0.005)
