@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from osfcore.control import monitor
 from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.estimators import Estimators
@@ -31,7 +32,6 @@ from osfcore.control.events import (
     Stepped,
 )
 from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
-from osfcore.control.monitor import ProgressMonitor, actions_without_contact, lamp_moved, lies_otherwise, moved_by_hand, offsets
 from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels
@@ -94,7 +94,7 @@ class Episode:
         self._planner = MPPIPlanner(models.dynamics.rollout, PushProposals(models.shapes), settings.plan)
         self._start, self._prepared, self._how = start, prepared, estimators or Estimators()
         self._number = 0
-        self._progress, self._sight = ProgressMonitor(), Sight()
+        self._progress, self._sight = monitor.ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
         self._searches = 0
         self._timer = StageTimer()
@@ -201,10 +201,10 @@ class Episode:
 
     def _noticed_changes(self, before: EstimatedState, expected: SceneState) -> Iterator[Event]:
         now = self._estimate.state
-        angle = lamp_moved(before.state.light, now.light)
+        angle = monitor.lamp_moved(before.state.light, now.light)
         if angle is not None:
             yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f}°: found again.")
-        names = moved_by_hand(expected, now)
+        names = monitor.moved_by_hand(expected, now)
         if names:
             self._planner.reset()
             self._before = None
@@ -290,7 +290,7 @@ class Episode:
         left, every, state = self.settings.steps - self._number, self.settings.replan_every, self._estimate.state
         actions = self._planner.nominal(min(max(every, _FREE if self.settings.planning else 1), left))
         futures = self._models.dynamics.rollout(state, actions[None], self._before)
-        actions = actions[: max(every, actions_without_contact(futures))]
+        actions = actions[: max(every, monitor.actions_without_contact(futures))]
         for action in actions:
             yield self._execute(action)
         self._planner.shift(len(actions))
@@ -306,12 +306,13 @@ class Episode:
     # Telling
 
     def _outcome(self) -> tuple[Outcome, str] | None:
-        far, turned = offsets(self._goal, self._estimate.state)
-        rolled = lies_otherwise(self._goal, self._estimate.state)  # which pushes are not planned to undo
+        far, turned = monitor.offsets(self._goal, self._estimate.state)
+        rolled = monitor.lies_otherwise(self._goal, self._estimate.state)  # which pushes are not planned to undo
         if far.max() <= self.settings.reached_m and np.all(turned[~rolled] <= self.settings.reached_rad):
-            text = "The table looks like the goal." if self._number else "The table looks like the goal already."
-            names = ", ".join(np.array(self._estimate.state.names)[rolled])
-            return "reached", f"Everything is in its place, but {names} lies on another side." if names else text
+            if rolled.any():
+                names = ", ".join(np.array(self._estimate.state.names)[rolled])
+                return "reached", f"Everything is in its place, but on another side than in the goal: {names}."
+            return "reached", f"The table looks like the goal{'' if self._number else ' already'}."
         if self._number >= self.settings.steps:
             where = f"{100 * far.max():.1f} cm away from its place and by {np.rad2deg(turned.max()):.0f}° turned"
             return "out of steps", f"All {self._number} pushes are done; objects are up to {where}."
@@ -320,7 +321,7 @@ class Episode:
     def _stepped(self) -> Stepped:
         estimate = self._estimate
         self._goal = nearest_symmetric_goal(self._goal, estimate.state, self._models.symmetries)
-        far, turned = offsets(self._goal, estimate.state)
+        far, turned = monitor.offsets(self._goal, estimate.state)
         rendered = self._rendered(estimate.state, self._camera, self._light)
         cost = float(((rendered - self._image) ** 2).mean())
         taken = self._timer.taken()

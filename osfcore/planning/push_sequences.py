@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from osfcore.dynamics.contact_geometry import part_outlines
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
@@ -44,7 +44,7 @@ class ObjectPushes:
         parts = [outline.astype(float) - centre for outline in part_outlines(table, 0, pose)]
         self.outcomes: PushOutcomes = push_outcomes(parts)
         self._motions = self.outcomes.motions.reshape(-1, 3)
-        self._tree = cKDTree(self._motions * [1, 1, ARM_M])
+        self._tree = KDTree(self._motions * [1, 1, ARM_M])
         self._ends = (
             self.outcomes.starts[:, None] + self.outcomes.lengths[:, None] * self.outcomes.directions[:, None]
         ).reshape(-1, 2)
