@@ -103,7 +103,7 @@ class ObjectPushes:
         rows = np.stack(
             [np.concatenate([possible, possible[::_EVERY]]), np.concatenate([np.full(len(possible), -1), then])], axis=1
         )
-        better = np.flatnonzero(left < _NEARER * _size(goal))
+        better = np.flatnonzero(left < _NEARER * _size(goal[None]))
         drawn = costs[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
         return rows[better[np.argsort(drawn)[:count]]]
 
@@ -158,5 +158,5 @@ def _after(goal: Float[np.ndarray, "3"], motions: Float[np.ndarray, "M 3"]) -> F
     return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)
 
 
-def _size(error: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-    return np.sqrt(error[..., 0] ** 2 + error[..., 1] ** 2 + (ARM_M * error[..., 2]) ** 2)
+def _size(error: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M"]:
+    return np.sqrt(error[:, 0] ** 2 + error[:, 1] ** 2 + (ARM_M * error[:, 2]) ** 2)
