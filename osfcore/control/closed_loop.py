@@ -56,7 +56,6 @@ from osfcore.render.types import Quality, SceneBatch
 _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
-_FREE = 3  # actions of a plan that are executed where the pusher only walks and touches nothing
 _RETREAT = 2  # actions away from the objects, before a search
 
 
@@ -287,10 +286,9 @@ class Episode:
         return ImageCost(self._of_goal.models.together, self._camera, self._image, self._light)
 
     def _act(self) -> Iterator[Event]:
-        left, every, state = self.settings.steps - self._number, self.settings.replan_every, self._estimate.state
-        actions = self._planner.nominal(min(max(every, _FREE if self.settings.planning else 1), left))
+        state = self._estimate.state
+        actions = self._planner.nominal(min(self.settings.replan_every, self.settings.steps - self._number))
         futures = self._models.dynamics.rollout(state, actions[None], self._before)
-        actions = actions[: max(every, monitor.actions_without_contact(futures))]
         for action in actions:
             yield self._execute(action)
         self._planner.shift(len(actions))

@@ -18,7 +18,7 @@ class EpisodeSettings:
 
     Attributes:
         steps: actions at most.
-        replan_every: actions executed of each plan (the paper's r); three where the pusher is to touch nothing.
+        replan_every: actions executed of each plan (the paper's r).
         cost: "pose" compares futures with the goal's poses, "image" their renderings with the goal image (the paper's).
         plan: how pushes are planned.
         planning: draw plans; where not, the last plan is followed to its end.

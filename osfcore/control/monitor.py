@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import planar_turn, rotation_angle
-from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from osfcore.planning.pose_cost import PoseGoal
@@ -30,13 +29,6 @@ def lies_otherwise(goal: PoseGoal, state: SceneState) -> Bool[np.ndarray, "N"]:
     """Which objects lie on another side than in the goal: turning them about the vertical would not do."""
     turns = (planar_turn(state.pose(name).quaternion, goal.pose(name).quaternion) for name in state.names)
     return np.array([turn is None for turn in turns], bool)
-
-
-def actions_without_contact(futures: Rollouts) -> int:
-    """How many of the first actions of a sequence, K = 1, are predicted to leave everything where it is."""
-    positions = futures.positions[0]
-    is_moved = np.any(positions != positions[0], axis=(1, 2))
-    return int(is_moved.argmax()) - 1 if is_moved.any() else len(positions) - 1
 
 
 class ProgressMonitor:

@@ -74,15 +74,12 @@ def test_the_table_becomes_what_was_asked_for(world, told):
     acted = [event.number for event in events if isinstance(event, ActionExecuted)]
     assert acted == list(range(1, events[-1].number + 1))
     steps = [event for event in events if isinstance(event, Stepped)]
-    looks = [step.number for step in steps]
-    assert (looks[0], looks[-1]) == (0, acted[-1])
-    assert set(np.diff(looks)) == {1, 3}  # three actions at once where the pusher only walks
+    assert [step.number for step in steps] == [0, *acted]
     assert steps[-1].offsets_m.max() == pytest.approx(left.max(), abs=1e-9)
     assert steps[-1].image_cost < 0.3 * steps[0].image_cost
     kinds = Counter(type(event) for event in events)
     assert kinds[GoalFound] == 1
-    plans = len(looks) - 1
-    assert plans < kinds[Planning] < 2 * plans  # some plans only refine the last one
+    assert len(acted) < kinds[Planning] < 2 * len(acted)  # some plans only refine the last one
     assert all(set(step.seconds) == {"estimate", "plan", "act"} for step in steps[1:])
 
 
@@ -143,8 +140,8 @@ def test_without_planning_the_last_plan_is_followed_to_its_end(world, told):
 
 
 def test_a_plan_serves_for_as_many_actions_as_asked(world, told):
-    events = list(begun(world, toward_middle(world, length=0.15), replace(SMALL, steps=5, replan_every=4)).run())
-    assert sum(isinstance(event, Planning) for event in events) == 2 + 1  # rounds of two plans
+    events = list(begun(world, toward_middle(world, length=0.15), replace(SMALL, steps=5, replan_every=2)).run())
+    assert sum(isinstance(event, Planning) for event in events) == 2 + 1 + 1  # rounds of three plans
     assert sum(isinstance(event, ActionExecuted) for event in events) == 5
 
 
