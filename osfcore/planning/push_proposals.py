@@ -2,8 +2,9 @@
 
 Random velocities touch an object in one of eight sequences, so sampling alone rarely finds a path around an object, let
 alone pushes of three objects one after another. A proposal is a whole sequence of actions: a collision-free path
-(`path_planning`) to the far side of an object, a straight push toward its goal (`push_primitives`) with random angle,
-offset and length, then the same for the next object, as if the first had arrived. All orders of objects are sampled.
+(`path_planning`) to an object, one or two pushes toward its pose (`push_sequences`) or a straight one toward its place
+(`push_primitives`), then the same for the next object, as if the first had arrived. All orders of up to three objects
+are sampled, six random ones of more.
 """
 
 from __future__ import annotations

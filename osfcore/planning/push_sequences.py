@@ -19,9 +19,9 @@ from osfcore.dynamics.shapes.object_shapes import ShapeTable
 from osfcore.geometry.poses import Pose, planar_turn
 from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.planning.path_planning import FreeSpace
+from osfcore.planning.pose_cost import ARM_M
 from osfcore.planning.push_outcomes import PushOutcomes, push_outcomes
 
-ARM_M = 0.06  # what a turn by 1 rad counts when pushes are chosen
 _PATH_PRICE = 0.1  # of a metre of the pusher's path, in metres of error
 _TEMPERATURE_M = 0.003
 _EVERY = 3  # rows of the table are tried as the first of two pushes
@@ -71,7 +71,7 @@ class ObjectPushes:
             pusher: where it comes from [m].
             count: of sequences at most; none where no push that has room brings the object nearer.
             rng: draws them.
-        """  # fmt: skip
+        """
         turn, centre = _rotation(self.yaw(pose) or 0.0), pose.apply(self._centre)[:2]
         shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
         target = np.array([*shift, planar_turn(pose.quaternion, goal.quaternion) or 0.0])
