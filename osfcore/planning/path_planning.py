@@ -24,33 +24,38 @@ _BLOCKED = 200.0  # cost of a cell too close to something, for a start in contac
 
 
 class FreeSpace:
-    """Where the pusher's centre can be without touching anything.
+    """Where the centre of a disc, usually the pusher, can be without touching anything.
 
     Attributes:
-        clearance: between the pusher's rim and the nearest outline, for its centre on each cell of the grid [m].
+        clearance: between the disc's rim and the nearest outline, for its centre on each cell of the grid [m].
     """
 
     clearance: Float[np.ndarray, "S S"]
 
-    def __init__(self, outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> None:
+    def __init__(self, outlines: Sequence[Float[np.ndarray, "_ 2"]], radius: float = PUSHER_RADIUS_M) -> None:
         """Draw the objects.
 
         Args:
             outlines: of their convex parts, seen from above [m].
+            radius: of the disc [m].
         """
         solid = np.zeros((_SIDE, _SIDE), np.uint8)
         for outline in outlines:
             cv2.fillConvexPoly(solid, _cells(outline)[:, ::-1].astype(np.int32), 1)
         distance = ndimage.distance_transform_edt(solid == 0) if solid.any() else np.full(solid.shape, float(_SIDE))
-        self.clearance = CELL_M * np.asarray(distance) - PUSHER_RADIUS_M
+        self.clearance = CELL_M * np.asarray(distance) - radius
         self._free = self.clearance >= CLEARANCE_M
 
     def is_free(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Whether the pusher clears everything at some places within its reach."""
+        """Whether the disc clears everything at some places within the pusher's reach."""
+        return self.clearance_at(points) >= CLEARANCE_M
+
+    def clearance_at(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Clearance at some places [m]; minus infinity beyond the pusher's reach."""
         cells = _cells(points)
         within = np.all((cells >= 0) & (cells < _SIDE), axis=1)
         rows = cells.clip(0, _SIDE - 1)
-        return within & self._free[rows[:, 0], rows[:, 1]]
+        return np.where(within, self.clearance[rows[:, 0], rows[:, 1]], -np.inf)
 
     def paths_from(self, start: Float[np.ndarray, "2"]) -> ShortestPaths:
         """All shortest paths from a place within reach [m]."""
