@@ -90,7 +90,8 @@ class Episode:
     ) -> None:
         self.settings = settings
         self._world, self._models, self._target, self._rng = world, models, goal, rng
-        self._planner = MPPIPlanner(models.dynamics.rollout, PushProposals(models.shapes), settings.plan)
+        proposals = PushProposals(models.shapes, models.pushes.rollout)
+        self._planner = MPPIPlanner(models.dynamics.rollout, proposals, settings.plan)
         self._start, self._prepared, self._how = start, prepared, estimators or Estimators()
         self._number = 0
         self._progress, self._sight = monitor.ProgressMonitor(), Sight()

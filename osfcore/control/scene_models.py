@@ -24,12 +24,14 @@ class SceneModels:
     Attributes:
         appearance: how objects and table look.
         dynamics: what pushes do.
+        pushes: the network that proposals are drawn by, whatever predicts them.
         shapes: of the objects, by name.
         symmetries: which of their orientations look the same; none for those left out.
     """
 
     appearance: ObjectModels
     dynamics: DynamicsModel
+    pushes: PushModel
     shapes: Mapping[str, ObjectShape]
     symmetries: Mapping[str, Symmetry]
 
@@ -51,9 +53,11 @@ def load_scene_models(
         CorruptFile: if a file is broken.
     """
     shapes = load_shapes(data_dir, fields, names)
+    pushes = PushModel(read_network(network_path(data_dir)), shapes, device)
     return SceneModels(
         ObjectModels({name: fields.load(name) for name in names}, fields.load_table(), device=device),
-        PushModel(read_network(network_path(data_dir)), shapes, device),
+        pushes,
+        pushes,
         shapes,
         {name: assets.info(name).symmetry for name in names},
     )

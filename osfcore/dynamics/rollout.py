@@ -52,7 +52,11 @@ class PushModel:
         return self._names
 
     def rollout(
-        self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
+        self,
+        state: SceneState,
+        actions: Float[np.ndarray, "K T 3"],
+        before: SceneState | None = None,
+        pushers: Float[np.ndarray, "K 2"] | None = None,
     ) -> Rollouts:
         """Predicted poses under K sequences of T actions.
 
@@ -63,6 +67,7 @@ class PushModel:
             state: of the scene, with its pusher.
             actions: velocities (vx, vy, 0) of the pusher [m/s], each held for 0.2 s.
             before: the same objects one action ago, if something may still be moving; else everything is at rest.
+            pushers: where the pusher begins each sequence, if not where it is [m].
 
         Raises:
             InvalidInput: if there are no objects or no pusher, or actions have another shape, are too many, not finite
@@ -76,9 +81,11 @@ class PushModel:
         with torch.inference_mode():
             start = self._initial_motion(state, order, names, before)
             number = self._number(names)
-            parts = [self._unroll(number, start, actions[k : k + _CHUNK]) for k in range(0, len(actions), _CHUNK)]
+            begins = np.tile(state.pusher[:2], (len(actions), 1)) if pushers is None else pushers
+            chunks = [slice(k, k + _CHUNK) for k in range(0, len(actions), _CHUNK)]
+            parts = [self._unroll(number, start, actions[chunk], begins[chunk]) for chunk in chunks]
         centre, turned, moved = (np.concatenate([part[i] for part in parts]) for i in range(3))
-        return self._rollouts(state, order, centre, turned, moved, actions)
+        return self._rollouts(state, order, centre, turned, moved, pusher_path(begins, actions[..., :2]))
 
     def _check(self, state: SceneState) -> None:
         if not state.names:
@@ -119,13 +126,16 @@ class PushModel:
         former = self._motion_at_rest(replace(before, pusher=state.pusher), earlier, number)
         return going_on(former, start)
 
-    def _unroll(self, number: Tensor, start: Motion, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _unroll(
+        self, number: Tensor, start: Motion, actions: np.ndarray, begins: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres of mass, orientations and whether anything moved since the start, after each action."""
         centres, turned, moved = [], [], []
         has_moved = torch.zeros(len(actions), number.shape[1], dtype=torch.bool, device=self.device)
         count = len(actions)
         velocity = torch.as_tensor(actions[..., :2], dtype=torch.float32, device=self.device).transpose(0, 1)
         scenes = Motion(*(part.expand(count, *part.shape[1:]) for part in start))
+        scenes = scenes._replace(pusher=self._tensor(begins).float())
         motions = unroll(self._network, self._table, number.expand(count, -1), scenes, velocity)
         for step, motion in enumerate(motions, start=1):
             has_moved = has_moved | (motion.linear.abs().amax(dim=2) > 0) | (motion.angular.abs().amax(dim=2) > 0)
@@ -142,10 +152,10 @@ class PushModel:
         centre: Float[np.ndarray, "K T N 3"],
         turned: Float[np.ndarray, "K T N 4"],
         moved: Bool[np.ndarray, "K T N"],
-        actions: Float[np.ndarray, "K T 3"],
+        path: Float[np.ndarray, "K S 2"],
     ) -> Rollouts:
         """Poses in the order of the state; the given ones where nothing moved."""
-        count, horizon = actions.shape[:2]
+        count, horizon = moved.shape[:2]
         names = tuple(state.names[i] for i in order)
         offsets = self._table.centre[self._number(names)[0]].cpu().numpy()
         turned = turned.astype(float)
@@ -158,6 +168,6 @@ class PushModel:
             positions[:, 1:, slot][here] = placed[..., place, :][here]
             quaternions[:, 1:, slot][here] = turned[..., place, :][here]
         assert state.pusher is not None
-        path = pusher_path(state.pusher[:2], actions[..., :2])[:, ::SUBSTEPS]
+        path = path[:, ::SUBSTEPS]
         height = np.full((*path.shape[:2], 1), state.pusher[2])
         return Rollouts(state.names, positions, quaternions, np.concatenate([path, height], axis=-1))

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from osfcore.errors import InvalidInput
@@ -93,11 +93,18 @@ def rotation_angle(
 
 def planar_turn(before: Float[np.ndarray, "4"], after: Float[np.ndarray, "4"]) -> float | None:
     """Turn about the vertical between two orientations, in -pi to pi [rad]; None if it tilts by more than 0.08 rad."""
+    angle, is_planar = planar_turns(before, after[None])
+    return float(angle[0]) if is_planar[0] else None
+
+
+def planar_turns(
+    before: Float[np.ndarray, "4"], after: Float[np.ndarray, "M 4"]
+) -> tuple[Float[np.ndarray, "M"], Bool[np.ndarray, "M"]]:
+    """Turns about the vertical from one orientation, in -pi to pi [rad], and which tilt by no more than 0.08 rad."""
     turn = quaternion_multiply(after, quaternion_conjugate(before))
-    if 2 * np.arcsin(min(float(np.linalg.norm(turn[1:3])), 1.0)) > _UPRIGHT_RAD:
-        return None
-    angle = 2 * np.arctan2(turn[3], turn[0])
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+    tilt = 2 * np.arcsin(np.linalg.norm(turn[:, 1:3], axis=1).clip(max=1.0))
+    angle = 2 * np.arctan2(turn[:, 3], turn[:, 0])
+    return (angle + np.pi) % (2 * np.pi) - np.pi, tilt <= _UPRIGHT_RAD
 
 
 def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") -> Float[np.ndarray, "*batch 4"]:

@@ -71,11 +71,17 @@ class PoseGoal:
         return self.poses_of(state.names).position[:, :2] - state.poses.position[:, :2]
 
 
+def turn_cost(angle: Float[np.ndarray, "*batch"] | float, arm_m: float = ARM_M) -> Float[np.ndarray, "*batch"]:
+    """What rotations count [m]: arm * a up to 0.5 rad; beyond that the cost grows by a third of what the angle does."""
+    angle = np.asarray(angle)
+    return np.asarray(arm_m * (angle - (1 - _LARGE_SHARE) * np.maximum(angle - _SMALL_RAD, 0)))
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseCost:
     """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * f(angle(q_n(t), q_n*)), horizontally [m].
 
-    f(a) = a up to 0.5 rad, and beyond that grows by a third of what a does.
+    arm * f(a) is `turn_cost`.
 
     Attributes:
         goal: where that is.
@@ -92,7 +98,6 @@ class PoseCost:
         cost = np.linalg.norm(shift, axis=-1)
         if self.arm_m > 0:
             target = np.broadcast_to(self.goal.poses.quaternion[order], rollouts.quaternions[:, 1:].shape)
-            angle = rotation_angle(rollouts.quaternions[:, 1:], target)
-            cost = cost + self.arm_m * (angle - (1 - _LARGE_SHARE) * np.maximum(angle - _SMALL_RAD, 0))
+            cost = cost + turn_cost(rotation_angle(rollouts.quaternions[:, 1:], target), self.arm_m)
         running_cost = cost.sum(axis=2)
         return running_cost.mean(axis=1) + _TERMINAL_WEIGHT * running_cost[:, -1]

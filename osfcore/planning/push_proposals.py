@@ -10,7 +10,7 @@ one had succeeded.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +23,12 @@ from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.planning.path_planning import FreeSpace, ShortestPaths, actions_along, duration_s
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.planning.push_order import Outlines, OutlinesAt, Stage, push_orders
+from osfcore.planning.push_outcomes import PushPredictor, push_outcomes
 from osfcore.planning.push_primitives import outline_points, straight_pushes
 from osfcore.planning.push_sequences import ObjectPushes
 
 _REACHED_M, _REACHED_RAD = 0.004, 0.045  # an object this close to its goal is not pushed on purpose
-_SPEEDS = (0.6, 1.0)  # of the highest
+_SPEEDS = (0.5, 1.0)  # of the highest
 _ORDERS = 6  # of stages; all of three objects in nobody's way
 _SPARE = 3  # times as many pushes are drawn as needed: some begin where there is no room
 _POOL = 120  # sequences of pushes of an object, drawn at once
@@ -39,10 +40,12 @@ class PushProposals:
 
     Args:
         shapes: of the objects, by name.
+        predict: fills tables of pushes; without it, all pushes are straight ones toward the goal's place.
     """
 
-    def __init__(self, shapes: Mapping[str, ObjectShape]) -> None:
+    def __init__(self, shapes: Mapping[str, ObjectShape], predict: PushPredictor | None = None) -> None:
         self._tables = {name: ShapeTable((shape,)) for name, shape in shapes.items()}
+        self._predict = predict
         self._pushes: dict[str, ObjectPushes] = {}
 
     def draw(
@@ -71,15 +74,19 @@ class PushProposals:
             return known[key]
 
         orders = push_orders(now, goals, off, outlines, _ORDERS, rng)
-        pushes = {n: self._pushes_of(state.names[n], now[n]) for n in off}
+        pushes = {n: self._pushes_of(state, n, outlines(n, now[n])) for n in off}
         chains = _PushSequences(state.pusher[:2], now, pushes, outlines, horizon, rng)
         each = -(-count // len(orders))
         proposals = [actions for order in orders for actions in chains.draw(order, each)]
         return np.array(proposals[:count]).reshape(-1, horizon, 3)
 
-    def _pushes_of(self, name: str, pose: Pose) -> ObjectPushes:
+    def _pushes_of(self, state: SceneState, n: int, outlines: Outlines) -> ObjectPushes:
+        name, pose = state.names[n], state.poses[n]
         if name not in self._pushes or self._pushes[name].yaw(pose) is None:
-            self._pushes[name] = ObjectPushes(self._tables[name], pose)
+            centre = self._tables[name].centre[0].numpy().astype(float)
+            alone = replace(state, names=(name,), poses=state.poses[[n]])
+            outcomes = push_outcomes(self._predict, alone, centre, outlines)
+            self._pushes[name] = ObjectPushes(outcomes, pose.quaternion, centre)
         return self._pushes[name]
 
 
@@ -143,9 +150,9 @@ class _PushSequences:
     def _ways(self, leg: _Leg, stage: Stage, count: int) -> list[Float[np.ndarray, "C 2"]]:
         """Pushes of a stage that begin where the pusher has room."""
         offset = (stage.target.position - leg.here.position)[:2]
-        straight = round(_STRAIGHT * count) if np.linalg.norm(offset) > _REACHED_M else 0
-        ways = [leg.pool[k] for k in self._rng.permutation(len(leg.pool))[: count - straight]]
-        if straight:
+        ways = [leg.pool[k] for k in self._rng.permutation(len(leg.pool))[: count - round(_STRAIGHT * count)]]
+        straight = count - len(ways)
+        if straight and np.linalg.norm(offset) > _REACHED_M:
             sides = outline_points(self._outlines(stage.number, leg.here))
             drawn = straight_pushes(sides, offset, _SPARE * straight, self._rng)
             clear = np.flatnonzero(leg.space.is_free(drawn.starts))[:straight]

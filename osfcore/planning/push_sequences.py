@@ -1,11 +1,12 @@
 """One or two pushes that bring an object to a pose, by search over a table of pushes (Song et al., 2020, go deeper).
 
-With e the goal in the object's planar frame and m_i the motion of push i, one push leaves e' = m_i^-1 e, and the second
-push is the one in the table whose motion is nearest to e'. Sequences are drawn by
+With e = (x, y, yaw) the goal in the object's planar frame and m_i the motion of push i, one push leaves e' = m_i^-1 e,
+and the second push is the one in the table whose motion is nearest to e'. Sequences are drawn by
 
-    s = sqrt(|e_xy|^2 + (arm * e_yaw)^2) + time price * (length of the pusher's path)
+    s = sqrt(x^2 + y^2 + turn_cost(angle)^2) of what is left + price * (length of the pusher's path)
 
-with probability proportional to exp(-s / temperature).
+with probability proportional to exp(-s / temperature). Pushes that roll the object onto another side end a sequence;
+what is left after them is told by the whole rotation.
 """
 
 from __future__ import annotations
@@ -14,13 +15,18 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from osfcore.dynamics.contact_geometry import part_outlines
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.geometry.poses import Pose, planar_turn
+from osfcore.geometry.poses import (
+    Pose,
+    planar_turn,
+    planar_turns,
+    quaternion_conjugate,
+    quaternion_multiply,
+    rotation_angle,
+)
 from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.planning.path_planning import FreeSpace
-from osfcore.planning.pose_cost import ARM_M
-from osfcore.planning.push_outcomes import PushOutcomes, push_outcomes
+from osfcore.planning.pose_cost import ARM_M, turn_cost
+from osfcore.planning.push_outcomes import PushOutcomes
 
 _PATH_PRICE = 0.1  # of a metre of the pusher's path, in metres of error
 _TEMPERATURE_M = 0.003
@@ -33,21 +39,23 @@ class ObjectPushes:
     """Push sequences of one object while it rests on one side.
 
     Args:
-        table: its shape alone.
-        pose: of the object on that side, any yaw.
+        outcomes: table of its pushes on that side.
+        reference: orientation that the table was made in.
+        centre: of mass, in the object's frame [m].
     """
 
-    def __init__(self, table: ShapeTable, pose: Pose) -> None:
-        self._centre = table.centre[0].numpy().astype(float)
-        self._reference = pose.quaternion
-        centre = pose.apply(self._centre)[:2]
-        parts = [outline.astype(float) - centre for outline in part_outlines(table, 0, pose)]
-        self.outcomes: PushOutcomes = push_outcomes(parts)
-        self._motions = self.outcomes.motions.reshape(-1, 3)
-        self._tree = KDTree(self._motions * [1, 1, ARM_M])
-        self._ends = (
-            self.outcomes.starts[:, None] + self.outcomes.lengths[:, None] * self.outcomes.directions[:, None]
-        ).reshape(-1, 2)
+    def __init__(
+        self, outcomes: PushOutcomes, reference: Float[np.ndarray, "4"], centre: Float[np.ndarray, "3"]
+    ) -> None:
+        self._outcomes, self._reference, self._centre = outcomes, reference, centre
+        self._turns = quaternion_multiply(outcomes.quaternions.reshape(-1, 4), quaternion_conjugate(reference))
+        yaw, is_planar = planar_turns(np.array([1.0, 0.0, 0.0, 0.0]), self._turns)
+        self._motions = np.concatenate([outcomes.centres.reshape(-1, 2), yaw[:, None]], axis=1)
+        self._planar = np.flatnonzero(is_planar)
+        self._is_planar = is_planar
+        self._tree = KDTree(self._motions[self._planar] * [1, 1, ARM_M]) if len(self._planar) else None
+        ends = outcomes.starts[:, None] + outcomes.lengths[:, None] * outcomes.directions[:, None]
+        self._ends = ends.reshape(-1, 2)
 
     def yaw(self, pose: Pose) -> float | None:
         """Turn about the vertical from the pose that the table was made in; None if the object lies on another side."""
@@ -73,41 +81,51 @@ class ObjectPushes:
             rng: draws them.
         """
         turn, centre = _rotation(self.yaw(pose) or 0.0), pose.apply(self._centre)[:2]
-        shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
-        target = np.array([*shift, planar_turn(pose.quaternion, goal.quaternion) or 0.0])
         is_within = np.abs(self._ends @ turn.T + centre).max(axis=1) <= PUSHER_REACH_M
-        has_room = np.repeat(space.is_free(self.outcomes.starts @ turn.T + centre), len(self.outcomes.lengths))
-        possible = np.flatnonzero(is_within & has_room)
+        has_room = space.is_free(self._outcomes.starts @ turn.T + centre)
+        possible = np.flatnonzero(is_within & np.repeat(has_room, len(self._outcomes.lengths)))
         if not len(possible):
             return []
-        chosen = self._choose(target, turn.T @ (pusher - centre), possible, count, rng)
+        shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
+        before = np.hypot(np.linalg.norm(shift), turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
+        rows, left = self._sequences(possible, pose, goal, shift)
+        path = self._path_lengths(rows, turn.T @ (pusher - centre))
+        better = np.flatnonzero(left < _NEARER * before)
+        drawn = (left + _PATH_PRICE * path)[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
+        chosen = rows[better[np.argsort(drawn)[:count]]]
         return [self._corners(first, second) @ turn.T + centre for first, second in chosen]
 
-    def _choose(
-        self,
-        goal: Float[np.ndarray, "3"],
-        pusher: Float[np.ndarray, "2"],
-        possible: Int[np.ndarray, "M"],
-        count: int,
-        rng: np.random.Generator,
-    ) -> Int[np.ndarray, "C 2"]:
-        """Rows of the table for the first and for the second push, -1 for no second one."""
-        starts, lengths = self.outcomes.starts, self.outcomes.lengths
-        path = np.linalg.norm(starts[possible // len(lengths)] - pusher, axis=1) + lengths[possible % len(lengths)]
-        error = _after(goal, self._motions[possible])
-        residual, then = self._tree.query(error[::_EVERY] * [1, 1, ARM_M])
-        between = self._carried(possible[::_EVERY], starts[then // len(lengths)]) - self._ends[possible[::_EVERY]]
-        longer = path[::_EVERY] + np.linalg.norm(between, axis=1) + lengths[then % len(lengths)]
-        left = np.concatenate([_size(error), residual])
-        costs = left + _PATH_PRICE * np.concatenate([path, longer])
-        rows = np.stack(
-            [np.concatenate([possible, possible[::_EVERY]]), np.concatenate([np.full(len(possible), -1), then])], axis=1
-        )
-        better = np.flatnonzero(left < _NEARER * _size(goal[None]))
-        drawn = costs[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
-        return rows[better[np.argsort(drawn)[:count]]]
+    def _sequences(
+        self, possible: Int[np.ndarray, "M"], pose: Pose, goal: Pose, shift: Float[np.ndarray, "2"]
+    ) -> tuple[Int[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
+        """Rows of the table for the first and for the second push, -1 for no second one; and what they leave [m]."""
+        yaw = self.yaw(pose) or 0.0
+        around = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+        ends = quaternion_multiply(quaternion_multiply(around, self._turns[possible]), self._reference)
+        angle = rotation_angle(ends, np.broadcast_to(goal.quaternion, ends.shape))
+        one = np.hypot(np.linalg.norm(shift - self._motions[possible, :2], axis=1), turn_cost(angle))
+        rows = np.stack([possible, np.full(len(possible), -1)], axis=1)
+        first = possible[self._is_planar[possible]][::_EVERY]
+        if self._tree is None or not len(first):
+            return rows, one
+        to_turn = planar_turn(pose.quaternion, goal.quaternion)
+        error = _after(np.array([*shift, to_turn or 0.0]), self._motions[first])
+        left, nearest = self._tree.query(error * [1, 1, ARM_M])
+        if to_turn is None:  # which pushes on this side cannot change
+            left = np.hypot(left, turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
+        two = np.stack([first, self._planar[nearest]], axis=1)
+        return np.concatenate([rows, two]), np.concatenate([one, left])
 
-    def _carried(self, number: np.ndarray, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def _path_lengths(self, rows: Int[np.ndarray, "C 2"], pusher: Float[np.ndarray, "2"]) -> Float[np.ndarray, "C"]:
+        """About how far the pusher goes, straight from push to push [m]."""
+        starts, lengths = self._outcomes.starts, self._outcomes.lengths
+        first, second = rows.T
+        path = np.linalg.norm(starts[first // len(lengths)] - pusher, axis=1) + lengths[first % len(lengths)]
+        between = self._carried(first, starts[second // len(lengths)]) - self._ends[first]
+        more = np.linalg.norm(between, axis=1) + lengths[second % len(lengths)]
+        return path + np.where(second < 0, 0.0, more)
+
+    def _carried(self, number: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Points of the planar frame after pushes, in the frame before them."""
         motion = self._motions[number]
         cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
@@ -116,23 +134,24 @@ class ObjectPushes:
         return np.stack([x, y], axis=1)
 
     def _corners(self, first: int, second: int) -> Float[np.ndarray, "C 2"]:
-        start, end = self.outcomes.starts[first // len(self.outcomes.lengths)], self._ends[first]
+        outcomes, count = self._outcomes, len(self._outcomes.lengths)
+        start, end = outcomes.starts[first // count], self._ends[first]
         if second < 0:
             return np.stack([start, end])
         motion = self._motions[first]
         turn, shift = _rotation(motion[2]), motion[:2]
-        back = end - _TURN_BACK_M * self.outcomes.directions[first // len(self.outcomes.lengths)]
-        begin = self.outcomes.starts[second // len(self.outcomes.lengths)]
-        around = around_loop(self.outcomes.loop, turn.T @ (back - shift), begin)
+        back = end - _TURN_BACK_M * outcomes.directions[first // count]
+        begin = outcomes.starts[second // count]
+        around = around_loop(outcomes.loop, turn.T @ (back - shift), begin)
         then = np.vstack([around, begin, self._ends[second]])
         return np.vstack([start, end, back, then @ turn.T + shift])
 
     def leave(self, pose: Pose, at: Float[np.ndarray, "2"], toward: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
         """Corners of a way around the object to the point of its loop that is nearest to another place."""
-        turn, centre = _rotation(self.yaw(pose) or 0.0), pose.apply(self._centre)[:2]
+        turn, centre, loop = _rotation(self.yaw(pose) or 0.0), pose.apply(self._centre)[:2], self._outcomes.loop
         own, aim = turn.T @ (at - centre), turn.T @ (toward - centre)
-        exit_ = self.outcomes.loop[np.linalg.norm(self.outcomes.loop - aim, axis=1).argmin()]
-        return np.vstack([around_loop(self.outcomes.loop, own, exit_), exit_]) @ turn.T + centre
+        exit_ = loop[np.linalg.norm(loop - aim, axis=1).argmin()]
+        return np.vstack([around_loop(loop, own, exit_), exit_]) @ turn.T + centre
 
 
 def around_loop(
@@ -156,7 +175,3 @@ def _after(goal: Float[np.ndarray, "3"], motions: Float[np.ndarray, "M 3"]) -> F
     x, y = (goal[:2] - motions[:, :2]).T
     yaw = (goal[2] - motions[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)
-
-
-def _size(error: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M"]:
-    return np.sqrt(error[:, 0] ** 2 + error[:, 1] ** 2 + (ARM_M * error[:, 2]) ** 2)

@@ -134,7 +134,7 @@ def _push_there(
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> None:
-    planner = MPPIPlanner(dynamics.rollout, PushProposals(models.shapes), settings.plan)
+    planner = MPPIPlanner(dynamics.rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
     goal, number = _moved_goal(task), 0
     while number < settings.steps:
         state = world.truth()

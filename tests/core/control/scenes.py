@@ -22,7 +22,7 @@ def models() -> SceneModels:
     fields = FieldLibrary(None)
     appearance = ObjectModels({name: fields.load(name) for name in NAMES}, fields.load_table())
     dynamics, shapes = load_push_model(None, fields, NAMES), load_shapes(None, fields, NAMES)
-    return SceneModels(appearance, dynamics, shapes, {name: Symmetry("none") for name in NAMES})
+    return SceneModels(appearance, dynamics, dynamics, shapes, {name: Symmetry("none") for name in NAMES})
 
 
 def table(library) -> Tabletop:

@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,14 @@ def test_the_pusher_goes_its_path_at_its_height(model, state):
     path = pusher_path(state.pusher[:2], actions[..., :2])[:, ::SUBSTEPS]
     np.testing.assert_array_equal(found.pusher[..., :2], path)
     np.testing.assert_array_equal(found.pusher[..., 2], np.full((5, 9), state.pusher[2]))
+
+
+def test_sequences_from_several_places_are_the_same_as_from_each(model, state):
+    actions, places = plans(4), state.pusher[:2] + np.array([[0.0, 0.0], [-0.02, 0.01], [0.0, 0.03], [-0.05, -0.05]])
+    together = model.rollout(state, actions, pushers=places)
+    for k, place in enumerate(places):
+        alone = model.rollout(replace(state, pusher=np.array([*place, state.pusher[2]])), actions[k : k + 1])
+        assert_same(together[k], alone, positions=1e-6)
 
 
 def test_what_nothing_can_touch_keeps_its_pose_bit_by_bit(model, state):

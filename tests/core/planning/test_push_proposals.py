@@ -9,7 +9,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, ro
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.planning.push_proposals import PushProposals
-from tests.core.dynamics.scenes import BOX, CAN, boxes, scene
+from tests.core.dynamics.scenes import BOX, CAN, GELATIN, boxes, scene
 
 FIELDS = FieldLibrary(None)
 HORIZON = 24
@@ -17,12 +17,12 @@ HORIZON = 24
 
 @pytest.fixture(scope="module")
 def shapes():
-    return load_shapes(None, FIELDS, (BOX, CAN))
+    return load_shapes(None, FIELDS, (BOX, CAN, GELATIN))
 
 
 @pytest.fixture(scope="module")
 def model():
-    return load_push_model(None, FIELDS, (BOX, CAN))
+    return load_push_model(None, FIELDS, (BOX, CAN, GELATIN))
 
 
 def moved(state, name: str, shift) -> PoseGoal:
@@ -79,7 +79,7 @@ def test_what_is_in_place_but_turned_is_turned_back(shapes, model):
     here = state.pose(BOX)
     turn = quaternion_exp(np.array([0.0, 0.0, 0.5]))
     goal = PoseGoal.of(state, {BOX: Pose(here.position, quaternion_multiply(turn, here.quaternion))})
-    actions = PushProposals(shapes).draw(state, goal, 40, 30, np.random.default_rng(0))
+    actions = PushProposals(shapes, model.rollout).draw(state, goal, 40, 30, np.random.default_rng(0))
     futures = model.rollout(state, actions)
     left = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.poses.quaternion[0], (len(actions), 4)))
     shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - here.position[:2], axis=1)
@@ -102,6 +102,15 @@ def test_a_chain_of_pushes_brings_two_objects_nearer_in_either_order(shapes, mod
     assert (off[:, -1] / off[:, 0]).max(axis=1).min() < 0.5
     first = (np.abs(off - off[:, :1]) > 0.01).argmax(axis=1).argmin(axis=1)
     assert set(first.tolist()) == {0, 1}
+
+
+def test_of_two_that_swap_places_some_sequence_brings_both_nearer_in_the_end(shapes, model):
+    state = scene(shapes, {CAN: (-0.08, 0.0), GELATIN: (0.08, 0.0)}, pusher=(0.0, -0.2))
+    goal = all_moved(state, {CAN: (0.16, 0.0), GELATIN: (-0.16, 0.0)})
+    actions = PushProposals(shapes, model.rollout).draw(state, goal, 60, 60, np.random.default_rng(0))
+    futures = model.rollout(state, actions)
+    off = np.linalg.norm(futures.positions[:, -1, :, :2] - goal.poses.position[:, :2], axis=-1)
+    assert off.max(axis=1).min() < 0.08
 
 
 def test_objects_are_pushed_in_all_orders():

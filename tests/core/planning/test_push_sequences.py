@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 
+from osfcore.dynamics.contact_geometry import part_outlines
 from osfcore.dynamics.push_models import load_push_model, load_shapes
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.planning.path_planning import FreeSpace, actions_along
+from osfcore.planning.push_outcomes import push_outcomes
 from osfcore.planning.push_sequences import ObjectPushes, around_loop
 from tests.core.dynamics.scenes import BOX, scene
 
@@ -19,8 +21,16 @@ def shapes():
 
 
 @pytest.fixture(scope="module")
-def pushes(shapes):
-    return ObjectPushes(ShapeTable((shapes[BOX],)), scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX))
+def model():
+    return load_push_model(None, FIELDS, (BOX,))
+
+
+@pytest.fixture(scope="module")
+def pushes(shapes, model):
+    state, table = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER), ShapeTable((shapes[BOX],))
+    centre = table.centre[0].numpy().astype(float)
+    outcomes = push_outcomes(model.rollout, state, centre, list(part_outlines(table, 0, state.pose(BOX)).astype(float)))
+    return ObjectPushes(outcomes, state.pose(BOX).quaternion, centre)
 
 
 def turned(pose: Pose, yaw: float, shift=(0.0, 0.0)) -> Pose:
@@ -28,12 +38,10 @@ def turned(pose: Pose, yaw: float, shift=(0.0, 0.0)) -> Pose:
     return Pose(pose.position + [*shift, 0.0], quaternion_multiply(turn, pose.quaternion))
 
 
-def test_an_object_that_is_only_turned_is_turned_back(shapes, pushes):
-    """The learned dynamics confirm what the search by the limit surface chose."""
+def test_an_object_that_is_only_turned_is_turned_back(shapes, pushes, model):
     state = scene(shapes, {BOX: (0.0, 0.0)}, pusher=tuple(PUSHER))
     goal = turned(state.pose(BOX), 0.6)
     ways = pushes.draw(state.pose(BOX), goal, FreeSpace([]), PUSHER, 30, np.random.default_rng(0))
-    model = load_push_model(None, FIELDS, (BOX,))
     actions = np.array([actions_along(np.vstack([PUSHER, way]), 30) for way in ways])
     futures = model.rollout(state, actions)
     turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
@@ -63,3 +71,18 @@ def test_the_shorter_way_is_taken_around_an_object():
     loop = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     way = around_loop(loop, loop[3] * 0.9, loop[30] * 1.1)
     np.testing.assert_allclose(way, loop[[3, 2, 1, 0, 35, 34, 33, 32, 31, 30]])
+
+
+def test_of_a_goal_on_another_side_only_the_place_is_sought(pushes, shapes):
+    here = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX)
+    fallen = quaternion_multiply(quaternion_exp(np.array([np.pi / 2, 0.0, 0.0])), here.quaternion)
+    goal = Pose(here.position + [0.1, 0.0, -0.06], fallen)
+    ways = pushes.draw(here, goal, FreeSpace([]), PUSHER, 10, np.random.default_rng(0))
+    assert len(ways) == 10
+    assert np.mean([way[-1, 0] > way[0, 0] for way in ways]) > 0.5
+
+
+def test_what_lies_on_another_side_needs_another_table(pushes, shapes):
+    here = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX)
+    assert pushes.yaw(turned(here, 0.3)) == pytest.approx(0.3)
+    assert pushes.yaw(Pose(here.position, quaternion_exp(np.array([1.0, 0.0, 0.0])))) is None
