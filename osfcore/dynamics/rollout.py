@@ -81,6 +81,7 @@ class PushModel:
         with torch.inference_mode():
             start = self._initial_motion(state, order, names, before)
             number = self._number(names)
+            assert state.pusher is not None  # `_check`
             begins = np.tile(state.pusher[:2], (len(actions), 1)) if pushers is None else pushers
             chunks = [slice(k, k + _CHUNK) for k in range(0, len(actions), _CHUNK)]
             parts = [self._unroll(number, start, actions[chunk], begins[chunk]) for chunk in chunks]

@@ -136,7 +136,7 @@ class _PushSequences:
             places = list(self._now)
             for one in stages[:-1]:
                 places[one.number] = one.target
-            n, last = stages[-1].number, stages[-2].number if len(stages) > 1 else -1
+            *_, last, n = -1, *(one.number for one in stages)
             space = FreeSpace([part for k, pose in enumerate(places) for part in self._outlines(k, pose)])
             around = None if last < 0 else (self._pushes[last], places[last])
             begin = self._pusher

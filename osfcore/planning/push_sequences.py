@@ -1,7 +1,9 @@
-"""One or two pushes that bring an object to a pose, by search over a table of pushes (Song et al., 2020, go deeper).
+"""Up to three pushes that bring an object to a pose, by search over a table of pushes (Song et al., 2020, go deeper).
 
 With e = (x, y, yaw) the goal in the object's planar frame and m_i the motion of push i, one push leaves e' = m_i^-1 e,
-and the second push is the one in the table whose motion is nearest to e'. Sequences are drawn by
+and the last push is the one in the table whose motion is nearest to e'. First pushes of two are a part of the table,
+first and second pushes of three are drawn; three let a can on its side, which rolls under most pushes, be slid along
+its axis, turned and slid back. Sequences are drawn by
 
     s = sqrt(x^2 + y^2 + turn_cost(angle)^2) of what is left + price * (length of the pusher's path)
 
@@ -31,6 +33,7 @@ from osfcore.planning.push_outcomes import PushOutcomes
 _PATH_PRICE = 0.1  # of a metre of the pusher's path, in metres of error
 _TEMPERATURE_M = 0.003
 _EVERY = 3  # rows of the table are tried as the first of two pushes
+_PAIRS = 6000  # of pushes are tried as the first of three
 _NEARER = 0.9  # of the error may be left, or a sequence is not worth its time
 _TURN_BACK_M = 0.008  # the pusher backs off before it walks around an object
 
@@ -56,6 +59,7 @@ class ObjectPushes:
         self._tree = KDTree(self._motions[self._planar] * [1, 1, ARM_M]) if len(self._planar) else None
         ends = outcomes.starts[:, None] + outcomes.lengths[:, None] * outcomes.directions[:, None]
         self._ends = ends.reshape(-1, 2)
+        self._left_at = _into(self._motions, self._ends)
 
     def yaw(self, pose: Pose) -> float | None:
         """Turn about the vertical from the pose that the table was made in; None if the object lies on another side."""
@@ -88,63 +92,63 @@ class ObjectPushes:
             return []
         shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
         before = np.hypot(np.linalg.norm(shift), turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
-        rows, left = self._sequences(possible, pose, goal, shift)
+        rows, left = self._sequences(possible, pose, goal, shift, rng)
         path = self._path_lengths(rows, turn.T @ (pusher - centre))
         better = np.flatnonzero(left < _NEARER * before)
         drawn = (left + _PATH_PRICE * path)[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
         chosen = rows[better[np.argsort(drawn)[:count]]]
-        return [self._corners(first, second) @ turn.T + centre for first, second in chosen]
+        return [self._corners(row) @ turn.T + centre for row in chosen]
 
     def _sequences(
-        self, possible: Int[np.ndarray, "M"], pose: Pose, goal: Pose, shift: Float[np.ndarray, "2"]
-    ) -> tuple[Int[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
-        """Rows of the table for the first and for the second push, -1 for no second one; and what they leave [m]."""
+        self, possible: Int[np.ndarray, "M"], pose: Pose, goal: Pose, shift: Float[np.ndarray, "2"],
+        rng: np.random.Generator,
+    ) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:  # fmt: skip
+        """Rows of the table for each push, -1 for none; and what they leave [m]."""
         yaw = self.yaw(pose) or 0.0
         around = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
         ends = quaternion_multiply(quaternion_multiply(around, self._turns[possible]), self._reference)
         angle = rotation_angle(ends, np.broadcast_to(goal.quaternion, ends.shape))
-        one = np.hypot(np.linalg.norm(shift - self._motions[possible, :2], axis=1), turn_cost(angle))
-        rows = np.stack([possible, np.full(len(possible), -1)], axis=1)
-        first = possible[self._is_planar[possible]][::_EVERY]
+        left = np.hypot(np.linalg.norm(shift - self._motions[possible, :2], axis=1), turn_cost(angle))
+        rows = np.stack([possible, *np.full((2, len(possible)), -1)], axis=1)
+        first = possible[self._is_planar[possible]]
         if self._tree is None or not len(first):
-            return rows, one
+            return rows, left
         to_turn = planar_turn(pose.quaternion, goal.quaternion)
-        error = _after(np.array([*shift, to_turn or 0.0]), self._motions[first])
-        left, nearest = self._tree.query(error * [1, 1, ARM_M])
+        target = np.array([*shift, to_turn or 0.0])
+        pairs = np.stack([rng.choice(first, _PAIRS), rng.choice(self._planar, _PAIRS)], axis=1)
+        one, two = first[::_EVERY], _after(_after(target, self._motions[pairs[:, 0]]), self._motions[pairs[:, 1]])
+        error = np.concatenate([_after(target, self._motions[one]), two])
+        more, nearest = self._tree.query(error * [1, 1, ARM_M])
         if to_turn is None:  # which pushes on this side cannot change
-            left = np.hypot(left, turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
-        two = np.stack([first, self._planar[nearest]], axis=1)
-        return np.concatenate([rows, two]), np.concatenate([one, left])
+            more = np.hypot(more, turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
+        last = self._planar[nearest]
+        second = np.stack([one, last[: len(one)], np.full(len(one), -1)], axis=1)
+        third = np.concatenate([pairs, last[len(one) :, None]], axis=1)
+        return np.concatenate([rows, second, third]), np.concatenate([left, more])
 
-    def _path_lengths(self, rows: Int[np.ndarray, "C 2"], pusher: Float[np.ndarray, "2"]) -> Float[np.ndarray, "C"]:
+    def _path_lengths(self, rows: Int[np.ndarray, "C 3"], pusher: Float[np.ndarray, "2"]) -> Float[np.ndarray, "C"]:
         """About how far the pusher goes, straight from push to push [m]."""
         starts, lengths = self._outcomes.starts, self._outcomes.lengths
-        first, second = rows.T
-        path = np.linalg.norm(starts[first // len(lengths)] - pusher, axis=1) + lengths[first % len(lengths)]
-        between = self._carried(first, starts[second // len(lengths)]) - self._ends[first]
-        more = np.linalg.norm(between, axis=1) + lengths[second % len(lengths)]
-        return path + np.where(second < 0, 0.0, more)
+        path, at = np.zeros(len(rows)), np.broadcast_to(pusher, (len(rows), 2))
+        for push in rows.T:
+            more = np.linalg.norm(starts[push // len(lengths)] - at, axis=1) + lengths[push % len(lengths)]
+            path += np.where(push < 0, 0.0, more)
+            at = self._left_at[push]
+        return path
 
-    def _carried(self, number: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Points of the planar frame after pushes, in the frame before them."""
-        motion = self._motions[number]
-        cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-        x = cos * points[:, 0] - sin * points[:, 1] + motion[:, 0]
-        y = sin * points[:, 0] + cos * points[:, 1] + motion[:, 1]
-        return np.stack([x, y], axis=1)
-
-    def _corners(self, first: int, second: int) -> Float[np.ndarray, "C 2"]:
-        outcomes, count = self._outcomes, len(self._outcomes.lengths)
-        start, end = outcomes.starts[first // count], self._ends[first]
-        if second < 0:
-            return np.stack([start, end])
-        motion = self._motions[first]
-        turn, shift = _rotation(motion[2]), motion[:2]
-        back = end - _TURN_BACK_M * outcomes.directions[first // count]
-        begin = outcomes.starts[second // count]
-        around = around_loop(outcomes.loop, turn.T @ (back - shift), begin)
-        then = np.vstack([around, begin, self._ends[second]])
-        return np.vstack([start, end, back, then @ turn.T + shift])
+    def _corners(self, rows: Int[np.ndarray, "_"]) -> Float[np.ndarray, "C 2"]:
+        """The pusher's path through pushes, in the planar frame before the first."""
+        outcomes = self._outcomes
+        push, later = rows[0], rows[1:]
+        number = push // len(outcomes.lengths)
+        path = np.stack([outcomes.starts[number], self._ends[push]])
+        if not len(later) or later[0] < 0:
+            return path
+        then = self._corners(later)
+        back = path[1] - _TURN_BACK_M * outcomes.directions[number]
+        motion = self._motions[push]
+        around = around_loop(outcomes.loop, _into(motion[None], back[None])[0], then[0])
+        return np.vstack([path, back, np.vstack([around, then]) @ _rotation(motion[2]).T + motion[:2]])
 
     def leave(self, pose: Pose, at: Float[np.ndarray, "2"], toward: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
         """Corners of a way around the object to the point of its loop that is nearest to another place."""
@@ -169,9 +173,17 @@ def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _after(goal: Float[np.ndarray, "3"], motions: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 3"]:
-    """The goal (x, y, yaw) in the frame of an object that has made motions: m^-1 e."""
+def _into(motions: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
+    """Points in the frame of an object that has made motions."""
     cos, sin = np.cos(motions[:, 2]), np.sin(motions[:, 2])
-    x, y = (goal[:2] - motions[:, :2]).T
-    yaw = (goal[2] - motions[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)
+    x, y = (points - motions[:, :2]).T
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
+
+
+def _after(
+    goal: Float[np.ndarray, "3"] | Float[np.ndarray, "M 3"], motions: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "M 3"]:
+    """Goals (x, y, yaw) in the frame of an object that has made motions: m^-1 e."""
+    goals = np.broadcast_to(goal, motions.shape)
+    yaw = (goals[:, 2] - motions[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return np.concatenate([_into(motions, goals[:, :2]), yaw[:, None]], axis=1)

@@ -9,7 +9,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, ro
 from osfcore.planning.path_planning import FreeSpace, actions_along
 from osfcore.planning.push_outcomes import push_outcomes
 from osfcore.planning.push_sequences import ObjectPushes, around_loop
-from tests.core.dynamics.scenes import BOX, scene
+from tests.core.dynamics.scenes import BOX, CAN, scene
 
 FIELDS = FieldLibrary(None)
 PUSHER = np.array([0.0, -0.2])
@@ -17,20 +17,25 @@ PUSHER = np.array([0.0, -0.2])
 
 @pytest.fixture(scope="module")
 def shapes():
-    return load_shapes(None, FIELDS, (BOX,))
+    return load_shapes(None, FIELDS, (BOX, CAN))
 
 
 @pytest.fixture(scope="module")
 def model():
-    return load_push_model(None, FIELDS, (BOX,))
+    return load_push_model(None, FIELDS, (BOX, CAN))
 
 
 @pytest.fixture(scope="module")
 def pushes(shapes, model):
-    state, table = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER), ShapeTable((shapes[BOX],))
+    return sequences(shapes, model, scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER))
+
+
+def sequences(shapes, model, state) -> ObjectPushes:
+    """Those of the only object of a scene."""
+    table = ShapeTable((shapes[state.names[0]],))
     centre = table.centre[0].numpy().astype(float)
-    outcomes = push_outcomes(model.rollout, state, centre, list(part_outlines(table, 0, state.pose(BOX)).astype(float)))
-    return ObjectPushes(outcomes, state.pose(BOX).quaternion, centre)
+    outcomes = push_outcomes(model.rollout, state, centre, list(part_outlines(table, 0, state.poses[0]).astype(float)))
+    return ObjectPushes(outcomes, state.poses[0].quaternion, centre)
 
 
 def turned(pose: Pose, yaw: float, shift=(0.0, 0.0)) -> Pose:
@@ -86,3 +91,16 @@ def test_what_lies_on_another_side_needs_another_table(pushes, shapes):
     here = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX)
     assert pushes.yaw(turned(here, 0.3)) == pytest.approx(0.3)
     assert pushes.yaw(Pose(here.position, quaternion_exp(np.array([1.0, 0.0, 0.0])))) is None
+
+
+def test_a_can_on_its_side_is_slid_across_its_axis_rather_than_rolled(shapes, model):
+    """Rolled straight to its goal it would turn by 3.6 rad."""
+    lying = scene(shapes, {CAN: (0.0, 0.0, (np.pi / 2, 0.0, 0.0))}, pusher=PUSHER)
+    goal = turned(lying.pose(CAN), 0.0, (0.12, 0.0))
+    ways = sequences(shapes, model, lying).draw(
+        lying.pose(CAN), goal, FreeSpace([]), PUSHER, 40, np.random.default_rng(0)
+    )
+    futures = model.rollout(lying, np.array([actions_along(np.vstack([PUSHER, way]), 50) for way in ways]))
+    turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
+    shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - goal.position[:2], axis=1)
+    assert (turn + shift / 0.1).min() < 0.5
