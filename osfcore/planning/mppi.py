@@ -176,8 +176,16 @@ class MPPIPlanner:
         second[1] = _hurried(begin)
         round_ = self._evaluate(1, state, second, cost, before)
         mean = np.einsum("k,kta->ta", _mppi_weights(round_.costs, self.settings.temperature), second)
-        self._nominal = np.concatenate([mean, rest])
+        self._nominal = self._best_of(
+            state, np.stack([np.concatenate([head, rest]) for head in (begin, mean, round_.actions)]), cost, before
+        )
         yield replace(round_, actions=self._nominal)
+
+    def _best_of(
+        self, state: SceneState, plans: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
+    ) -> Float[np.ndarray, "T 3"]:
+        """The one that costs least over the whole horizon: later pushes may need the object where it was expected."""
+        return plans[int(cost(self._rollout(state, plans, before)).argmin())]
 
     def _evaluate(
         self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None

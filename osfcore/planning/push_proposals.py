@@ -151,7 +151,8 @@ class _PushSequences:
         """Pushes of a stage that begin where the pusher has room."""
         offset = (stage.target.position - leg.here.position)[:2]
         ways = [leg.pool[k] for k in self._rng.permutation(len(leg.pool))[: count - round(_STRAIGHT * count)]]
-        straight = count - len(ways)
+        is_aimless = bool(ways) and self._pushes[stage.number].rolls  # straight pushes take no heed of rolling
+        straight = 0 if is_aimless else count - len(ways)
         if straight and np.linalg.norm(offset) > _REACHED_M:
             sides = outline_points(self._outlines(stage.number, leg.here))
             drawn = straight_pushes(sides, offset, _SPARE * straight, self._rng)

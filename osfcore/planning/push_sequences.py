@@ -35,6 +35,8 @@ _TEMPERATURE_M = 0.003
 _EVERY = 3  # rows of the table are tried as the first of two pushes
 _PAIRS = 6000  # of pushes are tried as the first of three
 _NEARER = 0.9  # of the error may be left, or a sequence is not worth its time
+_MUCH_NEARER = 0.5  # where as little is left by pushes that do not roll the object, no others are drawn
+_STEADY = 0.95  # of an object's pushes leave it on its side, or it rolls
 _TURN_BACK_M = 0.008  # the pusher backs off before it walks around an object
 
 
@@ -60,6 +62,7 @@ class ObjectPushes:
         ends = outcomes.starts[:, None] + outcomes.lengths[:, None] * outcomes.directions[:, None]
         self._ends = ends.reshape(-1, 2)
         self._left_at = _into(self._motions, self._ends)
+        self.rolls = bool(np.mean(is_planar) < _STEADY) if len(is_planar) else False
 
     def yaw(self, pose: Pose) -> float | None:
         """Turn about the vertical from the pose that the table was made in; None if the object lies on another side."""
@@ -94,7 +97,10 @@ class ObjectPushes:
         before = np.hypot(np.linalg.norm(shift), turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
         rows, left = self._sequences(possible, pose, goal, shift, rng)
         path = self._path_lengths(rows, turn.T @ (pusher - centre))
+        stays = (rows[:, 1] >= 0) | self._is_planar[rows[:, 0]]
         better = np.flatnonzero(left < _NEARER * before)
+        if np.any(stays & (left < _MUCH_NEARER * before)):
+            better = better[stays[better]]
         drawn = (left + _PATH_PRICE * path)[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
         chosen = rows[better[np.argsort(drawn)[:count]]]
         return [self._corners(row) @ turn.T + centre for row in chosen]
