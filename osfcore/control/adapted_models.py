@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from osfcore.control.goal import GoalImage
-from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.goal_refinement import GoalImageConfig
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.estimation.photometry.scaled_fields import adapted

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from osfcore.control.first_frame import estimate_first
 from osfcore.estimation.first_frame import FirstFrameConfig
-from osfcore.estimation.goal_image import GoalImageConfig
+from osfcore.estimation.goal_refinement import GoalImageConfig
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next

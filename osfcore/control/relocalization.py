@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.goal_refinement import GoalImageConfig
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import estimate_next

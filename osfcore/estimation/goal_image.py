@@ -1,20 +1,22 @@
 """Goal images: one view, no masks, objects known by name, perhaps under another light than the scene.
 
-Templates of each object are matched over the image (`template_matching`), first in the resting orientation that it has
-now, since goals are mostly reached by pushing. Combinations of matches are ranked by their photometric loss
-(`scene_assembly`), and the best is refined by Gauss-Newton as in the first frame.
+First the scene as it is now is compared with the image: objects that it shows there stay, and templates of the others
+are matched over the image (`template_matching`), in the resting orientation that they have now, since goals are mostly
+reached by pushing. Where that leaves doubts, templates of all objects are matched, combinations of matches are ranked
+by their photometric loss under any light (`scene_assembly`), and what is still doubted in other orientations.
+Gauss-Newton refines as in the first frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, yaw_hypotheses
+from osfcore.estimation.goal_refinement import GoalImageConfig, GoalRefinement
 from osfcore.estimation.hypotheses.scene_assembly import (
     OUT_OF_VIEW,
     assemble_scene,
@@ -26,41 +28,20 @@ from osfcore.estimation.hypotheses.template_matching import TemplateMatches, mat
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
 from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.objective.photometric_loss import loss_of
 from osfcore.estimation.objective.resting_orientations import yaw_quaternions
-from osfcore.estimation.search.gauss_newton import PLANAR_PARAMETERS, GaussNewtonState, gauss_newton
+from osfcore.estimation.search.gauss_newton import GaussNewtonState
+from osfcore.estimation.search.light_search import search_light
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.geometry.poses import Pose, quaternion_multiply, rotate, rotation_angle
+from osfcore.geometry.poses import Pose, quaternion_multiply, rotate
 from osfcore.geometry.states import Observation, SceneState
 
 _YAWS = 24
 _MATCHES = 300
-_FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
 _SHOWN = 24
-_COMPARISONS, _TURNED_RAD = 2, np.deg2rad(30.0)
-_BESIDE_M = 0.04
+_BETTER = 0.98  # times the loss: what is less is no reason to look elsewhere
 _ROUNDS = 2  # in which doubted objects are put where they were seen: the first may stand in the second's place
-
-
-@dataclass(frozen=True, slots=True)
-class GoalImageConfig:
-    """How much work a goal estimate is.
-
-    Attributes:
-        side: of the image that templates are slid over [px].
-        planar_iterations: of Gauss-Newton over position and yaw.
-        free_iterations: of Gauss-Newton over whole poses.
-        widen_all: match every object again in all resting orientations, also where none is doubted.
-        held_light: unit vector toward a light that is not estimated; None to estimate it.
-    """
-
-    side: int = FINE_SIDE
-    planar_iterations: int = 5
-    free_iterations: int = 8
-    widen_all: bool = False
-    held_light: tuple[float, float, float] | None = None
 
 
 def estimate_goal(
@@ -75,7 +56,7 @@ def estimate_goal(
     Args:
         models: fields of the objects and the table.
         observation: one view without the pusher; masks play no part.
-        prior: how the objects lie now; where they lie plays no part.
+        prior: the scene now, or any other guess: how objects lie matters most; places and light save time if right.
         config: how much work to do.
         allowed: by object, the residual below which its images are not doubted, see `allowed_residuals`.
 
@@ -102,41 +83,74 @@ class _GoalImageEstimator:
         config: GoalImageConfig,
         allowed: Mapping[str, float],
     ) -> None:
-        self._allowed = np.array([allowed.get(name, 0.0) for name in observation.names])
+        self._refinement = GoalRefinement(models, observation, config, allowed)
         self._models, self._config, self._prior = models, config, prior
         self._names = observation.names
-        self._fine = views_of(observation, FINE_SIDE, samples=2)
-        self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
+        self._everything = range(len(observation.names))
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, config.side)
-        self._light_views = self._middle if config.held_light is None else None  # in which the light is refined
-        comparison = len(self._names) + config.free_iterations
-        self._refinement = config.planar_iterations + _FINE_PLANAR + _COMPARISONS * comparison  # steps
-        self._pass = count_of_scenes(len(self._names)) + self._refinement
-        self._reporter = StepReporter(len(self._names) + self._pass + 1)
-        self._rivals: dict[int, float] = {}
+        self._pass = count_of_scenes(len(self._names)) + self._refinement.steps
+        self._reporter = StepReporter(len(self._names) + _ROUNDS + self._refinement.steps + 1)
 
     def steps(self) -> Iterator[EstimateStep]:
+        at = yield from self._from_prior()
+        if self._doubtful_objects(at):
+            at = yield from self._from_anywhere()
+        yield self._reporter.finish(at, self._refinement.estimate(at, self._refinement.rivals))
+
+    def _from_prior(self) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """What the image shows where the prior has it stays; templates of the others alone are matched."""
+        params = self._relit(self._prior_guess())
+        bad = self._refinement.misfits(params)
+        none = TemplateMatches(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))
+        matches = [none] * len(self._names)
+        params = without_objects(params, bad)
+        behind = scene_errors(self._models, self._slide, params)
+        for n in bad:
+            matches[n] = self._match_prior_orientation(n, behind, params.light)
+            yield self._step("orientations", f"{self._names[n]}: where it may be", params, matches)
+        for _ in range(_ROUNDS if bad else 0):
+            params = self._relit(reassign_poses(self._models, self._coarse, params, matches))
+            yield self._step("together", "Objects that were moved", params, matches)
+        at = yield from self._refined(params, matches, bad)
+        return (yield from self._reassign(at, matches, bad))
+
+    def _from_anywhere(self) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Templates of all objects are matched, and scenes assembled under any light."""
+        self._reporter.total += len(self._names) + self._pass
+        self._refinement.rivals = {}
         matches: list[TemplateMatches] = []
         for n, name in enumerate(self._names):
             matches.append(self._match_prior_orientation(n))
             yield self._step("orientations", f"{name}: where it may be", self._initial_guess(matches), matches)
         params = yield from self._assemble(self._initial_guess(matches), matches)
-        at = yield from self._refine(params, matches)
-        at = yield from self._reassign(at, matches)
+        at = yield from self._refined(params, matches, self._everything)
+        at = yield from self._reassign(at, matches, self._everything)
         bad = self._doubtful_objects(at)
         if bad:
             at = yield from self._relocate_doubtful(at, bad, matches)
             bad = self._doubtful_objects(at)
         if bad:
             at = yield from self._widen_hypotheses(at, bad, matches)
-        yield self._finish(at)
+        return at
+
+    def _prior_guess(self) -> SceneParameters:
+        poses = Pose.stacked([self._prior.pose(name) for name in self._names])
+        held = self._config.held_light
+        light = self._prior.light.direction if held is None else np.array(held)
+        return SceneParameters(self._names, poses.position, poses.quaternion, light, None)
+
+    def _relit(self, params: SceneParameters) -> SceneParameters:
+        """Under the light that fits best, if that fits better than the guess's."""
+        if self._config.held_light is not None:
+            return params
+        other = replace(params, light=search_light(self._models, self._rough, self._coarse, params))
+        return min(params, other, key=lambda one: loss_of(self._models, self._coarse, one))
 
     def _doubtful_objects(self, at: GaussNewtonState) -> list[int]:
         """Objects whose fit is poor or whose orientation the image does not determine."""
-        doubts = self._with_uncertainty(at, {}).doubts
-        return [n for n, doubt in enumerate(doubts) if doubt or self._config.widen_all]
+        return list(self._everything) if self._config.widen_all else self._refinement.doubted(at)
 
     def _relocate_doubtful(
         self, at: GaussNewtonState, bad: list[int], matches: list[TemplateMatches]
@@ -145,17 +159,17 @@ class _GoalImageEstimator:
 
         Under the estimated light the table's brightness is known, so grey objects differ from its shadows.
         """
-        self._reporter.total += len(bad) + 1 + self._refinement
+        self._reporter.total += len(bad) + 1 + self._refinement.steps
         params = without_objects(at.params, bad)
         behind = scene_errors(self._models, self._slide, params)
         for n in bad:
-            matches[n] = self._match_prior_orientation(n, behind)
+            matches[n] = self._match_prior_orientation(n, behind, params.light)
             yield self._step("orientations", f"{self._names[n]}: in what is unexplained", at.params, matches)
         for _ in range(_ROUNDS):
             params = reassign_poses(self._models, self._coarse, params, matches)
         yield self._step("together", "Doubted objects seen elsewhere", params, matches)
-        at = yield from self._accept_if_better(at, params, matches)
-        return (yield from self._reassign(at, matches))
+        at = yield from self._accept_if_better(at, params, matches, self._everything)
+        return (yield from self._reassign(at, matches, self._everything))
 
     def _widen_hypotheses(
         self, at: GaussNewtonState, bad: list[int], matches: list[TemplateMatches]
@@ -167,27 +181,34 @@ class _GoalImageEstimator:
             matches[n] = self._match_any_orientation(n, behind)
             yield self._step("orientations", f"{self._names[n]}: lying in any way", at.params, matches)
         params = yield from self._assemble(at.params, matches)
-        at = yield from self._accept_if_better(at, params, matches)
-        return (yield from self._reassign(at, matches))
+        at = yield from self._accept_if_better(at, params, matches, self._everything)
+        return (yield from self._reassign(at, matches, self._everything))
 
     def _accept_if_better(
-        self, at: GaussNewtonState, params: SceneParameters, matches: list[TemplateMatches]
+        self, at: GaussNewtonState, params: SceneParameters, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Refine another guess; keep the result if its loss is lower."""
-        rivals = dict(self._rivals)
-        other = yield from self._refine(params, matches)
+        rivals = dict(self._refinement.rivals)
+        other = yield from self._refined(params, matches, moved)
         if other.losses[-1] < at.losses[-1]:
             return other
-        self._rivals = rivals
+        self._refinement.rivals = rivals
         return at
 
-    def _match_prior_orientation(self, n: int, behind: Float[np.ndarray, "h w"] | None = None) -> TemplateMatches:
+    def _refined(
+        self, params: SceneParameters, matches: list[TemplateMatches], moved: Sequence[int]
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        return (yield from self._refinement.refined(params, matches, moved, self._reporter))
+
+    def _match_prior_orientation(
+        self, n: int, behind: Float[np.ndarray, "h w"] | None = None, light: Float[np.ndarray, "3"] | None = None
+    ) -> TemplateMatches:
         pose = self._prior.pose(self._names[n])
         turns = yaw_quaternions(np.arange(_YAWS) * 2 * np.pi / _YAWS)
         quaternions = quaternion_multiply(turns, pose.quaternion[None])
         heights = np.full(_YAWS, pose.position[2])
         return match_templates(
-            self._models, self._slide, self._names[n], quaternions, heights, most=_MATCHES, behind=behind
+            self._models, self._slide, self._names[n], quaternions, heights, most=_MATCHES, behind=behind, light=light
         )
 
     def _match_any_orientation(self, n: int, behind: Float[np.ndarray, "h w"]) -> TemplateMatches:
@@ -204,9 +225,7 @@ class _GoalImageEstimator:
         for n, found in enumerate(matches):
             if len(found.scores):
                 positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
-        held = self._config.held_light
-        light = self._prior.light.direction if held is None else np.array(held)
-        return SceneParameters(self._names, positions, quaternions, light, None)
+        return replace(self._prior_guess(), positions=positions, quaternions=quaternions)
 
     def _assemble(
         self, params: SceneParameters, matches: list[TemplateMatches]
@@ -217,76 +236,20 @@ class _GoalImageEstimator:
             yield self._step("together", "Which matches explain the image together", params, matches, loss=loss)
         return params
 
-    def _refine(
-        self, params: SceneParameters, matches: list[TemplateMatches]
-    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Gauss-Newton over positions and yaw on the table, then over whole poses."""
-        at = GaussNewtonState.at(params)
-        for views, numbers, iterations in (
-            (self._middle, PLANAR_PARAMETERS, self._config.planar_iterations),
-            (self._fine, PLANAR_PARAMETERS, _FINE_PLANAR),
-        ):
-            for step in gauss_newton(
-                self._models, views, at, iterations=iterations, numbers=numbers, light=self._light_views
-            ):
-                at = step
-                yield self._reporter.refinement("On the table", at)
-        for _ in range(_COMPARISONS):
-            before = at.params.quaternions
-            at = yield from self._compare_orientations(at, matches)
-            if rotation_angle(before, at.params.quaternions).max() < _TURNED_RAD:
-                break  # no object was turned, so the others' losses have not changed
-        return at
-
     def _reassign(
-        self, at: GaussNewtonState, matches: list[TemplateMatches]
+        self, at: GaussNewtonState, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Move objects to other matches of theirs if that lowers the loss after refinement.
 
         Gauss-Newton may have drawn an object into another's shadow or behind it, a local minimum.
         """
         params = reassign_poses(self._models, self._coarse, at.params, matches)
-        if params is at.params:
+        here, there = (loss_of(self._models, self._coarse, one) for one in (at.params, params))
+        if there > _BETTER * here:
             return at
-        self._reporter.total += 1 + self._refinement
+        self._reporter.total += 1 + self._refinement.steps
         yield self._step("together", "Objects seen elsewhere", params, matches)
-        return (yield from self._accept_if_better(at, params, matches))
-
-    def _compare_orientations(
-        self, at: GaussNewtonState, matches: list[TemplateMatches]
-    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Replace each object's orientation by any hypothesis of lower loss, then refine all six degrees of freedom.
-
-        A wrong orientation also shifts the position, so matches nearby are tried as well.
-        """
-        for n, name in enumerate(self._names):
-            beside = matches[n].within(at.params.positions[n], _BESIDE_M)
-            others = Pose.joined(yaw_hypotheses(self._models, at.params, n), beside.poses)
-            at, self._rivals[n] = compare_orientations(
-                self._models, self._middle, self._fine, self._fine, at, n, others
-            )
-            yield self._reporter.refinement(f"{name}: the other way round", at)
-        at = replace(at, dampings=GaussNewtonState.at(at.params).dampings)
-        sweeps = self._config.free_iterations
-        for step in gauss_newton(
-            self._models, self._fine, at, iterations=sweeps, light=self._light_views, until_settled=True
-        ):
-            at = step
-            yield self._reporter.refinement("The last millimetres", at)
-        return at
-
-    def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        estimate = self._with_uncertainty(at, self._rivals)
-        return self._reporter.finish(at, estimate)
-
-    def _with_uncertainty(self, at: GaussNewtonState, rivals: dict[int, float]) -> EstimatedState:
-        """The estimate with its uncertainty; heights are checked, since one view hardly shows depth."""
-        fit, poses = evaluate_fit(self._models, self._fine, at.params), at.params.state().poses
-        lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
-        held = self._config.held_light is not None
-        return estimate_with_uncertainty(
-            at.params, at.normals, fit, rivals, lowest=lowest, light_held=held, allowed=self._allowed
-        )
+        return (yield from self._accept_if_better(at, params, matches, moved))
 
     def _step(
         self,

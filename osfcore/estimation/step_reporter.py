@@ -51,8 +51,8 @@ class StepReporter:
         """
         self.done = min(self.done + 1, self.total)
         candidates = None
-        if tried and len(tried) == len(params.names):
-            count = min(len(poses.position) for poses in tried)
+        count = min((len(poses.position) for poses in tried), default=0) if len(tried) == len(params.names) else 0
+        if count:
             candidates = Pose(
                 np.stack([poses.position[:count] for poses in tried], 1),
                 np.stack([poses.quaternion[:count] for poses in tried], 1),

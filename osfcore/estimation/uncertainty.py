@@ -6,7 +6,7 @@ calibrated on other scenes, because errors of neighbouring pixels are correlated
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,7 +123,7 @@ def estimate_with_uncertainty(
     params: SceneParameters,
     normals: Sequence[np.ndarray],
     fit: FitQuality,
-    rivals: dict[int, float],
+    rivals: Mapping[int, float],
     *,
     light_held: bool = False,
     lowest: Float[np.ndarray, "N"] | None = None,
@@ -174,19 +174,34 @@ def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.
 def _reason_for_doubt(
     fit: FitQuality, n: int, most: float, position_std: float, rotation_std: float, rival: float
 ) -> str:
-    pixels = fit.pixels[:, n]
-    if pixels.sum() < _MIN_PIXELS:
-        return "it is hardly visible"
-    residual = object_residuals(fit)[n]
-    if fit.overlap[n] < _MIN_OVERLAP:
-        return f"its silhouette covers its masks by {fit.overlap[n]:.0%} only"
-    if residual > most:
-        return f"its images differ from what was rendered by {residual:.2f}"
+    misfit = _misfit(fit, n, most)
+    if misfit:
+        return misfit
     if rival < _MIN_RIVAL_RATIO:
         return AMBIGUOUS
     if position_std > _MOST_POSITION_STD_M or rotation_std > _MOST_ROTATION_STD_RAD:
         return f"its pose is known to {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg only"
     return ""
+
+
+def _misfit(fit: FitQuality, n: int, most: float) -> str:
+    if fit.pixels[:, n].sum() < _MIN_PIXELS:
+        return "it is hardly visible"
+    residual = object_residuals(fit)[n]
+    if fit.overlap[n] < _MIN_OVERLAP:
+        return f"its silhouette covers its masks by {fit.overlap[n]:.0%} only"
+    return f"its images differ from what was rendered by {residual:.2f}" if residual > most else ""
+
+
+def misfits(fit: FitQuality, allowed: Float[np.ndarray, "N"]) -> list[int]:
+    """Numbers of the objects that the images do not show where they were rendered.
+
+    Args:
+        fit: of the guess.
+        allowed: residuals below which an object's images are not doubted, should these be more than is usual.
+    """
+    most = np.maximum(_MAX_RESIDUAL, allowed)
+    return [n for n in range(len(most)) if _misfit(fit, n, most[n])]
 
 
 def _height_doubt(height: float) -> str:

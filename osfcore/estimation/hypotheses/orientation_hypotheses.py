@@ -21,6 +21,7 @@ _REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
 _REFINED_COARSE = 3  # of these, so many are refined in coarse ones
 _ITERATIONS, _FINE_ITERATIONS = 2, 3
 _CLOSE = 1.5  # ratio to the present loss up to which a hypothesis is refined on fine images
+_BETTER = 0.98  # times the loss: what is less is no reason to turn an object
 _SAME_RAD = np.deg2rad(12.0)
 
 
@@ -81,7 +82,7 @@ def compare_orientations(
     here, there = (loss_of(models, own, params) for params in (at.params, rival.params))
     angle = rotation_angle(rival.params.quaternions[number], at.params.quaternions[number])
     ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
-    return (replace(rival, losses=at.losses) if there < here else at), float(ratio)
+    return (replace(rival, losses=at.losses) if there < _BETTER * here else at), float(ratio)
 
 
 def _refine(

@@ -93,6 +93,7 @@ def match_templates(
     *,
     most: int,
     behind: Float[np.ndarray, "h w"] | None = None,
+    light: Float[np.ndarray, "3"] | None = None,
 ) -> TemplateMatches:
     """Look for an object in the first view, in given orientations and at given heights of its origin [m].
 
@@ -104,12 +105,16 @@ def match_templates(
         heights: for each of them.
         most: how many matches are kept.
         behind: squared errors of the pixels without the object; `table_errors` by default.
+        light: unit vector toward the light, where it is known; any light else.
     """
+    lights = _BASIS if light is None else light[None]
     camera, image = views.cameras[0], views.images[0]
     table = table_errors(models, views) if behind is None else behind
     grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
     found = [
-        _match_at_anchor(models, camera, image, table, name, quaternions, heights, (x, y)) for x in grid for y in grid
+        _match_at_anchor(models, camera, image, table, name, quaternions, heights, lights, (x, y))
+        for x in grid
+        for y in grid
     ]
     positions, turns, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return _non_maximum_suppression(positions, turns, scores, most)
@@ -123,6 +128,7 @@ def _match_at_anchor(
     name: str,
     quaternions: np.ndarray,
     heights: np.ndarray,
+    lights: np.ndarray,
     anchor: tuple[float, float],
 ) -> tuple[np.ndarray, ...]:
     """The best places of each orientation around an anchor: positions, orientations, scores."""
@@ -141,7 +147,9 @@ def _match_at_anchor(
     if not (-2 * half < x < width and -2 * half < y < height):
         return nothing  # the camera does not look there
     patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
-    scores = _scores(models, crop_camera(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, patches)
+    scores = _scores(
+        models, crop_camera(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, lights, patches
+    )
     best = _best_per_block(scores, places, _BLOCK_M * per_metre)
     scores, places = np.take_along_axis(scores, best, axis=0).ravel(), places[best.ravel()]
     quaternions, heights = (np.tile(a, (len(best),) + (1,) * (a.ndim - 1)) for a in (quaternions, heights))
@@ -177,15 +185,16 @@ def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[
 
 
 def _scores(
-    models: ObjectModels, camera: Camera, name: str, positions: np.ndarray, quaternions: np.ndarray, patches: np.ndarray
-) -> Float[np.ndarray, "S K"]:
+    models: ObjectModels, camera: Camera, name: str, positions: np.ndarray, quaternions: np.ndarray,
+    directions: np.ndarray, patches: np.ndarray,
+) -> Float[np.ndarray, "S K"]:  # fmt: skip
     """How much better each of K templates explains each of S windows than the table does."""
-    count, lights = len(positions), len(_BASIS)
+    count, lights = len(positions), len(directions)
     batch = SceneBatch(
         (name,),
         np.repeat(positions, lights, axis=0)[:, None],
         np.repeat(quaternions, lights, axis=0)[:, None],
-        np.tile(_BASIS, (count, 1)),
+        np.tile(directions, (count, 1)),
         None,
     )
     rendered = models.alone.render(batch, (camera,), quality=QUALITY, outputs={"rgb", "opacity"})

@@ -14,7 +14,8 @@ import numpy as np
 
 from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
-from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.goal_refinement import GoalImageConfig
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.experiments.estimation.tasks import episode, first_frame, goals

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
-from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.goal_image import estimate_goal
+from osfcore.estimation.goal_refinement import GoalImageConfig
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
