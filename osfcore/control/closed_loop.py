@@ -49,7 +49,7 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.planning.image_cost import ImageCost
 from osfcore.planning.mppi import MPPIPlanner
-from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal
+from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal, turn_cost
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.render.types import Quality, SceneBatch
 
@@ -93,7 +93,7 @@ class Episode:
         proposals = PushProposals(models.shapes, models.pushes.rollout)
         self._planner = MPPIPlanner(models.dynamics.rollout, proposals, settings.plan)
         self._start, self._prepared, self._how = start, prepared, estimators or Estimators()
-        self._number = 0
+        self._number, self._is_stalled = 0, False
         self._progress, self._sight = monitor.ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
         self._searches = 0
@@ -127,7 +127,9 @@ class Episode:
             yield from self._look_again()
             stepped = self._stepped()
             yield stepped
-            if self._progress.is_stalled(float(stepped.offsets_m.sum())):
+            distance = stepped.offsets_m + turn_cost(stepped.offsets_rad)
+            self._is_stalled = self._progress.is_stalled(float(distance.sum()))
+            if self._is_stalled:
                 self._planner.reset()
                 yield self._noticed("stalled", "Nothing has come nearer for some time; drawing new plans.")
 
@@ -306,7 +308,9 @@ class Episode:
 
     def _outcome(self) -> tuple[Outcome, str] | None:
         far, turned = monitor.offsets(self._goal, self._estimate.state)
-        rolled = monitor.lies_otherwise(self._goal, self._estimate.state)  # which pushes are not planned to undo
+        rolled = (
+            monitor.lies_otherwise(self._goal, self._estimate.state) & self._is_stalled
+        )  # and cannot be rolled back
         if far.max() <= self.settings.reached_m and np.all(turned[~rolled] <= self.settings.reached_rad):
             if rolled.any():
                 names = ", ".join(np.array(self._estimate.state.names)[rolled])

@@ -35,7 +35,7 @@ class EpisodeSettings:
     planning: bool = True
     acting: bool = True
     despite_doubts: bool = False
-    reached_m: float = 0.005
+    reached_m: float = 0.008
     reached_rad: float = 0.06
 
     def __post_init__(self) -> None:

@@ -10,14 +10,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from osfcore.errors import InvalidInput
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 _ROUNDING = 8 * np.finfo(float).eps
-_UPRIGHT_RAD = 0.08  # of tilt: more is another side of an object
+UPRIGHT_RAD = 0.08  # of tilt: more is another side of an object
 
 
 def quaternion_multiply(
@@ -93,18 +93,18 @@ def rotation_angle(
 
 def planar_turn(before: Float[np.ndarray, "4"], after: Float[np.ndarray, "4"]) -> float | None:
     """Turn about the vertical between two orientations, in -pi to pi [rad]; None if it tilts by more than 0.08 rad."""
-    angle, is_planar = planar_turns(before, after[None])
-    return float(angle[0]) if is_planar[0] else None
+    angle, tilt = planar_turns(before, after[None])
+    return float(angle[0]) if tilt[0] <= UPRIGHT_RAD else None
 
 
 def planar_turns(
     before: Float[np.ndarray, "4"], after: Float[np.ndarray, "M 4"]
-) -> tuple[Float[np.ndarray, "M"], Bool[np.ndarray, "M"]]:
-    """Turns about the vertical from one orientation, in -pi to pi [rad], and which tilt by no more than 0.08 rad."""
+) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+    """Rotations from one orientation as turns about the vertical, in -pi to pi, and tilts after them [rad]."""
     turn = quaternion_multiply(after, quaternion_conjugate(before))
     tilt = 2 * np.arcsin(np.linalg.norm(turn[:, 1:3], axis=1).clip(max=1.0))
     angle = 2 * np.arctan2(turn[:, 3], turn[:, 0])
-    return (angle + np.pi) % (2 * np.pi) - np.pi, tilt <= _UPRIGHT_RAD
+    return (angle + np.pi) % (2 * np.pi) - np.pi, tilt
 
 
 def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") -> Float[np.ndarray, "*batch 4"]:

@@ -9,7 +9,7 @@ one had succeeded.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from osfcore.dynamics.contact_geometry import part_outlines
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
-from osfcore.geometry.poses import Pose, planar_turn
+from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.planning.path_planning import FreeSpace, ShortestPaths, actions_along, duration_s
@@ -32,6 +32,7 @@ _SPEEDS = (0.5, 1.0)  # of the highest
 _ORDERS = 6  # of stages; all of three objects in nobody's way
 _SPARE = 3  # times as many pushes are drawn as needed: some begin where there is no room
 _POOL = 120  # sequences of pushes of an object, drawn at once
+_SIDES = 6  # of an object whose tables are kept
 _STRAIGHT = 0.25  # share of pushes that are aimed at the goal's place alone
 
 
@@ -46,7 +47,7 @@ class PushProposals:
     def __init__(self, shapes: Mapping[str, ObjectShape], predict: PushPredictor | None = None) -> None:
         self._tables = {name: ShapeTable((shape,)) for name, shape in shapes.items()}
         self._predict = predict
-        self._pushes: dict[str, ObjectPushes] = {}
+        self._pushes: dict[str, list[ObjectPushes]] = {}  # on each side that an object has lain on
 
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
@@ -74,33 +75,40 @@ class PushProposals:
             return known[key]
 
         orders = push_orders(now, goals, off, outlines, _ORDERS, rng)
-        pushes = {n: self._pushes_of(state, n, outlines(n, now[n])) for n in off}
+
+        def pushes(n: int, pose: Pose) -> ObjectPushes:
+            return self._pushes_at(state, n, pose, outlines(n, pose))
+
         chains = _PushSequences(state.pusher[:2], now, pushes, outlines, horizon, rng)
         each = -(-count // len(orders))
         proposals = [actions for order in orders for actions in chains.draw(order, each)]
         return np.array(proposals[:count]).reshape(-1, horizon, 3)
 
-    def _pushes_of(self, state: SceneState, n: int, outlines: Outlines) -> ObjectPushes:
-        name, pose = state.names[n], state.poses[n]
-        if name not in self._pushes or self._pushes[name].yaw(pose) is None:
-            centre = self._tables[name].centre[0].numpy().astype(float)
-            alone = replace(state, names=(name,), poses=state.poses[[n]])
-            outcomes = push_outcomes(self._predict, alone, centre, outlines)
-            self._pushes[name] = ObjectPushes(outcomes, pose.quaternion, centre)
-        return self._pushes[name]
+    def _pushes_at(self, state: SceneState, n: int, pose: Pose, outlines: Outlines) -> ObjectPushes:
+        name = state.names[n]
+        known = self._pushes.setdefault(name, [])
+        for one in known:
+            if one.yaw(pose) is not None:
+                return one
+        centre = self._tables[name].centre[0].numpy().astype(float)
+        alone = replace(state, names=(name,), poses=Pose.stacked([pose]))
+        outcomes = push_outcomes(self._predict, alone, centre, outlines)
+        known.append(ObjectPushes(outcomes, pose.quaternion, centre))
+        del known[:-_SIDES]
+        return known[-1]
 
 
 def _is_off(pose: Pose, goal: Pose) -> bool:
     if np.linalg.norm((goal.position - pose.position)[:2]) > _REACHED_M:
         return True
-    return abs(planar_turn(pose.quaternion, goal.quaternion) or 0.0) > _REACHED_RAD
+    return float(rotation_angle(pose.quaternion, goal.quaternion)) > _REACHED_RAD
 
 
 class _PushSequences:
     """Samples sequences of pushes; what several orders that begin alike need is computed once."""
 
     def __init__(
-        self, pusher: Float[np.ndarray, "2"], now: Sequence[Pose], pushes: Mapping[int, ObjectPushes],
+        self, pusher: Float[np.ndarray, "2"], now: Sequence[Pose], pushes: Callable[[int, Pose], ObjectPushes],
         outlines: OutlinesAt, horizon: int, rng: np.random.Generator,
     ) -> None:  # fmt: skip
         self._pusher, self._now, self._pushes, self._outlines = pusher, now, pushes, outlines
@@ -138,21 +146,22 @@ class _PushSequences:
                 places[one.number] = one.target
             *_, last, n = -1, *(one.number for one in stages)
             space = FreeSpace([part for k, pose in enumerate(places) for part in self._outlines(k, pose)])
-            around = None if last < 0 else (self._pushes[last], places[last])
+            around = None if last < 0 else (self._pushes(last, places[last]), places[last])
             begin = self._pusher
             if around is not None:
                 toward = places[n].position[:2]
                 begin = around[0].leave(around[1], toward, toward)[-1].clip(-PUSHER_REACH_M, PUSHER_REACH_M)
-            pool = self._pushes[n].draw(places[n], stages[-1].target, space, begin, _POOL, self._rng)
-            self._known[key] = _Leg(places[n], space, begin, space.paths_from(begin), around, pool)
+            here, target = places[n], stages[-1].target
+            own = self._pushes(n, here)
+            pool = own.draw(here, target, self._pushes(n, target), space, begin, _POOL, self._rng)
+            self._known[key] = _Leg(here, space, begin, space.paths_from(begin), around, pool, own.rolls)
         return self._known[key]
 
     def _ways(self, leg: _Leg, stage: Stage, count: int) -> list[Float[np.ndarray, "C 2"]]:
         """Pushes of a stage that begin where the pusher has room."""
         offset = (stage.target.position - leg.here.position)[:2]
         ways = [leg.pool[k] for k in self._rng.permutation(len(leg.pool))[: count - round(_STRAIGHT * count)]]
-        is_aimless = bool(ways) and self._pushes[stage.number].rolls  # straight pushes take no heed of rolling
-        straight = 0 if is_aimless else count - len(ways)
+        straight = 0 if ways and leg.rolls else count - len(ways)
         if straight and np.linalg.norm(offset) > _REACHED_M:
             sides = outline_points(self._outlines(stage.number, leg.here))
             drawn = straight_pushes(sides, offset, _SPARE * straight, self._rng)
@@ -172,6 +181,7 @@ class _Leg:
         paths: from there.
         around: pushes and pose of the object of the stage before, which it walks around first.
         pool: pushes to choose from.
+        rolls: the object rolls under some pushes, of which straight ones take no heed.
     """
 
     here: Pose
@@ -180,6 +190,7 @@ class _Leg:
     paths: ShortestPaths
     around: tuple[ObjectPushes, Pose] | None
     pool: list[Float[np.ndarray, "C 2"]]
+    rolls: bool
 
     def walk(self, at: Float[np.ndarray, "2"], start: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2"]]:
         """Corners of a path to the start of a push."""

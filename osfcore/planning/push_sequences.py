@@ -1,23 +1,26 @@
-"""Up to three pushes that bring an object to a pose, by search over a table of pushes (Song et al., 2020, go deeper).
+"""Up to three pushes that bring an object to a pose, by search over tables of pushes (Song et al., 2020, go deeper).
 
 With e = (x, y, yaw) the goal in the object's planar frame and m_i the motion of push i, one push leaves e' = m_i^-1 e,
 and the last push is the one in the table whose motion is nearest to e'. First pushes of two are a part of the table,
 first and second pushes of three are drawn; three let a can on its side, which rolls under most pushes, be slid along
-its axis, turned and slid back. Sequences are drawn by
+its axis, turned and slid back. A first push may roll the object onto the side that the goal shows; later pushes are
+then those of that side. Sequences are drawn by
 
     s = sqrt(x^2 + y^2 + turn_cost(angle)^2) of what is left + price * (length of the pusher's path)
 
-with probability proportional to exp(-s / temperature). Pushes that roll the object onto another side end a sequence;
-what is left after them is told by the whole rotation.
+with probability proportional to exp(-s / temperature).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from osfcore.geometry.poses import (
+    UPRIGHT_RAD,
     Pose,
     planar_turn,
     planar_turns,
@@ -54,15 +57,14 @@ class ObjectPushes:
     ) -> None:
         self._outcomes, self._reference, self._centre = outcomes, reference, centre
         self._turns = quaternion_multiply(outcomes.quaternions.reshape(-1, 4), quaternion_conjugate(reference))
-        yaw, is_planar = planar_turns(np.array([1.0, 0.0, 0.0, 0.0]), self._turns)
+        yaw, tilt = planar_turns(np.array([1.0, 0.0, 0.0, 0.0]), self._turns)
         self._motions = np.concatenate([outcomes.centres.reshape(-1, 2), yaw[:, None]], axis=1)
-        self._planar = np.flatnonzero(is_planar)
-        self._is_planar = is_planar
+        self._planar = np.flatnonzero(tilt <= UPRIGHT_RAD)
         self._tree = KDTree(self._motions[self._planar] * [1, 1, ARM_M]) if len(self._planar) else None
         ends = outcomes.starts[:, None] + outcomes.lengths[:, None] * outcomes.directions[:, None]
         self._ends = ends.reshape(-1, 2)
         self._left_at = _into(self._motions, self._ends)
-        self.rolls = bool(np.mean(is_planar) < _STEADY) if len(is_planar) else False
+        self.rolls = len(self._planar) < _STEADY * len(self._turns)
 
     def yaw(self, pose: Pose) -> float | None:
         """Turn about the vertical from the pose that the table was made in; None if the object lies on another side."""
@@ -72,6 +74,7 @@ class ObjectPushes:
         self,
         pose: Pose,
         goal: Pose,
+        later: ObjectPushes,
         space: FreeSpace,
         pusher: Float[np.ndarray, "2"],
         count: int,
@@ -82,78 +85,81 @@ class ObjectPushes:
         Args:
             pose: of the object, on the side that the table was made for.
             goal: where it should be.
+            later: pushes on the side that the goal shows: these ones, or others if that is another side.
             space: where first pushes may begin.
             pusher: where it comes from [m].
             count: of sequences at most; none where no push that has room brings the object nearer.
             rng: draws them.
         """
-        turn, centre = _rotation(self.yaw(pose) or 0.0), pose.apply(self._centre)[:2]
+        yaw, centre = self.yaw(pose) or 0.0, pose.apply(self._centre)[:2]
+        turn = _rotation(yaw)
         is_within = np.abs(self._ends @ turn.T + centre).max(axis=1) <= PUSHER_REACH_M
         has_room = space.is_free(self._outcomes.starts @ turn.T + centre)
         possible = np.flatnonzero(is_within & np.repeat(has_room, len(self._outcomes.lengths)))
         if not len(possible):
             return []
+        first = self._first_pushes(possible, yaw, goal, later)
         shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
+        rows, left = _sequences(first, np.array([*shift, (later.yaw(goal) or 0.0) - yaw]), later, rng)
+        path = self._path_lengths(rows, first, later, turn.T @ (pusher - centre))
         before = np.hypot(np.linalg.norm(shift), turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
-        rows, left = self._sequences(possible, pose, goal, shift, rng)
-        path = self._path_lengths(rows, turn.T @ (pusher - centre))
-        stays = (rows[:, 1] >= 0) | self._is_planar[rows[:, 0]]
         better = np.flatnonzero(left < _NEARER * before)
+        stays = (rows[:, 1] >= 0) | first.lands[rows[:, 0]]
         if np.any(stays & (left < _MUCH_NEARER * before)):
             better = better[stays[better]]
         drawn = (left + _PATH_PRICE * path)[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
         chosen = rows[better[np.argsort(drawn)[:count]]]
-        return [self._corners(row) @ turn.T + centre for row in chosen]
+        return [self._corners(row, first, later) @ turn.T + centre for row in chosen]
 
-    def _sequences(
-        self, possible: Int[np.ndarray, "M"], pose: Pose, goal: Pose, shift: Float[np.ndarray, "2"],
-        rng: np.random.Generator,
-    ) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:  # fmt: skip
-        """Rows of the table for each push, -1 for none; and what they leave [m]."""
-        yaw = self.yaw(pose) or 0.0
+    def _first_pushes(self, rows: Int[np.ndarray, "M"], yaw: float, goal: Pose, later: ObjectPushes) -> _FirstPushes:
+        """What some pushes of the table do to an object that is turned by `yaw`, in the terms of later ones."""
         around = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-        ends = quaternion_multiply(quaternion_multiply(around, self._turns[possible]), self._reference)
-        angle = rotation_angle(ends, np.broadcast_to(goal.quaternion, ends.shape))
-        left = np.hypot(np.linalg.norm(shift - self._motions[possible, :2], axis=1), turn_cost(angle))
-        rows = np.stack([possible, *np.full((2, len(possible)), -1)], axis=1)
-        first = possible[self._is_planar[possible]]
-        if self._tree is None or not len(first):
-            return rows, left
-        to_turn = planar_turn(pose.quaternion, goal.quaternion)
-        target = np.array([*shift, to_turn or 0.0])
-        pairs = np.stack([rng.choice(first, _PAIRS), rng.choice(self._planar, _PAIRS)], axis=1)
-        one, two = first[::_EVERY], _after(_after(target, self._motions[pairs[:, 0]]), self._motions[pairs[:, 1]])
-        error = np.concatenate([_after(target, self._motions[one]), two])
-        more, nearest = self._tree.query(error * [1, 1, ARM_M])
-        if to_turn is None:  # which pushes on this side cannot change
-            more = np.hypot(more, turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
-        last = self._planar[nearest]
-        second = np.stack([one, last[: len(one)], np.full(len(one), -1)], axis=1)
-        third = np.concatenate([pairs, last[len(one) :, None]], axis=1)
-        return np.concatenate([rows, second, third]), np.concatenate([left, more])
+        ends = quaternion_multiply(quaternion_multiply(around, self._turns[rows]), self._reference)
+        then, _ = planar_turns(later._reference, ends)
+        _, tilts = planar_turns(goal.quaternion, ends)
+        motions = np.concatenate([self._motions[rows, :2], (then - yaw)[:, None]], axis=1)
+        angles = rotation_angle(ends, np.broadcast_to(goal.quaternion, ends.shape))
+        return _FirstPushes(rows, motions, tilts, np.asarray(angles))
 
-    def _path_lengths(self, rows: Int[np.ndarray, "C 3"], pusher: Float[np.ndarray, "2"]) -> Float[np.ndarray, "C"]:
+    def _path_lengths(
+        self, rows: Int[np.ndarray, "C 3"], first: _FirstPushes, later: ObjectPushes, pusher: Float[np.ndarray, "2"]
+    ) -> Float[np.ndarray, "C"]:
         """About how far the pusher goes, straight from push to push [m]."""
-        starts, lengths = self._outcomes.starts, self._outcomes.lengths
-        path, at = np.zeros(len(rows)), np.broadcast_to(pusher, (len(rows), 2))
-        for push in rows.T:
-            more = np.linalg.norm(starts[push // len(lengths)] - at, axis=1) + lengths[push % len(lengths)]
-            path += np.where(push < 0, 0.0, more)
-            at = self._left_at[push]
+        own = first.rows[rows[:, 0]]
+        path = self._walked(own, np.broadcast_to(pusher, (len(own), 2)))
+        at = _into(first.motions[rows[:, 0]], self._ends[own])
+        for push in rows[:, 1:].T:
+            path += np.where(push < 0, 0.0, later._walked(push, at))
+            at = later._left_at[push]
         return path
 
-    def _corners(self, rows: Int[np.ndarray, "_"]) -> Float[np.ndarray, "C 2"]:
+    def _walked(self, rows: Int[np.ndarray, "C"], begin: Float[np.ndarray, "C 2"]) -> Float[np.ndarray, "C"]:
+        count = len(self._outcomes.lengths)
+        return (
+            np.linalg.norm(self._outcomes.starts[rows // count] - begin, axis=1) + self._outcomes.lengths[rows % count]
+        )
+
+    def _corners(self, row: Int[np.ndarray, "3"], first: _FirstPushes, later: ObjectPushes) -> Float[np.ndarray, "C 2"]:
         """The pusher's path through pushes, in the planar frame before the first."""
-        outcomes = self._outcomes
-        push, later = rows[0], rows[1:]
-        number = push // len(outcomes.lengths)
-        path = np.stack([outcomes.starts[number], self._ends[push]])
-        if not len(later) or later[0] < 0:
+        own, motion = first.rows[row[0]], first.motions[row[0]]
+        then = later._path_through([int(push) for push in row[1:] if push >= 0])
+        return self._followed_by(int(own), motion, then, later._outcomes.loop)
+
+    def _path_through(self, rows: list[int]) -> Float[np.ndarray, "C 2"]:
+        if not rows:
+            return np.zeros((0, 2))
+        return self._followed_by(rows[0], self._motions[rows[0]], self._path_through(rows[1:]), self._outcomes.loop)
+
+    def _followed_by(
+        self, row: int, motion: Float[np.ndarray, "3"], then: Float[np.ndarray, "C 2"], loop: Float[np.ndarray, "L 2"]
+    ) -> Float[np.ndarray, "D 2"]:
+        """The path of one push, then around the object, then along a path in the frame after it."""
+        number = row // len(self._outcomes.lengths)
+        path = np.stack([self._outcomes.starts[number], self._ends[row]])
+        if not len(then):
             return path
-        then = self._corners(later)
-        back = path[1] - _TURN_BACK_M * outcomes.directions[number]
-        motion = self._motions[push]
-        around = around_loop(outcomes.loop, _into(motion[None], back[None])[0], then[0])
+        back = path[1] - _TURN_BACK_M * self._outcomes.directions[number]
+        around = around_loop(loop, _into(motion[None], back[None])[0], then[0])
         return np.vstack([path, back, np.vstack([around, then]) @ _rotation(motion[2]).T + motion[:2]])
 
     def leave(self, pose: Pose, at: Float[np.ndarray, "2"], toward: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
@@ -162,6 +168,57 @@ class ObjectPushes:
         own, aim = turn.T @ (at - centre), turn.T @ (toward - centre)
         exit_ = loop[np.linalg.norm(loop - aim, axis=1).argmin()]
         return np.vstack([around_loop(loop, own, exit_), exit_]) @ turn.T + centre
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _FirstPushes:
+    """Some rows of a table, and what they lead to.
+
+    Attributes:
+        rows: of the table.
+        motions: shift in the planar frame before, and turn from it to the planar frame of later pushes [m, rad].
+        tilts: from the side that the goal shows [rad].
+        angles: of the whole rotation to the goal [rad].
+    """
+
+    rows: Int[np.ndarray, "M"]
+    motions: Float[np.ndarray, "M 3"]
+    tilts: Float[np.ndarray, "M"]
+    angles: Float[np.ndarray, "M"]
+
+    @property
+    def lands(self) -> Bool[np.ndarray, "M"]:
+        """Whether the object lies on that side then."""
+        return self.tilts <= UPRIGHT_RAD
+
+
+def _sequences(
+    first: _FirstPushes, target: Float[np.ndarray, "3"], later: ObjectPushes, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:
+    """Sequences as numbers of first pushes, then rows of the table of later ones, -1 for none; what they leave [m].
+
+    Args:
+        first: pushes that are possible.
+        target: the goal in the planar frame before the first, with its turn in that of later pushes.
+        later: pushes on the goal's side.
+        rng: draws first and second pushes of three.
+    """
+    motions, planar, tree = later._motions, later._planar, later._tree
+    left = np.hypot(np.linalg.norm(target[:2] - first.motions[:, :2], axis=1), turn_cost(first.angles))
+    every = np.arange(len(first.rows))
+    rows = np.stack([every, *np.full((2, len(every)), -1)], axis=1)
+    landing = np.flatnonzero(first.lands)
+    if tree is None or not len(landing):
+        return rows, left
+    one = landing[::_EVERY]
+    pairs = np.stack([rng.choice(landing, _PAIRS), rng.choice(planar, _PAIRS)], axis=1)
+    two = _after(_after(target, first.motions[pairs[:, 0]]), motions[pairs[:, 1]])
+    more, nearest = tree.query(np.concatenate([_after(target, first.motions[one]), two]) * [1, 1, ARM_M])
+    more = np.hypot(more, turn_cost(first.tilts[np.concatenate([one, pairs[:, 0]])]))
+    last = planar[nearest]
+    second = np.stack([one, last[: len(one)], np.full(len(one), -1)], axis=1)
+    third = np.concatenate([pairs, last[len(one) :, None]], axis=1)
+    return np.concatenate([rows, second, third]), np.concatenate([left, more])
 
 
 def around_loop(

@@ -248,8 +248,7 @@ class TaskRunner:
         except OsfError as error:
             refused = str(error)
         seconds = time.perf_counter() - began
-        state = None if estimate is None else estimate.state
-        shown = self._compared(case.observation, state)
+        shown = self._compared(case.observation, None if estimate is None else estimate.state)
         score = BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
         if estimate is not None:
             score = replace(self._judged(estimate, case), seconds=seconds)

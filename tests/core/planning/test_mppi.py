@@ -112,6 +112,14 @@ def test_the_same_seed_gives_the_same_plan(shapes, start):
     np.testing.assert_array_equal(a.actions, b.actions)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_plan_costs_no_more_over_the_whole_horizon_than_before_its_refinement(shapes, start, seed):
+    goal = goal_of(start, (0.12, -0.08))
+    rounds = planned(MPPIPlanner(carried, PushProposals(shapes), SHORT), start, goal, seed)
+    whole = PoseCost(goal, 0.0)(carried(start, rounds[-1].actions[None]))
+    assert whole[0] <= rounds[0].costs.min() + 1e-12
+
+
 def test_what_was_executed_is_dropped(shapes, start):
     seen = []
 
@@ -124,8 +132,8 @@ def test_what_was_executed_is_dropped(shapes, start):
     plan = planned(planner, start, goal)[-1].actions
     planner.shift(3)
     planned(planner, start, goal)
-    np.testing.assert_array_equal(seen[2][:-3], plan[3:])  # the first sample is the last plan itself
-    np.testing.assert_array_equal(seen[2][-3:], 0)
+    np.testing.assert_array_equal(seen[3][:-3], plan[3:])  # the first sample is the last plan itself
+    np.testing.assert_array_equal(seen[3][-3:], 0)
     planner.settings = PlanSettings(samples=64, horizon=5)
     assert planned(planner, start, goal)[-1].actions.shape == (5, 3)
     planner.settings = PlanSettings(samples=64, horizon=20)
