@@ -13,6 +13,7 @@ from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.objective.photometric_loss import loss_of, photometric_loss, residuals
 from osfcore.estimation.objective.resting_orientations import yaw_quaternions
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
+from osfcore.estimation.uncertainty import evaluate_fit, object_residuals
 from osfcore.geometry.poses import Pose, quaternion_multiply, rotate, rotation_angle
 
 _YAWS = 24
@@ -20,6 +21,10 @@ _RANKED_COARSE = 64  # hypotheses that are ranked again in coarse images
 _REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
 _REFINED_COARSE = 3  # of these, so many are refined in coarse ones
 _ITERATIONS, _FINE_ITERATIONS = 2, 3
+_FAR, _EXPLAINED = (
+    1.5,
+    0.035,
+)  # nothing is refined where all losses are as high and the object differs by less [radiance]
 _CLOSE = 1.5  # ratio to the present loss up to which a hypothesis is refined on fine images
 _BETTER = 0.98  # times the loss: what is less is no reason to turn an object
 _SAME_RAD = np.deg2rad(12.0)
@@ -51,6 +56,9 @@ def compare_orientations(
 ) -> tuple[GaussNewtonState, float]:
     """Compare an object's orientation with the best of other hypotheses.
 
+    None is refined where the object explains its pixels already and every hypothesis is far worse: under right
+    orientations residuals are 0.038 at most, under wrong ones 0.038 and more (`docs/estimation.md`).
+
     Args:
         models: fields.
         rough: images in which hypotheses are ranked and first refined: they have the widest basins of attraction.
@@ -70,7 +78,10 @@ def compare_orientations(
     own = crop_to_object(rough, models, at.params, number)
     far = far[np.argsort(pose_losses(models, own, at.params, number, far))[:_RANKED_COARSE]]
     own = crop_to_object(coarse, models, at.params, number)
-    far = far[np.argsort(pose_losses(models, own, at.params, number, far))]
+    losses = pose_losses(models, own, at.params, number, far)
+    far, nearest = far[np.argsort(losses)], float(losses.min() / max(loss_of(models, own, at.params), 1e-12))
+    if nearest > _FAR and object_residuals(evaluate_fit(models, fine, at.params))[number] < _EXPLAINED:
+        return at, nearest
     tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct_orientations(far)]
     tried = sorted(tried, key=lambda one: loss_of(models, own, one.params))[:_REFINED_COARSE]
     tried = [_refine(models, coarse, one, number, _pose(one.params, number), _ITERATIONS) for one in tried]
