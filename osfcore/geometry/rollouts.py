@@ -35,6 +35,11 @@ class Rollouts:
         k = slice(sequence, sequence + 1)
         return Rollouts(self.names, self.positions[k], self.quaternions[k], self.pusher[k])
 
+    def after(self, actions: int) -> Rollouts:
+        """What is left of the futures after some actions; at least the last state."""
+        t = slice(min(actions, self.positions.shape[1] - 1), None)
+        return Rollouts(self.names, self.positions[:, t], self.quaternions[:, t], self.pusher[:, t])
+
 
 def check_actions(actions: object) -> Float[np.ndarray, "K T 3"]:
     """Sequences of actions that can be rolled out.

@@ -9,9 +9,10 @@ and the next plan is warm-started from it, shifted by the actions that were exec
 Deviations: samples are not drawn around the nominal sequence alone but from three sources (the nominal sequence, push
 proposals, random walks), and the average is taken in a second round of samples around the best of the first: the mean
 of a path around the left and one around the right of an object leads into it. The second round has a shorter horizon,
-since later actions are planned again before they are executed; only every third plan has a first round. lambda is
-relative to the spread of the costs, temperature * (median S - min S). Noise is added to the pusher's path at knots, not
-to its velocity, so that its variance does not grow along the horizon.
+since later actions are planned again before they are executed; only every third plan has a first round, and those that
+only walk no second one. The average, or the best sample, replaces the plan so far if it costs less over the whole
+horizon. lambda is relative to the spread of the costs, temperature * (median S - min S). Noise is added to the pusher's
+path at knots, not to its velocity, so that its variance does not grow along the horizon.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
 from osfcore.planning.path_planning import actions_along
 from osfcore.planning.pose_cost import Cost, PoseGoal
 
+_SOON, _TOUCHED_M = 3, 1e-4  # a plan is refined where it moves something by so much after as many actions or fewer
 _RANDOM_WALK_M = 0.06  # standard deviation of random walks at their knots
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
@@ -129,10 +131,11 @@ class MPPIPlanner:
         self.settings = settings or PlanSettings()
         self._nominal: Float[np.ndarray, "T 3"] | None = None
         self._refinements = 0  # plans since the last first round
+        self._known: PlanRound | None = None  # the nominal sequence's own future, the last time it was rolled out
 
     def reset(self) -> None:
         """Drop the nominal sequence: the goal or the scene is another one."""
-        self._nominal = None
+        self._nominal = self._known = None
 
     def nominal(self, count: int) -> Float[np.ndarray, "count 3"]:
         """The next actions of the nominal sequence; zero after its end, and without a plan [m/s]."""
@@ -141,16 +144,18 @@ class MPPIPlanner:
 
     def shift(self, count: int) -> None:
         """Shift the nominal sequence by actions that have been executed, to warm-start the next plan."""
+        if self._known is not None:
+            self._known = replace(self._known, rollouts=self._known.rollouts.after(count))
         if self._nominal is not None:
             self._nominal = np.concatenate([self._nominal[count:], np.zeros((min(count, len(self._nominal)), 3))])
 
     def plan(
         self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None = None
     ) -> Iterator[PlanRound]:
-        """Plan in two rounds, or in the second one alone; the actions of the last one are the plan.
+        """Plan in two rounds, in the second one alone, or not at all where the plan goes on walking.
 
-        What was proposed a moment ago is still worth refining, so that proposals are drawn in every third plan, and
-        whenever the nominal sequence has ended.
+        What was proposed a moment ago is still worth following, so that proposals are drawn in every third plan, and
+        whenever the nominal sequence has ended. It is refined once it will soon touch something.
 
         Args:
             state: of the scene, with its pusher.
@@ -167,25 +172,31 @@ class MPPIPlanner:
             self._refinements = 0
             round_ = self._evaluate(0, state, self._sample_first_round(state, goal, rng), cost, before)
             yield round_
-            nominal = round_.actions
-        else:
-            nominal = self._resized(self._nominal)
+            self._follow(round_)
+        assert self._nominal is not None
+        nominal = self._resized(self._nominal)
+        if self._known is not None and _walks(self._known.rollouts) > _SOON:
+            self._nominal = nominal
+            yield replace(self._known, number=1, actions=nominal)
+            return
         begin, rest = np.split(nominal, [self.settings.refined])
         keep_end = self.settings.knot_every < len(begin) and len(rest) > 0
         second = self._perturbed(begin, self.settings.samples, rng, self.settings.noise_m, keep_end=keep_end)
         second[1] = _hurried(begin)
         round_ = self._evaluate(1, state, second, cost, before)
         mean = np.einsum("k,kta->ta", _mppi_weights(round_.costs, self.settings.temperature), second)
-        self._nominal = self._best_of(
-            state, np.stack([np.concatenate([head, rest]) for head in (begin, mean, round_.actions)]), cost, before
-        )
-        yield replace(round_, actions=self._nominal)
+        plans = np.stack([np.concatenate([head, rest]) for head in (begin, mean, round_.actions)])
+        # Over the whole horizon: later pushes need the objects where they were expected.
+        whole = self._evaluate(1, state, plans, cost, before)
+        self._follow(whole)
+        yield replace(round_, actions=whole.actions)
 
-    def _best_of(
-        self, state: SceneState, plans: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
-    ) -> Float[np.ndarray, "T 3"]:
-        """The one that costs least over the whole horizon: later pushes may need the object where it was expected."""
-        return plans[int(cost(self._rollout(state, plans, before)).argmin())]
+    def _follow(self, round_: PlanRound) -> None:
+        """Take the best sequence of a round for the nominal one."""
+        self._nominal, self._known = (
+            round_.actions,
+            replace(round_, rollouts=round_.best, costs=round_.costs.min()[None]),
+        )
 
     def _evaluate(
         self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
@@ -254,6 +265,13 @@ def _hurried(plan: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:
     """The same path as fast as the pusher can, for the average of sequences that hesitate somewhere hesitates."""
     path = STEP_S * np.pad(np.cumsum(plan[:, :2], axis=0), ((1, 0), (0, 0)))
     return actions_along(path, len(plan))
+
+
+def _walks(future: Rollouts) -> int:
+    """Actions before the first that moves something; 0 if none does."""
+    shift = np.linalg.norm(future.positions[0] - future.positions[0, :1], axis=-1).max(axis=-1, initial=0.0)
+    moving = np.flatnonzero(shift > _TOUCHED_M)
+    return int(moving[0]) - 1 if len(moving) else 0
 
 
 def _mppi_weights(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:

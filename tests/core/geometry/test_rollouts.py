@@ -70,3 +70,11 @@ def test_whatever_comes_it_is_actions_or_a_clear_error(value):
     else:
         assert found.shape[2] == 3
         assert np.abs(found).max() <= 0.3 + 1e-9
+
+
+def test_what_is_left_of_futures_begins_later_and_keeps_the_last_state():
+    rng = np.random.default_rng(0)
+    futures = Rollouts(("a",), rng.normal(size=(2, 4, 1, 3)), rng.normal(size=(2, 4, 1, 4)), rng.normal(size=(2, 4, 3)))
+    np.testing.assert_array_equal(futures.after(2).positions, futures.positions[:, 2:])
+    np.testing.assert_array_equal(futures.after(2).pusher, futures.pusher[:, 2:])
+    np.testing.assert_array_equal(futures.after(9).quaternions, futures.quaternions[:, 3:])

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -118,6 +120,32 @@ def test_a_plan_costs_no_more_over_the_whole_horizon_than_before_its_refinement(
     rounds = planned(MPPIPlanner(carried, PushProposals(shapes), SHORT), start, goal, seed)
     whole = PoseCost(goal, 0.0)(carried(start, rounds[-1].actions[None]))
     assert whole[0] <= rounds[0].costs.min() + 1e-12
+
+
+def touched(state, actions, before=None) -> Rollouts:
+    """A world in which the pusher takes the first object along once it is beyond y = 5 cm."""
+    future = carried(state, actions)
+    positions = np.broadcast_to(state.poses.position, future.positions.shape).copy()
+    positions[:, :, 0, 1] += np.maximum(future.pusher[..., 1] - 0.05, 0)
+    return Rollouts(state.names, positions, future.quaternions, future.pusher)
+
+
+def test_a_plan_that_only_walks_is_kept_as_it_is_until_it_will_soon_touch_something(shapes, start):
+    planner = MPPIPlanner(touched, PushProposals(shapes), PlanSettings(samples=64, horizon=24, proposals_every=30))
+    state = replace(start, pusher=start.pusher + np.array([0.0, -0.25, 0.0]))
+    goal = goal_of(start, (0.0, 0.2))
+    before = planned(planner, state, goal)[-1].actions
+    walk = int(np.argmax(touched(state, before[None]).positions[0, :, 0, 1] > state.poses.position[0, 1])) - 1
+    assert walk > 5
+    for number in range(1, walk - 3):
+        state = replace(state, pusher=state.pusher + STEP_S * planner.nominal(1)[0])
+        planner.shift(1)
+        (only,) = planned(planner, state, goal, number)
+        np.testing.assert_array_equal(only.actions[:-1], before[1:])
+        np.testing.assert_allclose(only.best.pusher[0, 0], state.pusher, atol=1e-9)
+        before = only.actions
+    planner.shift(1)
+    assert len(planned(planner, state, goal)[-1].costs) == 64  # which is refined
 
 
 def test_what_was_executed_is_dropped(shapes, start):
