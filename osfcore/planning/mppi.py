@@ -185,7 +185,7 @@ class MPPIPlanner:
         second[1] = _hurried(begin)
         round_ = self._evaluate(1, state, second, cost, before)
         mean = np.einsum("k,kta->ta", _mppi_weights(round_.costs, self.settings.temperature), second)
-        plans = np.stack([np.concatenate([head, rest]) for head in (begin, mean, round_.actions)])
+        plans = np.stack([np.concatenate([head, rest]) for head in (mean, begin, round_.actions)])
         # Over the whole horizon: later pushes need the objects where they were expected.
         whole = self._evaluate(1, state, plans, cost, before)
         self._follow(whole)
