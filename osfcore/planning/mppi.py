@@ -32,6 +32,7 @@ from osfcore.planning.path_planning import actions_along
 from osfcore.planning.pose_cost import Cost, PoseGoal
 
 _SOON, _TOUCHED_M = 3, 1e-4  # a plan is refined where it moves something by so much after as many actions or fewer
+COMPARED = 3  # sequences that are rolled out once more after the second round, over the whole horizon
 _RANDOM_WALK_M = 0.06  # standard deviation of random walks at their knots
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]

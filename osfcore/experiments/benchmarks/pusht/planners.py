@@ -1,7 +1,7 @@
 """Planners that are compared: ours, the paper's and pytorch-mppi's, with one cost, budget and dynamics.
 
 All choose among velocities within the same limits and compare the same futures by the same cost of poses. K sequences
-of T actions are looked at for each action: all at once by the Gaussian ones, half of them in each round by ours.
+of T actions are looked at for each action: all at once by the Gaussian ones, in two rounds and a comparison by ours.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S
 from osfcore.paper.mppi import GaussianMPPI, GaussianPlanSettings
-from osfcore.planning.mppi import MPPIPlanner, PlanSettings
+from osfcore.planning.mppi import COMPARED, MPPIPlanner, PlanSettings
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 
@@ -60,7 +60,7 @@ class OurPlanner:
 
     def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
         self._futures, self._goal, self._rng = _Futures(problem.step), problem.goal, rng
-        settings = PlanSettings(samples=problem.samples // 2, horizon=problem.horizon)
+        settings = PlanSettings(samples=(problem.samples - COMPARED) // 2, horizon=problem.horizon)
         self._planner = MPPIPlanner(self._futures, PushProposals({NAME: tee_shape()}), settings)
 
     def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:

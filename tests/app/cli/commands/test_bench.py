@@ -124,15 +124,15 @@ def test_an_option_that_does_not_apply_is_refused(command, option, capsys):
 def test_planners_are_compared(tmp_path, capsys):
     pytest.importorskip("gym_pusht")
     pytest.importorskip("pytorch_mppi")
-    arguments = ["bench", "planner", "--tasks", "1", "--samples", "16", "--horizon", "2", "--steps", "2"]
+    arguments = ["bench", "planner", "--tasks", "1", "--samples", "20", "--horizon", "2", "--steps", "2"]
     assert main([*arguments, "--out", str(tmp_path), "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert list(result["planners"]) == ["ours", "paper", "pytorch_mppi"]
-    assert (result["samples"], result["horizon"], result["steps"], result["seed"]) == (16, 2, 2, 0)
+    assert (result["samples"], result["horizon"], result["steps"], result["seed"]) == (20, 2, 2, 0)
     assert json.loads((tmp_path / "planner.json").read_text()) == result
     assert main(arguments) == 0
     shown = capsys.readouterr().out
-    assert shown.startswith("1 tasks, 16 sequences of 2 actions")
+    assert shown.startswith("1 tasks, 20 sequences of 2 actions")
     assert len(shown.splitlines()) == 5
     assert main([*arguments, "--tasks", "0"]) == 1
     assert "number of tasks is 0" in capsys.readouterr().err
