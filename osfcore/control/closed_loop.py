@@ -308,9 +308,7 @@ class Episode:
 
     def _outcome(self) -> tuple[Outcome, str] | None:
         far, turned = monitor.offsets(self._goal, self._estimate.state)
-        rolled = (
-            monitor.lies_otherwise(self._goal, self._estimate.state) & self._is_stalled
-        )  # and cannot be rolled back
+        rolled = self._is_stalled & monitor.lies_otherwise(self._goal, self._estimate.state)  # and stays so
         if far.max() <= self.settings.reached_m and np.all(turned[~rolled] <= self.settings.reached_rad):
             if rolled.any():
                 names = ", ".join(np.array(self._estimate.state.names)[rolled])

@@ -96,7 +96,9 @@ class _GoalImageEstimator:
     def steps(self) -> Iterator[EstimateStep]:
         at = yield from self._from_prior()
         if self._doubtful_objects(at):
-            at = yield from self._from_anywhere()
+            rivals = self._refinement.rivals
+            other = yield from self._from_anywhere()
+            at = self._better_of(at, other, rivals)
         yield self._reporter.finish(at, self._refinement.estimate(at, self._refinement.rivals))
 
     def _from_prior(self) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
@@ -190,7 +192,12 @@ class _GoalImageEstimator:
         """Refine another guess; keep the result if its loss is lower."""
         rivals = dict(self._refinement.rivals)
         other = yield from self._refined(params, matches, moved)
-        if other.losses[-1] < at.losses[-1]:
+        return self._better_of(at, other, rivals)
+
+    def _better_of(self, at: GaussNewtonState, other: GaussNewtonState, rivals: dict[int, float]) -> GaussNewtonState:
+        """The one whose loss is lower; of two that cost the same the first, with its own rivals."""
+        here, there = (loss_of(self._models, self._refinement.fine, one.params) for one in (at, other))
+        if there < here:
             return other
         self._refinement.rivals = rivals
         return at

@@ -194,10 +194,8 @@ class MPPIPlanner:
 
     def _follow(self, round_: PlanRound) -> None:
         """Take the best sequence of a round for the nominal one."""
-        self._nominal, self._known = (
-            round_.actions,
-            replace(round_, rollouts=round_.best, costs=round_.costs.min()[None]),
-        )
+        self._nominal = round_.actions
+        self._known = replace(round_, rollouts=round_.best, costs=round_.costs.min()[None])
 
     def _evaluate(
         self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None
