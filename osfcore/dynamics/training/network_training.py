@@ -28,7 +28,7 @@ from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.substep import unroll
 from osfcore.dynamics.training.holdout import has_held_out_pair, is_for_validation
 from osfcore.dynamics.training.optimizers import Optimizers
-from osfcore.dynamics.training.samples import Sample, disturbed_substeps, samples
+from osfcore.dynamics.training.samples import disturbed_substeps, samples
 from osfcore.dynamics.training.validation import _ARM_M, MEASURED_WINDOW, Validation, distance, validate
 from osfcore.dynamics.training.windows import Batch, Recording, batch, record
 from osfcore.errors import InvalidInput, check_ranges, check_seed
@@ -144,7 +144,8 @@ class _Run:
         self._table = ShapeTable(tuple(shapes[name] for name in names), device)
         learned, kept = _episodes(config, frozenset(names))
         self._long = _recorded(learned, shapes, LONG_WINDOW)
-        self._samples = samples(_recorded(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
+        drawn = samples(_recorded(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
+        self._samples = drawn.to(device)
         self._validation = _recorded(kept, shapes, MEASURED_WINDOW)
         self._used = len(learned)
         torch.manual_seed(config.seed)
@@ -177,9 +178,9 @@ class _Run:
 
     def _loss_of_samples(self) -> Tensor:
         """Mean error of single substeps [mm]."""
-        graphs = torch.as_tensor(self._rng.integers(len(self._samples), size=self._config.batch))
-        flipped = torch.as_tensor(self._rng.random(len(graphs)) < 0.5)
-        sample = Sample(*(part.to(self._device) for part in self._samples.draw(graphs, flipped)))
+        graphs = torch.as_tensor(self._rng.integers(len(self._samples), size=self._config.batch), device=self._device)
+        flipped = torch.as_tensor(self._rng.random(len(graphs)) < 0.5, device=self._device)
+        sample = self._samples.draw(graphs, flipped)
         residual = self._descent.network(sample.nodes, sample.edges, sample.receiver, sample.sender)
         scale = residual.new_tensor([SHIFT_M] * 3 + [_ARM_M * TURN_RAD] * 3)
         return 1e3 * (((residual - sample.target) * scale).square().sum(dim=1) + 1e-9).sqrt().mean()

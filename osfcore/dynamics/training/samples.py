@@ -89,6 +89,10 @@ class _Rows:
         """The rows of some graphs."""
         return self.values[_ranges(self.first[graphs], self.count[graphs])]
 
+    def to(self, device: torch.device | str) -> _Rows:
+        """On another device."""
+        return _Rows(self.values.to(device), self.first.to(device), self.count.to(device))
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
@@ -107,6 +111,10 @@ class Samples:
     def __len__(self) -> int:
         """Number of graphs."""
         return len(self.nodes.count)
+
+    def to(self, device: torch.device | str) -> Samples:
+        """On another device: three million substeps take 6 GB."""
+        return Samples(self.nodes.to(device), self.pushed.to(device), self.paired.to(device))
 
     def draw(self, graphs: Int[Tensor, "B"], flipped: Bool[Tensor, "B"]) -> Sample:
         """Some graphs, those with a flag reflected."""
