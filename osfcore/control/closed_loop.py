@@ -49,7 +49,7 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.planning.image_cost import ImageCost
 from osfcore.planning.mppi import MPPIPlanner
-from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal, turn_cost
+from osfcore.planning.pose_cost import ARM_M, Cost, PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.render.types import Quality, SceneBatch
 
@@ -127,7 +127,7 @@ class Episode:
             yield from self._look_again()
             stepped = self._stepped()
             yield stepped
-            distance = stepped.offsets_m + turn_cost(stepped.offsets_rad)
+            distance = stepped.offsets_m + ARM_M * stepped.offsets_rad
             self._is_stalled = self._progress.is_stalled(float(distance.sum()))
             if self._is_stalled:
                 self._planner.reset()

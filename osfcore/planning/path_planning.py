@@ -19,6 +19,7 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_RE
 
 CELL_M = 0.005
 CLEARANCE_M = 0.006  # between the pusher's rim and what it goes around
+_CUT_M = 0.012  # by how much an action may pass a corner of its path
 _SIDE = round(2 * PUSHER_REACH_M / CELL_M) + 1
 _BLOCKED = 200.0  # cost of a cell too close to something, for a start in contact must be possible
 
@@ -113,20 +114,48 @@ def actions_along(
 ) -> Float[np.ndarray, "T 3"]:
     """Velocities that follow a path, each leg at its share of the highest speed; zero after its end [m/s].
 
+    The pusher goes straight during an action. Where that would cut a corner by more than its tolerance, the action ends
+    at the corner, so that a way around an object does not touch it and a push begins where it should.
+
     Args:
         path: corners, the first where the pusher is [m].
         horizon: number of actions.
         speeds: share of the highest speed on each leg, above 0; all 1 by default.
     """
-    times = np.concatenate([[0.0], np.cumsum(_legs_s(path, speeds))])
-    moments = STEP_S * np.arange(horizon + 1)
-    places = np.stack([np.interp(moments, times, path[:, axis]) for axis in range(2)], axis=1)
-    velocity = np.diff(places, axis=0) / STEP_S
+    times = np.concatenate([[0.0], np.cumsum(_legs_s(path, speeds))]) / STEP_S
+    moments = np.zeros(horizon + 1)
+    for k in range(horizon):
+        moments[k + 1] = _next_moment(path, times, moments[k])
+    velocity = np.diff(_places(path, times, moments), axis=0) / STEP_S
     return np.pad(velocity, ((0, 0), (0, 1)))
 
 
+def _next_moment(path: Float[np.ndarray, "n 2"], times: Float[np.ndarray, "n"], now: float) -> float:
+    """When the action that begins now ends [actions of the path's time]: after a whole one, or at a corner."""
+    end = now + 1
+    first, last = int(np.searchsorted(times, now, side="right")), int(np.searchsorted(times, end))
+    if last == first:
+        return end
+    here = _places(path, times, np.array([now]))[0]
+    while last > first:
+        way = _places(path, times, np.array([end]))[0] - here
+        to_corners = path[first:last] - here
+        share = (to_corners @ way / max(float(way @ way), 1e-12)).clip(0, 1)
+        if np.linalg.norm(to_corners - share[:, None] * way, axis=1).max() <= _CUT_M:
+            break
+        last -= 1
+        end = float(times[last])
+    return end
+
+
+def _places(
+    path: Float[np.ndarray, "n 2"], times: Float[np.ndarray, "n"], moments: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "m 2"]:
+    return np.stack([np.interp(moments, times, path[:, axis]) for axis in range(2)], axis=1)
+
+
 def duration_s(path: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:
-    """Duration of a path [s], each leg at its share of the highest speed."""
+    """Duration of a path [s], each leg at its share of the highest speed; corners may take longer."""
     return float(_legs_s(path, speeds).sum())
 
 

@@ -14,9 +14,7 @@ from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 
-ARM_M = 0.06  # a small rotation by an angle counts as the angle times this
-_SMALL_RAD = 0.5  # what exceeds it counts less, or nothing would be moved that rolls on its way
-_LARGE_SHARE = 1 / 3
+ARM_M = 0.06  # a rotation counts as its angle times this
 _TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
 
 
@@ -71,21 +69,13 @@ class PoseGoal:
         return self.poses_of(state.names).position[:, :2] - state.poses.position[:, :2]
 
 
-def turn_cost(angle: Float[np.ndarray, "*batch"] | float, arm_m: float = ARM_M) -> Float[np.ndarray, "*batch"]:
-    """What rotations count [m]: arm * a up to 0.5 rad; beyond that the cost grows by a third of what the angle does."""
-    angle = np.asarray(angle)
-    return np.asarray(arm_m * (angle - (1 - _LARGE_SHARE) * np.maximum(angle - _SMALL_RAD, 0)))
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseCost:
-    """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * f(angle(q_n(t), q_n*)), horizontally [m].
-
-    arm * f(a) is `turn_cost`.
+    """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*), p horizontally [m].
 
     Attributes:
         goal: where that is.
-        arm_m: what a small rotation counts [m/rad]; 0 to leave rotations out.
+        arm_m: what a rotation counts [m/rad]; 0 to leave rotations out.
     """
 
     goal: PoseGoal
@@ -98,6 +88,6 @@ class PoseCost:
         cost = np.linalg.norm(shift, axis=-1)
         if self.arm_m > 0:
             target = np.broadcast_to(self.goal.poses.quaternion[order], rollouts.quaternions[:, 1:].shape)
-            cost = cost + turn_cost(rotation_angle(rollouts.quaternions[:, 1:], target), self.arm_m)
+            cost = cost + self.arm_m * rotation_angle(rollouts.quaternions[:, 1:], target)
         running_cost = cost.sum(axis=2)
         return running_cost.mean(axis=1) + _TERMINAL_WEIGHT * running_cost[:, -1]

@@ -6,7 +6,7 @@ first and second pushes of three are drawn; three let a can on its side, which r
 its axis, turned and slid back. A first push may roll the object onto the side that the goal shows; later pushes are
 then those of that side. Sequences are drawn by
 
-    s = sqrt(x^2 + y^2 + turn_cost(angle)^2) of what is left + price * (length of the pusher's path)
+    s = sqrt(x^2 + y^2 + (arm * angle)^2) of what is left + price * (length of the pusher's path)
 
 with probability proportional to exp(-s / temperature).
 """
@@ -14,6 +14,7 @@ with probability proportional to exp(-s / temperature).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,7 +31,7 @@ from osfcore.geometry.poses import (
 )
 from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.planning.path_planning import FreeSpace
-from osfcore.planning.pose_cost import ARM_M, turn_cost
+from osfcore.planning.pose_cost import ARM_M
 from osfcore.planning.push_outcomes import PushOutcomes
 
 _PATH_PRICE = 0.1  # of a metre of the pusher's path, in metres of error
@@ -102,14 +103,15 @@ class ObjectPushes:
         shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
         rows, left = _sequences(first, np.array([*shift, (later.yaw(goal) or 0.0) - yaw]), later, rng)
         path = self._path_lengths(rows, first, later, turn.T @ (pusher - centre))
-        before = np.hypot(np.linalg.norm(shift), turn_cost(rotation_angle(pose.quaternion, goal.quaternion)))
+        before = np.hypot(np.linalg.norm(shift), ARM_M * float(rotation_angle(pose.quaternion, goal.quaternion)))
         better = np.flatnonzero(left < _NEARER * before)
         stays = (rows[:, 1] >= 0) | first.lands[rows[:, 0]]
         if np.any(stays & (left < _MUCH_NEARER * before)):
             better = better[stays[better]]
         drawn = (left + _PATH_PRICE * path)[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
-        chosen = rows[better[np.argsort(drawn)[:count]]]
-        return [self._corners(row, first, later) @ turn.T + centre for row in chosen]
+        paths = (self._corners(row, first, later) @ turn.T + centre for row in rows[better[np.argsort(drawn)]])
+        within = (path for path in paths if np.abs(path).max() <= PUSHER_REACH_M)
+        return list(islice(within, count))
 
     def _first_pushes(self, rows: Int[np.ndarray, "M"], yaw: float, goal: Pose, later: ObjectPushes) -> _FirstPushes:
         """What some pushes of the table do to an object that is turned by `yaw`, in the terms of later ones."""
@@ -204,7 +206,7 @@ def _sequences(
         rng: draws first and second pushes of three.
     """
     motions, planar, tree = later._motions, later._planar, later._tree
-    left = np.hypot(np.linalg.norm(target[:2] - first.motions[:, :2], axis=1), turn_cost(first.angles))
+    left = np.hypot(np.linalg.norm(target[:2] - first.motions[:, :2], axis=1), ARM_M * first.angles)
     every = np.arange(len(first.rows))
     rows = np.stack([every, *np.full((2, len(every)), -1)], axis=1)
     landing = np.flatnonzero(first.lands)
@@ -214,7 +216,7 @@ def _sequences(
     pairs = np.stack([rng.choice(landing, _PAIRS), rng.choice(planar, _PAIRS)], axis=1)
     two = _after(_after(target, first.motions[pairs[:, 0]]), motions[pairs[:, 1]])
     more, nearest = tree.query(np.concatenate([_after(target, first.motions[one]), two]) * [1, 1, ARM_M])
-    more = np.hypot(more, turn_cost(first.tilts[np.concatenate([one, pairs[:, 0]])]))
+    more = np.hypot(more, ARM_M * first.tilts[np.concatenate([one, pairs[:, 0]])])
     last = planar[nearest]
     second = np.stack([one, last[: len(one)], np.full(len(one), -1)], axis=1)
     third = np.concatenate([pairs, last[len(one) :, None]], axis=1)

@@ -97,14 +97,23 @@ def test_actions_take_as_long_as_the_slower_axis_and_then_rest():
 
 
 @given(seed=st.integers(0, 10**6))
-def test_a_way_ends_when_it_is_said_to(seed):
+def test_actions_pass_every_corner_nearby_and_end_no_sooner_than_said(seed):
     rng = np.random.default_rng(seed)
     way = rng.uniform(-0.3, 0.3, (rng.integers(2, 6), 2))
     speeds = rng.uniform(0.2, 1, len(way) - 1)
-    last = int(np.ceil(duration_s(way, speeds) / STEP_S))
-    reached = way[0] + STEP_S * np.cumsum(actions_along(way, last + 2, speeds)[:, :2], axis=0)
-    np.testing.assert_allclose(reached[last - 1 :], np.broadcast_to(way[-1], (3, 2)), atol=1e-9)
-    assert np.linalg.norm(reached[last - 2] - way[-1]) > 0 or last < 2
+    least = int(np.ceil(duration_s(way, speeds) / STEP_S - 1e-9))
+    actions = actions_along(way, least + len(way), speeds)
+    reached = np.vstack([way[0], way[0] + STEP_S * np.cumsum(actions[:, :2], axis=0)])
+    gaps = np.linalg.norm(along(reached, 20_000)[:, None] - way, axis=2).min(axis=0)
+    assert gaps.max() < 0.012 + 1e-3
+    np.testing.assert_allclose(reached[-1], way[-1], atol=1e-9)
+    assert least < 2 or np.linalg.norm(reached[least - 1] - way[-1]) > 0
+
+
+def test_an_action_does_not_cut_a_corner():
+    way = np.array([[-0.1, 0.0], [0.01, 0.0], [0.01, -0.1]])  # an action of 6 cm would cut off 4 cm
+    passed = along(np.vstack([way[0], way[0] + STEP_S * np.cumsum(actions_along(way, 8)[:, :2], axis=0)]), 4000)
+    assert np.linalg.norm(passed - way[1], axis=1).min() <= 0.012
 
 
 def test_durations_add_up_and_grow_as_speeds_fall():

@@ -8,6 +8,7 @@ from osfcore.dynamics.push_models import load_push_model, load_shapes
 from osfcore.dynamics.shapes.object_shapes import ShapeTable
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
+from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.planning.path_planning import FreeSpace, actions_along
 from osfcore.planning.push_outcomes import push_outcomes
 from osfcore.planning.push_sequences import ObjectPushes, around_loop
@@ -54,6 +55,14 @@ def test_an_object_that_is_only_turned_is_turned_back(shapes, pushes, model):
     turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
     shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - goal.position[:2], axis=1)
     assert (turn + shift / 0.1).min() < 0.25
+
+
+def test_ways_stay_within_the_reach_of_the_pusher(shapes, pushes):
+    pose = turned(scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX), 0.0, (0.27, 0.27))
+    goal = turned(pose, 0.5, (0.0, -0.1))
+    ways = pushes.draw(pose, goal, pushes, FreeSpace([]), PUSHER, 60, np.random.default_rng(0))
+    assert len(ways) > 20
+    assert max(np.abs(way).max() for way in ways) <= PUSHER_REACH_M
 
 
 @pytest.mark.parametrize("yaw", [-0.7, 1.1])
