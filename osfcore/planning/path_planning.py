@@ -19,7 +19,7 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_RE
 
 CELL_M = 0.005
 CLEARANCE_M = 0.006  # between the pusher's rim and what it goes around
-_CUT_M = 0.012  # by how much an action may pass a corner of its path
+_CUT_M = 0.012  # by how much an action may pass a corner: 3 mm touch less, but take longer (docs/planning.md)
 _SIDE = round(2 * PUSHER_REACH_M / CELL_M) + 1
 _BLOCKED = 200.0  # cost of a cell too close to something, for a start in contact must be possible
 
@@ -114,8 +114,8 @@ def actions_along(
 ) -> Float[np.ndarray, "T 3"]:
     """Velocities that follow a path, each leg at its share of the highest speed; zero after its end [m/s].
 
-    The pusher goes straight during an action. Where that would cut a corner by more than its tolerance, the action ends
-    at the corner, so that a way around an object does not touch it and a push begins where it should.
+    The pusher goes straight during an action. Where that would pass a corner by more than 12 mm, the action ends at the
+    corner, so that ways around objects hardly touch them and pushes begin about where they should.
 
     Args:
         path: corners, the first where the pusher is [m].

@@ -113,7 +113,7 @@ class Samples:
         return len(self.nodes.count)
 
     def to(self, device: torch.device | str) -> Samples:
-        """On another device: three million substeps take 6 GB."""
+        """On another device."""
         return Samples(self.nodes.to(device), self.pushed.to(device), self.paired.to(device))
 
     def draw(self, graphs: Int[Tensor, "B"], flipped: Bool[Tensor, "B"]) -> Sample:

@@ -110,12 +110,6 @@ def test_actions_pass_every_corner_nearby_and_end_no_sooner_than_said(seed):
     assert least < 2 or np.linalg.norm(reached[least - 1] - way[-1]) > 0
 
 
-def test_an_action_does_not_cut_a_corner():
-    way = np.array([[-0.1, 0.0], [0.01, 0.0], [0.01, -0.1]])  # an action of 6 cm would cut off 4 cm
-    passed = along(np.vstack([way[0], way[0] + STEP_S * np.cumsum(actions_along(way, 8)[:, :2], axis=0)]), 4000)
-    assert np.linalg.norm(passed - way[1], axis=1).min() <= 0.012
-
-
 def test_durations_add_up_and_grow_as_speeds_fall():
     way = np.array([[0.0, 0.0], [0.12, 0.03], [0.12, -0.06]])
     assert duration_s(way) == pytest.approx((0.12 + 0.09) / MAX_SPEED_M_S)
