@@ -19,6 +19,7 @@ ONE_AT_A_TIME = threading.Lock()
 _FLOOR = np.float32(DENSITY_FLOOR)
 _FLOOR_G = np.float32(FLOOR_G)
 _ONE = np.float32(1)
+_NEXT = np.uint64(1)
 _EDGE = np.float32(1.001)  # before the last corner, so that there is always a next one
 
 
@@ -44,12 +45,13 @@ def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201, D417
     """
     i, j, k = int(px), int(py), int(pz)
     fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)  # int64 would promote to double
-    at = start + (i * ny + j) * nz + k
-    far = at + ny * nz
-    a = flat[at] + (flat[at + 1] - flat[at]) * fz
-    b = flat[at + nz] + (flat[at + nz + 1] - flat[at + nz]) * fz
-    c = flat[far] + (flat[far + 1] - flat[far]) * fz
-    d = flat[far + nz] + (flat[far + nz + 1] - flat[far + nz]) * fz
+    at = np.uint64(start + (i * ny + j) * nz + k)  # unsigned: numba need not ask whether to count from the end
+    side, far = at + np.uint64(nz), at + np.uint64(ny * nz)
+    corner = far + np.uint64(nz)
+    a = flat[at] + (flat[at + _NEXT] - flat[at]) * fz
+    b = flat[side] + (flat[side + _NEXT] - flat[side]) * fz
+    c = flat[far] + (flat[far + _NEXT] - flat[far]) * fz
+    d = flat[corner] + (flat[corner + _NEXT] - flat[corner]) * fz
     a += (b - a) * fy
     c += (d - c) * fy
     return a + (c - a) * fx

@@ -9,12 +9,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from osfcore.fields.dense_kernels import ANY, dense_layer, three_outputs
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, NETWORK_INPUTS
 from osfcore.fields.ray_marching import interpolate, inverted, leave_blocks, optical_density, within
 from osfcore.render.lamp_kernels import lamp_gain, toward_lamp
 from osfcore.render.numba_options import FAR, HELPER
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_NEXT = np.uint64(1)
 
 
 @numba.njit(**HELPER)
@@ -59,7 +61,7 @@ def next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step
         # Rounding must not lead out of the grid, however far away the ray began.
         px, py, pz = within(ox + t * dx, nx), within(oy + t * dy, ny), within(oz + t * dz, nz)
         bx, by, bz = int(px) >> MACRO_BITS, int(py) >> MACRO_BITS, int(pz) >> MACRO_BITS
-        free = np.int64(pack.macro[blocks + (bx * my + by) * mz + bz])
+        free = np.int64(pack.macro[np.uint64(blocks + (bx * my + by) * mz + bz)])
         if free > 0:
             skip = min(leave_blocks(px, dx, ix, bx, free), leave_blocks(py, dy, iy, by, free))
             skip = min(skip, leave_blocks(pz, dz, iz, bz, free))
@@ -129,66 +131,45 @@ def light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, step_voxels, 
 def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
     """Rho of field a at voxel coordinates: ambient part in out[0:3], direct part in out[3:6]."""
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
-    i, j, k = int(px), int(py), int(pz)
-    fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
-    f1 = f2 = f3 = f4 = f5 = f6 = f7 = _ZERO
-    start, first = pack.starts[a, 0] + (i * ny + j) * nz + k, pack.starts[a, 1]
-    for corner in range(8):
-        ci, cj, ck = corner >> 2, (corner >> 1) & 1, corner & 1
-        w = (fx if ci else _ONE - fx) * (fy if cj else _ONE - fy) * (fz if ck else _ONE - fz)
-        row = (first + pack.index[start + (ci * ny + cj) * nz + ck]) * FEATURES
-        f1 += w * pack.rows[row + 1]
-        f2 += w * pack.rows[row + 2]
-        f3 += w * pack.rows[row + 3]
-        f4 += w * pack.rows[row + 4]
-        f5 += w * pack.rows[row + 5]
-        f6 += w * pack.rows[row + 6]
-        f7 += w * pack.rows[row + 7]
-    dipole = f4 * lx + f5 * ly + f6 * lz
+    _mix_features(pack, a, px, py, pz, ny, nz, h1)
+    f1, f2, f3 = h1[1], h1[2], h1[3]
+    dipole = h1[4] * lx + h1[5] * ly + h1[6] * lz
     cx, cy, cz = pack.shapes[a, 6], pack.shapes[a, 7], pack.shapes[a, 8]
     qx = px * np.float32(cx) / np.float32(nx - 1)
     qy = py * np.float32(cy) / np.float32(ny - 1)
     qz = pz * np.float32(cz) / np.float32(nz - 1)
     i, j, k = min(int(qx), cx - 1), min(int(qy), cy - 1), min(int(qz), cz - 1)
-    inputs[0], inputs[1] = dipole, f7
+    inputs[0], inputs[1] = dipole, h1[7]
     inputs[2], inputs[3], inputs[4] = lx, ly, lz
     inputs[5], inputs[6], inputs[7] = vx, vy, vz
     inputs[8] = _TWO * (qx - np.float32(i)) - _ONE
     inputs[9] = _TWO * (qy - np.float32(j)) - _ONE
     inputs[10] = _TWO * (qz - np.float32(k)) - _ONE
-    network = pack.starts[a, 4] + pack.cells[pack.starts[a, 3] + (i * cy + j) * cz + k]
-    z0, z1, z2 = _run_network(pack.networks, network * pack.parameters, pack.hidden, inputs, h1, h2)
+    network = pack.starts[a, 4] + pack.cells[np.uint64(pack.starts[a, 3] + (i * cy + j) * cz + k)]
+    at = dense_layer(pack.networks, network * pack.parameters, inputs, ANY, NETWORK_INPUTS, pack.hidden, h1)
+    at = dense_layer(pack.networks, at, h1, _ZERO, pack.hidden, pack.hidden, h2)
+    x, y, z = three_outputs(pack.networks, at, h2, pack.hidden)
     out[0], out[1], out[2] = f1 * pack.ambient[a, 0], f2 * pack.ambient[a, 1], f3 * pack.ambient[a, 2]
-    out[3], out[4], out[5] = f1 * max(dipole + z0, _ZERO), f2 * max(dipole + z1, _ZERO), f3 * max(dipole + z2, _ZERO)
+    out[3], out[4], out[5] = f1 * max(dipole + x, _ZERO), f2 * max(dipole + y, _ZERO), f3 * max(dipole + z, _ZERO)
 
 
 @numba.njit(**HELPER)
-def _run_network(flat, at, hidden, inputs, h1, h2):
-    """The three outputs of a tiny network whose parameters begin at `at`."""
-    bias = at + NETWORK_INPUTS * hidden
-    for n in range(hidden):
-        h1[n] = flat[bias + n]
-    for m in range(NETWORK_INPUTS):
-        value, row = inputs[m], at + m * hidden
-        for n in range(hidden):
-            h1[n] += value * flat[row + n]
-    at = bias + hidden
-    bias = at + hidden * hidden
-    for n in range(hidden):
-        h2[n] = flat[bias + n]
-    for m in range(hidden):
-        value, row = max(h1[m], _ZERO), at + m * hidden
-        for n in range(hidden):
-            h2[n] += value * flat[row + n]
-    at = bias + hidden
-    bias = at + 3 * hidden
-    z0, z1, z2 = flat[bias], flat[bias + 1], flat[bias + 2]
-    for m in range(hidden):
-        value, row = max(h2[m], _ZERO), at + 3 * m
-        z0 += value * flat[row]
-        z1 += value * flat[row + 1]
-        z2 += value * flat[row + 2]
-    return z0, z1, z2
+def _mix_features(pack, a, px, py, pz, ny, nz, mixed) -> None:
+    """The features at voxel coordinates of field a, interpolated between eight corners, into mixed[0:FEATURES]."""
+    i, j, k = int(px), int(py), int(pz)
+    fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
+    start, first = pack.starts[a, 0] + (i * ny + j) * nz + k, pack.starts[a, 1]
+    for c in range(FEATURES):
+        mixed[c] = _ZERO
+    for side in range(4):
+        ci, cj = side >> 1, side & 1
+        w = (fx if ci else _ONE - fx) * (fy if cj else _ONE - fy)
+        here = np.uint64(start + (ci * ny + cj) * nz)
+        one = np.uint64((first + pack.index[here]) * FEATURES)
+        two = np.uint64((first + pack.index[here + _NEXT]) * FEATURES)
+        low, high = w * (_ONE - fz), w * fz
+        for c in range(FEATURES):
+            mixed[np.uint64(c)] += low * pack.rows[one + np.uint64(c)] + high * pack.rows[two + np.uint64(c)]
 
 
 @numba.njit(**HELPER)

@@ -19,12 +19,13 @@ from osfcore.fields.kiloosf import MOST_HIDDEN, NETWORK_INPUTS
 from osfcore.fields.ray_marching import inverted
 from osfcore.render.field_kernels import clip_to_extent, light_transmittance, next_sample, radiance_at
 from osfcore.render.numba_options import FAR, HELPER, KERNEL, TINY
-from osfcore.render.table_kernels import meet_table, pixel_ray, table_colour
+from osfcore.render.table_kernels import empty_pixel, meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
-BAND_ROWS = 8  # rows of an image that one thread draws at a time
+BAND_ROWS = 4  # rows of an image that one thread draws at a time
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+_FAINT = np.float32(1e-3)  # of a pixel that shows anything less, the distance is not told
 
 
 class _Work(NamedTuple):
@@ -220,37 +221,61 @@ def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, r
             total[c] += result[c]
 
 
+@numba.njit(**HELPER)
+def _untouched(
+    table, directs, lamps, cameras, base_rgb, base_distance, base_of, b, view, row, column, rules
+):  # fmt: skip
+    """Colour and distance of a pixel that shows the empty table, from the base if there is one."""
+    if len(base_rgb) == 0:
+        return empty_pixel(table, cameras, directs, lamps, b, view, row, column, rules.samples)
+    at = base_of[b]
+    red, green, blue = (
+        base_rgb[at, view, row, column, 0],
+        base_rgb[at, view, row, column, 1],
+        base_rgb[at, view, row, column, 2],
+    )
+    return red, green, blue, base_distance[at, view, row, column]
+
+
+@numba.njit(**HELPER)
+def _put(rgb, distance, b, view, row, column, red, green, blue, t) -> None:
+    rgb[b, view, row, column, 0], rgb[b, view, row, column, 1], rgb[b, view, row, column, 2] = red, green, blue
+    if distance.size > 0:
+        distance[b, view, row, column] = t
+
+
 @numba.njit(**KERNEL)
 def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, base_distance, base_of, boxes, shadows,
-                 outlines, rules, only, rgb, opacity, distance) -> None:  # fmt: skip
-    """Every image of a batch; what no object and no shadow can touch is copied from the empty table.
+                 outlines, rules, only, stride, rgb, opacity, distance) -> None:  # fmt: skip
+    """Every image of a batch; what no object and no shadow can touch shows the empty table.
 
     Args:
         pack, fields: packed fields, and that of each of N objects; table, scene, outlines, rules: types of `launch`.
         directs, lamps, cameras: B x 3 direct light on a white table, or `Lamps`; V x 12 `types.camera_numbers`.
-        base_rgb, base_distance, base_of: L empty tables (see `render_base`), and which of them each scene has.
+        base_rgb, base_distance, base_of: L empty tables (see `render_base`), and which of them each scene has; where
+            L = 0, each has its own, which is drawn with it.
         boxes, shadows: B x V x N x 4, pixels of objects and of their shadows (columns from, to, rows from, to).
         only: V x h x w, 0 for pixels that stay black, or empty.
+        stride: from one band of rows to the next that a thread draws, coprime to the number of bands: threads share
+            the bands equally, and half an image may hold all objects.
         rgb, opacity, distance: results: B x V x h x w x 3; B x V x N' x h x w or empty; B x V x h x w or empty.
     """
     scenes, views, height, width = rgb.shape[0], rgb.shape[1], rgb.shape[2], rgb.shape[3]
     count = len(fields)
-    wants_opacity, wants_distance, wants_some = opacity.size > 0, distance.size > 0, only.size > 0
+    wants_some = only.size > 0
     share = _ONE / np.float32(rules.samples * rules.samples)
     bands = (height + BAND_ROWS - 1) // BAND_ROWS
-    for job in numba.prange(scenes * views * bands):
+    jobs = scenes * views * bands
+    for number in numba.prange(jobs):
+        job = np.int64(number) * stride % jobs
         band, view, b = job % bands, (job // bands) % views, job // (bands * views)
-        base = base_of[b]
         work = _workspace()
         near, total, spans = work.near, work.total, work.spans
         for row in range(band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)):
             first, last = _row_spans(outlines, boxes, shadows, b, view, row, count, width, spans)
             for column in range(width):
                 if wants_some and only[view, row, column] == 0:
-                    for c in range(3):
-                        rgb[b, view, row, column, c] = _ZERO
-                    if wants_distance:
-                        distance[b, view, row, column] = _ZERO
+                    _put(rgb, distance, b, view, row, column, _ZERO, _ZERO, _ZERO, _ZERO)
                     continue
                 touched = False
                 if first <= column < last:
@@ -258,16 +283,12 @@ def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, 
                         near[n] = spans[n, 0] <= column < spans[n, 1]
                         touched = touched or near[n] or spans[n, 2] <= column < spans[n, 3]
                 if not touched:
-                    for c in range(3):
-                        rgb[b, view, row, column, c] = base_rgb[base, view, row, column, c]
-                    if wants_distance:
-                        distance[b, view, row, column] = base_distance[base, view, row, column]
+                    red, green, blue, t = _untouched(table, directs, lamps, cameras, base_rgb, base_distance, base_of,
+                                                     b, view, row, column, rules)  # fmt: skip
+                    _put(rgb, distance, b, view, row, column, red, green, blue, t)
                     continue
                 _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work)
-                for c in range(3):
-                    rgb[b, view, row, column, c] = total[c] * share
-                if wants_distance:
-                    distance[b, view, row, column] = total[3] / total[4] if total[4] * share > 1e-3 else _ZERO
-                if wants_opacity:
-                    for n in range(opacity.shape[2]):
-                        opacity[b, view, n, row, column] = total[5 + n] * share
+                t = total[3] / total[4] if total[4] * share > _FAINT else _ZERO
+                _put(rgb, distance, b, view, row, column, total[0] * share, total[1] * share, total[2] * share, t)
+                for n in range(opacity.shape[2]):
+                    opacity[b, view, n, row, column] = total[5 + n] * share

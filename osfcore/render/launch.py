@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from osfcore.fields.ray_marching import ONE_AT_A_TIME
 from osfcore.fields.table_field import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import quaternion_to_matrix
-from osfcore.render.kernels import NO_OUTLINE, render_batch
+from osfcore.render.kernels import BAND_ROWS, NO_OUTLINE, render_batch
 from osfcore.render.lamps import Lamps, below_lamps, numbers_of_lamps, over_the_table, place_lamps
 from osfcore.render.packing import Packed
 from osfcore.render.table_kernels import render_base
@@ -114,7 +115,7 @@ def launch(  # noqa: D417
     with ONE_AT_A_TIME:
         base = _empty_tables(plain, table, batch, lamps, lenses_f32, size, quality.samples_per_side)
         render_batch(pack, plain, numbers, scene, directs, lamps, lenses_f32, *base, boxes, shadows,
-                     Outlines(outline, shadow_outline), rules, mask, rgb, opacity, distance)  # fmt: skip
+                     Outlines(outline, shadow_outline), rules, mask, _stride(rgb), rgb, opacity, distance)  # fmt: skip
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,
@@ -132,16 +133,25 @@ def _empty_tables(
     size: tuple[int, int],
     samples: int,
 ) -> tuple[Float32[np.ndarray, "L V h w 3"], Float32[np.ndarray, "L V h w"], Int[np.ndarray, "B"]]:
-    """Colours and distances of the empty table under each of L different lights, and which of them each scene has."""
+    """Colours and distances of the empty table under each of L different lights, and which of them each scene has.
+
+    Where no scenes share one, L is 0.
+    """
     lights = batch.lights.astype(np.float32)
     rows = lights if batch.spots is None else numbers_of_lamps(batch.spots)
     _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    shape = len(first), len(lenses), *size
+    shape = len(first) if len(first) < len(rows) else 0, len(lenses), *size
     rgb, distance = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-    if table is not None:
+    if table is not None and len(rgb):
         different = None if lamps is None else over_the_table(lamps, first)
         render_base(plain, lenses, table.direct(lights[first]), different, samples, rgb, distance)
     return rgb, distance, which.reshape(-1)
+
+
+def _stride(images: Float32[np.ndarray, "B V h w 3"]) -> int:
+    """A number coprime to the number of bands, about the golden section of it, so that multiples spread evenly."""
+    bands = images.shape[0] * images.shape[1] * -(-images.shape[2] // BAND_ROWS)
+    return next(s for s in range(max(round(0.618 * bands), 1), 2 * bands + 2) if math.gcd(s, bands) == 1)
 
 
 def _scene(

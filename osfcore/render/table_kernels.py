@@ -78,16 +78,48 @@ def table_colour(table, directs, lamps, b, x, y, visible):
     )
 
 
+@numba.njit(**HELPER)
+def empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples):
+    """Colour of a pixel of the empty, unshaded table, and its distance [m], 0 where there is no table.
+
+    Args:
+        table: `launch.Table`.
+        cameras, directs, lamps, b: as in `table_colour`.
+        view, row, column: the pixel.
+        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough,
+            except for the edge of a lamp's cone.
+    """
+    hits = 0
+    for s in range(4 if samples > 1 else 0):  # a pixel that straddles the table's edge shows a part of it
+        u, v = np.float32(column + s % 2), np.float32(row + s // 2)
+        dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
+        hits += meet_table(table, cameras, view, dx, dy, dz) < FAR
+    count = samples if 0 < hits < 4 or lamps is not None else 1
+    share = _ONE / np.float32(count * count)
+    red = green = blue = reach = _ZERO
+    hits = 0
+    for s in range(count * count):
+        u = np.float32(column + (s % count + 0.5) / count)
+        v = np.float32(row + (s // count + 0.5) / count)
+        dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
+        t = meet_table(table, cameras, view, dx, dy, dz)
+        if t < FAR:
+            x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
+            r, g, bl = table_colour(table, directs, lamps, b, x, y, _ONE)
+            hits, reach = hits + 1, reach + t
+        else:
+            r, g, bl = table.background[0], table.background[1], table.background[2]
+        red, green, blue = red + share * r, green + share * g, blue + share * bl
+    return red, green, blue, reach / np.float32(max(hits, 1))
+
+
 @numba.njit(**KERNEL)
 def render_base(table, cameras, directs, lamps, samples, rgb, distance) -> None:
     """The empty, unshaded table under L lights from V cameras.
 
     Args:
-        table: `launch.Table`.
-        cameras: V x 12 numbers of `types.camera_numbers`.
+        table, cameras, samples: as in `empty_pixel`.
         directs, lamps: L x 3, direct light on a white table; or L lamps instead.
-        samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough,
-            except for the edge of a lamp's cone.
         rgb: result, L x V x h x w x 3.
         distance: result, L x V x h x w [m]; 0 where there is no table.
     """
@@ -95,28 +127,8 @@ def render_base(table, cameras, directs, lamps, samples, rgb, distance) -> None:
     for job in numba.prange(lights * views * height):
         row, view, b = job % height, (job // height) % views, job // (height * views)
         for column in range(width):
-            hits = 0
-            for s in range(4 if samples > 1 else 0):  # a pixel that straddles the table's edge shows a part of it
-                u, v = np.float32(column + s % 2), np.float32(row + s // 2)
-                dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
-                hits += meet_table(table, cameras, view, dx, dy, dz) < FAR
-            count = samples if 0 < hits < 4 or lamps is not None else 1
-            share = _ONE / np.float32(count * count)
-            red = green = blue = reach = _ZERO
-            hits = 0
-            for s in range(count * count):
-                u = np.float32(column + (s % count + 0.5) / count)
-                v = np.float32(row + (s // count + 0.5) / count)
-                dx, dy, dz, _ = pixel_ray(cameras, view, u, v)
-                t = meet_table(table, cameras, view, dx, dy, dz)
-                if t < FAR:
-                    x, y = cameras[view, 0] + t * dx, cameras[view, 1] + t * dy
-                    r, g, bl = table_colour(table, directs, lamps, b, x, y, _ONE)
-                    hits, reach = hits + 1, reach + t
-                else:
-                    r, g, bl = table.background[0], table.background[1], table.background[2]
-                red, green, blue = red + share * r, green + share * g, blue + share * bl
-            distance[b, view, row, column] = reach / max(hits, 1)
+            red, green, blue, reach = empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples)
+            distance[b, view, row, column] = reach
             rgb[b, view, row, column, 0] = red
             rgb[b, view, row, column, 1] = green
             rgb[b, view, row, column, 2] = blue
