@@ -117,7 +117,7 @@ def light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, step_voxels, 
     """
     depth = _ZERO
     for m in range(len(fields)):
-        if m != n and depth < enough:
+        if m != n and scene.part[b, m] > 0 and depth < enough:  # 0: `kernels.GONE`
             a = fields[m]
             qx, qy, qz = _transform(scene.between, b, n, m, x, y, z)
             step = step_voxels * pack.scales[a, 3]

@@ -23,6 +23,7 @@ from osfcore.render.table_kernels import empty_pixel, meet_table, pixel_ray, tab
 
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
+GONE, STILL, MOVES = 0, 1, 2  # an object that is not there, or that is in the base, or in the scene alone
 BAND_ROWS = 4  # rows of an image that one thread draws at a time
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _FAINT = np.float32(1e-3)  # of a pixel that shows anything less, the distance is not told
@@ -55,7 +56,7 @@ def _workspace():
         np.empty((n, 3), f), np.empty((n, 3), f), np.empty(NETWORK_INPUTS, f), np.empty(MOST_HIDDEN, f),
         np.empty(MOST_HIDDEN, f), np.empty(6, f), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, f),
         np.empty(n, f), np.empty(1, np.int64), np.zeros(n, np.bool_), np.empty(5 + n, f),
-        np.empty(5 + n, f), np.empty((n, 4), np.int64),
+        np.empty(5 + n, f), np.empty((n, 6), np.int64),
     )  # fmt: skip
 
 
@@ -96,16 +97,14 @@ def _nearest_sample(pack, fields, rules, work):
 
 
 @numba.njit(**HELPER)
-def _add_background(
-    pack, table, fields, scene, directs, lamps, cameras, b, view, dx, dy, table_t, left, rules, result
-) -> None:
+def _add_background(pack, table, fields, scene, lamps, cameras, b, view, dx, dy, table_t, left, rules, result) -> None:
     """Add what passes all objects: the table with its shadows, or the surroundings."""
     if table_t < FAR:
         x, y = cameras[view, 0] + table_t * dx, cameras[view, 1] + table_t * dy
         visible = light_transmittance(
             pack, fields, scene, lamps, b, len(fields), x, y, _ZERO, rules.shadow_voxels, rules.enough
         )
-        r, g, blue = table_colour(table, directs, lamps, b, x, y, visible)
+        r, g, blue = table_colour(table, scene.direct, lamps, b, x, y, visible)
         result[0] += left * r
         result[1] += left * g
         result[2] += left * blue
@@ -117,7 +116,7 @@ def _add_background(
 
 
 @numba.njit(**HELPER)
-def _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, near, rules, work, result):
+def _trace(pack, table, fields, scene, lamps, cameras, b, view, u, v, near, rules, work, result):
     """Follow one ray.
 
     It leaves radiance in result[0:3], distance times weight in result[3], weight in result[4] and the seen share of
@@ -162,14 +161,14 @@ def _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, n
         for c in range(5 + count):
             result[c] *= whole
         return
-    _add_background(pack, table, fields, scene, directs, lamps, cameras, b, view, dx, dy, table_t, left, rules, result)
+    _add_background(pack, table, fields, scene, lamps, cameras, b, view, dx, dy, table_t, left, rules, result)
 
 
 @numba.njit(**HELPER)
 def _row_span(outlines, boxes, b, view, n, row):
     """The columns of a row of pixels, from and to, that the outline of object n may touch.
 
-    The outline is the convex hull of eight points; between any two of them a line lies in it, and some are its edges.
+    The outline is the convex hull of some points; between any two of them a line lies in it, and some are its edges.
     """
     if not boxes[b, view, n, 2] <= row < boxes[b, view, n, 3]:
         return 0, 0
@@ -178,7 +177,7 @@ def _row_span(outlines, boxes, b, view, n, row):
         return first, last
     top, bottom = np.float32(row), np.float32(row + 1)
     low, high = FAR, -FAR
-    for i in range(8):
+    for i in range(outlines.shape[3]):
         x0, y0 = outlines[b, view, n, i, 0], outlines[b, view, n, i, 1]
         for j in range(i):
             x1, y1 = outlines[b, view, n, j, 0], outlines[b, view, n, j, 1]
@@ -194,21 +193,49 @@ def _row_span(outlines, boxes, b, view, n, row):
 
 
 @numba.njit(**HELPER)
-def _row_spans(outlines, boxes, shadows, b, view, row, count, width, spans):
-    """Columns of a row that each object (spans 0, 1) and its shadow (2, 3) may touch; returns those that any may."""
-    first, last = width, 0
+def _row_spans(scene, b, view, row, count, width, spans):
+    """Columns of a row that each object may touch (spans 0, 1), and the shadow of each that moves (2, 3).
+
+    And what these may shade (4, 5), which is left empty where no other objects are still.
+
+    Returns:
+        Columns, from and to, that what moves may change.
+    """
+    first, last, has_still = width, 0, False
     for n in range(count):
-        spans[n, 0], spans[n, 1] = _row_span(outlines.objects, boxes, b, view, n, row)
-        spans[n, 2], spans[n, 3] = _row_span(outlines.shadows, shadows, b, view, n, row)
-        if spans[n, 0] < spans[n, 1]:
-            first, last = min(first, spans[n, 0]), max(last, spans[n, 1])
-        if spans[n, 2] < spans[n, 3]:
-            first, last = min(first, spans[n, 2]), max(last, spans[n, 3])
+        has_still = has_still or scene.part[b, n] == STILL
+    for n in range(count):
+        for c in range(6):
+            spans[n, c] = 0
+        if scene.part[b, n] == GONE:
+            continue
+        spans[n, 0], spans[n, 1] = _row_span(scene.outline, scene.box, b, view, n, row)
+        if scene.part[b, n] == MOVES:
+            spans[n, 2], spans[n, 3] = _row_span(scene.shadow, scene.shadow_box, b, view, n, row)
+            if has_still:
+                spans[n, 4], spans[n, 5] = _row_span(scene.swept, scene.swept_box, b, view, n, row)
+            for c in range(3):
+                if spans[n, 2 * c] < spans[n, 2 * c + 1]:
+                    first, last = min(first, spans[n, 2 * c]), max(last, spans[n, 2 * c + 1])
     return first, last
 
 
 @numba.njit(**HELPER)
-def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work) -> None:
+def _is_touched(scene, b, column, count, spans, near):
+    """Whether a pixel may show anything but the base; marks the objects that it may show."""
+    touched = shaded = shows_still = False
+    for n in range(count):
+        near[n] = spans[n, 0] <= column < spans[n, 1]
+        if scene.part[b, n] == MOVES:
+            touched = touched or near[n] or spans[n, 2] <= column < spans[n, 3]
+            shaded = shaded or spans[n, 4] <= column < spans[n, 5]
+        else:
+            shows_still = shows_still or near[n]
+    return touched or (shaded and shows_still)
+
+
+@numba.njit(**HELPER)
+def _trace_pixel(pack, table, fields, scene, lamps, cameras, b, view, row, column, rules, work) -> None:
     """Sum of the rays of one pixel, left in work.total."""
     total, result, samples = work.total, work.result, rules.samples
     for c in range(5 + len(fields)):
@@ -216,25 +243,25 @@ def _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, r
     for s in range(samples * samples):
         u = np.float32(column + (s % samples + 0.5) / samples)
         v = np.float32(row + (s // samples + 0.5) / samples)
-        _trace(pack, table, fields, scene, directs, lamps, cameras, b, view, u, v, work.near, rules, work, result)
+        _trace(pack, table, fields, scene, lamps, cameras, b, view, u, v, work.near, rules, work, result)
         for c in range(5 + len(fields)):
             total[c] += result[c]
 
 
 @numba.njit(**HELPER)
-def _untouched(
-    table, directs, lamps, cameras, base_rgb, base_distance, base_of, b, view, row, column, rules
-):  # fmt: skip
-    """Colour and distance of a pixel that shows the empty table, from the base if there is one."""
-    if len(base_rgb) == 0:
-        return empty_pixel(table, cameras, directs, lamps, b, view, row, column, rules.samples)
-    at = base_of[b]
-    red, green, blue = (
-        base_rgb[at, view, row, column, 0],
-        base_rgb[at, view, row, column, 1],
-        base_rgb[at, view, row, column, 2],
-    )
-    return red, green, blue, base_distance[at, view, row, column]
+def _show_base(table, scene, lamps, cameras, base, b, view, row, column, rules, rgb, opacity, distance) -> None:
+    """A pixel that shows nothing of the scene's own: the base, or the empty table where there is none."""
+    at = base.of[b]
+    if at < 0:
+        red, green, blue, t = empty_pixel(table, cameras, scene.direct, lamps, b, view, row, column, rules.samples)
+        _put(rgb, distance, b, view, row, column, red, green, blue, t)
+        return
+    for c in range(3):
+        rgb[b, view, row, column, c] = base.rgb[at, view, row, column, c]
+    for n in range(opacity.shape[2]):
+        opacity[b, view, n, row, column] = base.opacity[at, view, n, row, column]
+    if distance.size > 0:
+        distance[b, view, row, column] = base.distance[at, view, row, column]
 
 
 @numba.njit(**HELPER)
@@ -245,24 +272,21 @@ def _put(rgb, distance, b, view, row, column, red, green, blue, t) -> None:
 
 
 @numba.njit(**KERNEL)
-def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, base_distance, base_of, boxes, shadows,
-                 outlines, rules, only, stride, rgb, opacity, distance) -> None:  # fmt: skip
-    """Every image of a batch; what no object and no shadow can touch shows the empty table.
+def render_batch(pack, table, fields, scene, lamps, cameras, base, rules, only, stride, rgb, opacity, distance) -> None:
+    """Every image of a batch.
 
     Args:
-        pack, fields: packed fields, and that of each of N objects; table, scene, outlines, rules: types of `launch`.
-        directs, lamps, cameras: B x 3 direct light on a white table, or `Lamps`; V x 12 `types.camera_numbers`.
-        base_rgb, base_distance, base_of: L empty tables (see `render_base`), and which of them each scene has; where
-            L = 0, each has its own, which is drawn with it.
-        boxes, shadows: B x V x N x 4, pixels of objects and of their shadows (columns from, to, rows from, to).
+        pack, fields: packed fields, and that of each of N objects.
+        table, scene, base, rules: types of `launch`.
+        lamps, cameras: `Lamps`, or None; V x 12 `types.camera_numbers`.
         only: V x h x w, 0 for pixels that stay black, or empty.
         stride: from one band of rows to the next that a thread draws, coprime to the number of bands: threads share
             the bands equally, and half an image may hold all objects.
-        rgb, opacity, distance: results: B x V x h x w x 3; B x V x N' x h x w or empty; B x V x h x w or empty.
+        rgb, opacity, distance: results: B x V x h x w x 3; zeros of B x V x N' x h x w or empty; B x V x h x w or
+            empty.
     """
     scenes, views, height, width = rgb.shape[0], rgb.shape[1], rgb.shape[2], rgb.shape[3]
-    count = len(fields)
-    wants_some = only.size > 0
+    count, wants_some = len(fields), only.size > 0
     share = _ONE / np.float32(rules.samples * rules.samples)
     bands = (height + BAND_ROWS - 1) // BAND_ROWS
     jobs = scenes * views * bands
@@ -270,24 +294,17 @@ def render_batch(pack, table, fields, scene, directs, lamps, cameras, base_rgb, 
         job = np.int64(number) * stride % jobs
         band, view, b = job % bands, (job // bands) % views, job // (bands * views)
         work = _workspace()
-        near, total, spans = work.near, work.total, work.spans
+        total = work.total
         for row in range(band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)):
-            first, last = _row_spans(outlines, boxes, shadows, b, view, row, count, width, spans)
+            first, last = _row_spans(scene, b, view, row, count, width, work.spans)
             for column in range(width):
                 if wants_some and only[view, row, column] == 0:
                     _put(rgb, distance, b, view, row, column, _ZERO, _ZERO, _ZERO, _ZERO)
                     continue
-                touched = False
-                if first <= column < last:
-                    for n in range(count):
-                        near[n] = spans[n, 0] <= column < spans[n, 1]
-                        touched = touched or near[n] or spans[n, 2] <= column < spans[n, 3]
-                if not touched:
-                    red, green, blue, t = _untouched(table, directs, lamps, cameras, base_rgb, base_distance, base_of,
-                                                     b, view, row, column, rules)  # fmt: skip
-                    _put(rgb, distance, b, view, row, column, red, green, blue, t)
+                if not (first <= column < last and _is_touched(scene, b, column, count, work.spans, work.near)):
+                    _show_base(table, scene, lamps, cameras, base, b, view, row, column, rules, rgb, opacity, distance)
                     continue
-                _trace_pixel(pack, table, fields, scene, directs, lamps, cameras, b, view, row, column, rules, work)
+                _trace_pixel(pack, table, fields, scene, lamps, cameras, b, view, row, column, rules, work)
                 t = total[3] / total[4] if total[4] * share > _FAINT else _ZERO
                 _put(rgb, distance, b, view, row, column, total[0] * share, total[1] * share, total[2] * share, t)
                 for n in range(opacity.shape[2]):

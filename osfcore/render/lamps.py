@@ -16,7 +16,7 @@ _HIGHEST = 0.98  # of a lamp's height: what reaches higher may cast its shadow a
 
 
 class Lamps(NamedTuple):
-    """The near lamps of B scenes, or those of L empty tables, which have no objects.
+    """The near lamps of B scenes.
 
     Attributes:
         position: B x (N + 1) x 3, in the voxel coordinates of each object; the last: in the world [m].
@@ -71,10 +71,9 @@ def place_lamps(
     return Lamps(*(np.array(array, np.float32, order="C") for array in arrays))  # any other layout is compiled anew
 
 
-def over_the_table(lamps: Lamps, chosen: Int[np.ndarray, "L"]) -> Lamps:
-    """Some of the lamps, with the world as their only coordinates."""
-    position, axis = (np.ascontiguousarray(array[chosen, -1:]) for array in lamps[:2])
-    return Lamps(position, axis, lamps.cone[chosen], *lamps[3:])
+def lamps_of(lamps: Lamps, chosen: Int[np.ndarray, "L"]) -> Lamps:
+    """The lamps of some of the scenes."""
+    return Lamps(lamps.position[chosen], lamps.axis[chosen], lamps.cone[chosen], *lamps[3:])
 
 
 def numbers_of_lamps(spots: Sequence[SpotLamp]) -> Float[np.ndarray, "B 8"]:

@@ -13,14 +13,14 @@ from osfcore.fields.ray_marching import ONE_AT_A_TIME
 from osfcore.fields.table_field import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import quaternion_to_matrix
-from osfcore.render.kernels import BAND_ROWS, NO_OUTLINE, render_batch
-from osfcore.render.lamps import Lamps, below_lamps, numbers_of_lamps, over_the_table, place_lamps
+from osfcore.render.kernels import BAND_ROWS, GONE, MOVES, NO_OUTLINE, STILL, render_batch
+from osfcore.render.lamps import Lamps, below_lamps, lamps_of, numbers_of_lamps, place_lamps
 from osfcore.render.packing import Packed
-from osfcore.render.table_kernels import render_base
 from osfcore.render.types import MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, poses_of
 
 _LAST_CORNER = 1.001  # interpolation needs the corner after
 _TINY = 1e-9
+_LOWEST = 0.02  # of a light that drops shadows onto the table
 _NEAREST_M = 1e-3  # corners of boxes closer than that make a box fill the screen
 
 
@@ -35,7 +35,10 @@ class Table(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Where everything is, in the voxel coordinates of each object.
+    """Where everything is, in the voxel coordinates of each object and on the screens.
+
+    Outlines are convex hulls of points on the screen [px], `NO_OUTLINE` where some are behind the camera; boxes hold
+    them, or the whole screen: columns from, to, rows from, to.
 
     Attributes:
         eye: B x V x N x 3, the cameras.
@@ -43,6 +46,11 @@ class Scene(NamedTuple):
         lit: B x N x 3, toward the light, per metre.
         lit_inverse: the same, each number inverted.
         between: B x (N + 1) x N x 12, from the voxel coordinates of one object to another's; the last: the world.
+        direct: B x 3, direct light on a white table.
+        part: B x N, whether an object is `GONE`, or `STILL` and in the base, or `MOVES`.
+        box, outline: B x V x N x 4 and x 8 x 2, of the objects.
+        shadow_box, shadow: likewise, of their shadows on the table.
+        swept_box, swept: B x V x N x 4 and x 16 x 2, of the objects, their shadows and all between.
         reach: N x 6, lowest and highest corner of what is occupied.
     """
 
@@ -51,14 +59,33 @@ class Scene(NamedTuple):
     lit: np.ndarray
     lit_inverse: np.ndarray
     between: np.ndarray
+    direct: np.ndarray
+    part: np.ndarray
+    box: np.ndarray
+    outline: np.ndarray
+    shadow_box: np.ndarray
+    shadow: np.ndarray
+    swept_box: np.ndarray
+    swept: np.ndarray
     reach: np.ndarray
 
+    def of(self, chosen: Int[np.ndarray, "L"], part: Int[np.ndarray, "L N"]) -> Scene:
+        """Some of the scenes, with other parts."""
+        return Scene._make([*(array[chosen] for array in self[:-1]), self.reach])._replace(part=part)
 
-class Outlines(NamedTuple):
-    """Corners of boxes on the screen, B x V x N x 8 x 2 [px]; `NO_OUTLINE` where a box reaches behind the camera."""
 
-    objects: np.ndarray
-    shadows: np.ndarray
+class Base(NamedTuple):
+    """Images of what many scenes of a batch have in common: the table, and objects that are the same in all of them.
+
+    Attributes:
+        of: B, which of L images each scene has; -1 for none.
+        rgb, opacity, distance: L x V x h x w x 3 and so on, as results of `render_batch`.
+    """
+
+    of: np.ndarray
+    rgb: np.ndarray
+    opacity: np.ndarray
+    distance: np.ndarray
 
 
 class Rules(NamedTuple):
@@ -91,31 +118,27 @@ def launch(  # noqa: D417
         table, batch, cameras, quality, outputs, only: as in `SceneRenderer` and its `render`.
     """
     rotations, positions = poses_of(batch)
-    scenes, views, count = len(batch.lights), len(cameras), len(batch.names)
-    lenses = np.array([camera_numbers(camera) for camera in cameras])
-    corners = _corners_world(pack.extents[numbers], rotations, positions)
-    if table is None:
-        boxes, outline = _on_screen(corners, cameras)
-        shadows, shadow_outline = np.zeros_like(boxes), np.zeros_like(outline)
-    else:
-        dropped = _on_table(corners, batch.lights) if batch.spots is None else below_lamps(corners, batch.spots)
-        both = _on_screen(np.concatenate([corners, dropped], axis=1), cameras)
-        (boxes, shadows), (outline, shadow_outline) = (_halves(part) for part in both)
-    shape = (scenes, views, *size)
-    rgb = np.empty((*shape, 3), np.float32)
-    wants_opacity = bool({"opacity", "masks"} & set(outputs))
-    opacity = np.zeros((scenes, views, count, *size) if wants_opacity else (0,) * 5, np.float32)
-    distance = np.empty(shape if "depth" in outputs else (0,) * 4, np.float32)
-    plain, rules = plain_table(table), _rules(quality)
-    lenses_f32 = np.array(lenses, np.float32, order="C")
-    directs = np.zeros((scenes, 3), np.float32) if table is None else table.direct(batch.lights)
+    views = np.array([camera_numbers(camera) for camera in cameras])
     lamps = None if batch.spots is None else place_lamps(batch.spots, pack, numbers, rotations, positions, table)
-    scene = _scene(pack, numbers, rotations, positions, batch.lights, lenses)
+    scene = _scene(pack, numbers, table, batch, cameras, rotations, positions, views)
     mask = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
+    shape = len(cameras), *size
+    lenses = np.array(views, np.float32, order="C")
+
+    def draw(scene: Scene, lamps: Lamps | None, base: Base) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        images = _blank(len(scene.eye), shape, len(batch.names), outputs)
+        render_batch(pack, plain_table(table), numbers, scene, lamps, lenses, base, _rules(quality), mask,
+                     _stride(images[0]), *images)  # fmt: skip
+        return images
+
+    still, chosen, of = _shared(batch, rotations, positions, has_table=table is not None)
+    base = Base(np.full(len(chosen), -1), *_blank(0, shape, len(batch.names), outputs))
     with ONE_AT_A_TIME:
-        base = _empty_tables(plain, table, batch, lamps, lenses_f32, size, quality.samples_per_side)
-        render_batch(pack, plain, numbers, scene, directs, lamps, lenses_f32, *base, boxes, shadows,
-                     Outlines(outline, shadow_outline), rules, mask, _stride(rgb), rgb, opacity, distance)  # fmt: skip
+        if len(chosen):
+            seen = scene.of(chosen, np.where(still[chosen], MOVES, GONE))
+            base = Base(of, *draw(seen, None if lamps is None else lamps_of(lamps, chosen), base))
+        scene = scene._replace(part=np.where(still & (of >= 0)[:, None], STILL, MOVES))
+        rgb, opacity, distance = draw(scene, lamps, base._replace(of=of))
     return Rendered(
         rgb,
         opacity if "opacity" in outputs else None,
@@ -124,28 +147,43 @@ def launch(  # noqa: D417
     )
 
 
-def _empty_tables(
-    plain: Table,
-    table: TableField | None,
-    batch: SceneBatch,
-    lamps: Lamps | None,
-    lenses: Float32[np.ndarray, "V 12"],
-    size: tuple[int, int],
-    samples: int,
-) -> tuple[Float32[np.ndarray, "L V h w 3"], Float32[np.ndarray, "L V h w"], Int[np.ndarray, "B"]]:
-    """Colours and distances of the empty table under each of L different lights, and which of them each scene has.
+def _blank(
+    scenes: int, shape: tuple[int, ...], count: int, outputs: frozenset[str] | set[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Memory for colours, opacity of so many objects and distance; empty where not asked for."""
+    views, *size = shape
+    opacity = np.zeros((scenes, views, count, *size) if {"opacity", "masks"} & set(outputs) else (0,) * 5, np.float32)
+    distance = np.empty((scenes, *shape) if "depth" in outputs else (0,) * 4, np.float32)
+    return np.empty((scenes, *shape, 3), np.float32), opacity, distance
 
-    Where no scenes share one, L is 0.
+
+def _shared(
+    batch: SceneBatch,
+    rotations: Float[np.ndarray, "B N 3 3"],
+    positions: Float[np.ndarray, "B N 3"],
+    *,
+    has_table: bool,
+) -> tuple[Bool[np.ndarray, "B N"], Int[np.ndarray, "L"], Int[np.ndarray, "B"]]:
+    """What scenes have in common, so that it is drawn once: planning and derivatives move one object of many.
+
+    Returns:
+        For each scene, objects whose pose is the commonest of that object; L scenes, one for each set of two or more
+        that have the light and these objects in common; and which of these sets each scene is in, -1 for none.
     """
-    lights = batch.lights.astype(np.float32)
-    rows = lights if batch.spots is None else numbers_of_lamps(batch.spots)
-    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    shape = len(first) if len(first) < len(rows) else 0, len(lenses), *size
-    rgb, distance = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-    if table is not None and len(rgb):
-        different = None if lamps is None else over_the_table(lamps, first)
-        render_base(plain, lenses, table.direct(lights[first]), different, samples, rgb, distance)
-    return rgb, distance, which.reshape(-1)
+    scenes, count = positions.shape[:2]
+    still = np.zeros((scenes, count), bool)
+    if scenes < 2:
+        return still, np.zeros(0, int), np.full(scenes, -1)
+    if has_table and batch.lights[:, 2].min() > _LOWEST:
+        poses = np.concatenate([rotations.reshape(scenes, count, 9), positions], axis=-1)
+        for n in range(count):
+            _, which, many = np.unique(poses[:, n], axis=0, return_inverse=True, return_counts=True)
+            still[:, n] = (which == many.argmax()).reshape(-1) if many.max() > 1 else False
+    lights = batch.lights if batch.spots is None else numbers_of_lamps(batch.spots)
+    rows = np.concatenate([lights, still], axis=1)
+    _, first, which, many = np.unique(rows, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    number = np.where(many > 1, np.cumsum(many > 1) - 1, -1)
+    return still, first[many > 1], number[which.reshape(-1)]
 
 
 def _stride(images: Float32[np.ndarray, "B V h w 3"]) -> int:
@@ -157,19 +195,21 @@ def _stride(images: Float32[np.ndarray, "B V h w 3"]) -> int:
 def _scene(
     pack: Packed,
     numbers: Int[np.ndarray, "N"],
+    table: TableField | None,
+    batch: SceneBatch,
+    cameras: Sequence[Camera],
     rotations: Float[np.ndarray, "B N 3 3"],
     positions: Float[np.ndarray, "B N 3"],
-    lights: Float[np.ndarray, "B 3"],
     lenses: Float[np.ndarray, "V 12"],
 ) -> Scene:
-    """Everything in voxel coordinates, worked out in double precision."""
+    """Everything in voxel coordinates, worked out in double precision, and on the screens; all objects move."""
     scales = pack.scales[numbers].astype(float)
     origin, voxel = scales[:, :3], scales[:, 3:]
     into = rotations / voxel[..., None]  # from the world
     offset = -np.einsum("bnij,bnj->bni", into, positions) - origin / voxel
     eye = np.einsum("bnij,vj->bvni", into, lenses[:, :3]) + offset[:, None]
     ray = np.einsum("bnij,vjk->bvnik", into, lenses[:, 3:].reshape(-1, 3, 3))
-    lit = np.einsum("bnij,bj->bni", into, lights)
+    lit = np.einsum("bnij,bj->bni", into, batch.lights)
     # From object n: x_world = R_n^T (voxel_n * x + origin_n) + position_n; the world comes as it is.
     scenes, count = positions.shape[:2]
     linear = np.concatenate(
@@ -184,9 +224,36 @@ def _scene(
     most = pack.shapes[numbers, :3] - _LAST_CORNER
     reach = np.stack([np.maximum(reach[:, 0], 0), np.minimum(reach[:, 1], most)], axis=1)
     inverse = 1 / np.where(np.abs(lit) > _TINY, lit, _TINY)
-    arrays = (eye, ray.reshape(*ray.shape[:3], 9), lit, inverse, between.reshape(scenes, count + 1, count, 12))
+    direct = np.zeros((scenes, 3)) if table is None else table.direct(batch.lights)
+    arrays = (
+        *(eye, ray.reshape(*ray.shape[:3], 9), lit, inverse, between.reshape(scenes, count + 1, count, 12), direct),
+        reach.reshape(-1, 6),
+    )
     # One memory layout for all batches: any other would be compiled anew, which takes half a minute.
-    return Scene(*(np.array(array, np.float32, order="C") for array in (*arrays, reach.reshape(-1, 6))))
+    *places, reach = (np.array(array, np.float32, order="C") for array in arrays)
+    outlines = _outlines(pack.extents[numbers], rotations, positions, batch, cameras, has_table=table is not None)
+    return Scene._make([*places, np.full((scenes, count), MOVES), *outlines, reach])
+
+
+def _outlines(
+    extents: Float[np.ndarray, "N 6"],
+    rotations: Float[np.ndarray, "B N 3 3"],
+    positions: Float[np.ndarray, "B N 3"],
+    batch: SceneBatch,
+    cameras: Sequence[Camera],
+    *,
+    has_table: bool,
+) -> list[np.ndarray]:
+    """Boxes and outlines of `Scene`: of objects, of shadows, of both with what is between."""
+    corners = _corners_world(extents, rotations, positions)
+    if not has_table:
+        box, outline = _on_screen(corners, cameras)
+        return [box, outline, np.zeros_like(box), np.zeros_like(outline), box, np.concatenate([outline] * 2, axis=3)]
+    dropped = _on_table(corners, batch.lights) if batch.spots is None else below_lamps(corners, batch.spots)
+    boxes, outlines = _on_screen(np.concatenate([corners, dropped], axis=1), cameras)
+    (box, shadow_box), (outline, shadow) = _halves(boxes), _halves(outlines)
+    swept_box, swept = _on_screen(np.concatenate([corners, dropped], axis=2), cameras)
+    return [box, outline, shadow_box, shadow, swept_box, swept]
 
 
 def _rules(quality: Quality) -> Rules:
@@ -205,9 +272,9 @@ def _corners_world(
 
 
 def _on_screen(
-    points: Float[np.ndarray, "B N 8 3"], cameras: Sequence[Camera]
-) -> tuple[Int[np.ndarray, "B V N 4"], Float32[np.ndarray, "B V N 8 2"]]:
-    """Boxes of pixels and outlines of boxes' corners, from every camera."""
+    points: Float[np.ndarray, "B N P 3"], cameras: Sequence[Camera]
+) -> tuple[Int[np.ndarray, "B V N 4"], Float32[np.ndarray, "B V N P 2"]]:
+    """Boxes of pixels and outlines of points, from every camera."""
     boxes, outlines = zip(*(screen_boxes(points, camera) for camera in cameras), strict=True)
     return np.stack(boxes, axis=1), np.stack(outlines, axis=1)
 
@@ -219,11 +286,11 @@ def _halves(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def screen_boxes(
-    points: Float[np.ndarray, "B N 8 3"], camera: Camera
-) -> tuple[Int[np.ndarray, "B N 4"], Float32[np.ndarray, "B N 8 2"]]:
-    """The pixels that hold the projections of boxes' corners: columns from, to, rows from, to (not included).
+    points: Float[np.ndarray, "B N P 3"], camera: Camera
+) -> tuple[Int[np.ndarray, "B N 4"], Float32[np.ndarray, "B N P 2"]]:
+    """The pixels that hold the projections of bodies' points: columns from, to, rows from, to (not included).
 
-    And the projections themselves [px]; `NO_OUTLINE` where a box reaches behind the camera.
+    And the projections themselves [px]; `NO_OUTLINE` where a body reaches behind the camera.
     """
     pose = camera.T_world_camera
     local = (points - pose.position) @ quaternion_to_matrix(pose.quaternion)

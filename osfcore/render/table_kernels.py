@@ -7,7 +7,7 @@ import numba
 import numpy as np
 
 from osfcore.render.lamp_kernels import light_on_table
-from osfcore.render.numba_options import FAR, HELPER, KERNEL, TINY
+from osfcore.render.numba_options import FAR, HELPER, TINY
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
@@ -111,24 +111,3 @@ def empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples):
             r, g, bl = table.background[0], table.background[1], table.background[2]
         red, green, blue = red + share * r, green + share * g, blue + share * bl
     return red, green, blue, reach / np.float32(max(hits, 1))
-
-
-@numba.njit(**KERNEL)
-def render_base(table, cameras, directs, lamps, samples, rgb, distance) -> None:
-    """The empty, unshaded table under L lights from V cameras.
-
-    Args:
-        table, cameras, samples: as in `empty_pixel`.
-        directs, lamps: L x 3, direct light on a white table; or L lamps instead.
-        rgb: result, L x V x h x w x 3.
-        distance: result, L x V x h x w [m]; 0 where there is no table.
-    """
-    lights, views, height, width = distance.shape
-    for job in numba.prange(lights * views * height):
-        row, view, b = job % height, (job // height) % views, job // (height * views)
-        for column in range(width):
-            red, green, blue, reach = empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples)
-            distance[b, view, row, column] = reach
-            rgb[b, view, row, column, 0] = red
-            rgb[b, view, row, column, 1] = green
-            rgb[b, view, row, column, 2] = blue

@@ -20,7 +20,8 @@ from osfcore.geometry.workspace import PUSHER_ALBEDO
 from osfcore.paper.fields.tiny_field import DIRECTION_INPUTS, MOST_WIDTH, POSITION_INPUTS
 from osfcore.paper.rendering.network_kernels import density_at, encode_direction, next_occupied, transfer_at
 from osfcore.paper.rendering.shadow_maps import light_reaches, pusher_distance
-from osfcore.render.table_kernels import FAR, HELPER, KERNEL, meet_table, pixel_ray, table_colour
+from osfcore.render.numba_options import FAR, HELPER, KERNEL
+from osfcore.render.table_kernels import meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)

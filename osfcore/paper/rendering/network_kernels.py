@@ -13,7 +13,7 @@ import numpy as np
 from osfcore.fields.kiloosf import MACRO_BITS
 from osfcore.fields.ray_marching import leave_blocks
 from osfcore.paper.fields.tiny_field import DIRECTION_INPUTS, DIRECTION_OCTAVES, POSITION_INPUTS, POSITION_OCTAVES
-from osfcore.render.table_kernels import HELPER
+from osfcore.render.numba_options import HELPER
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 

@@ -18,7 +18,7 @@ from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.paper.fields.tiny_field import MOST_WIDTH, POSITION_INPUTS
 from osfcore.paper.rendering.network_kernels import density_at, next_occupied
 from osfcore.paper.rendering.packing import PackedTiny
-from osfcore.render.table_kernels import HELPER, KERNEL, TINY
+from osfcore.render.numba_options import HELPER, KERNEL, TINY
 
 NOTHING = np.float32(-1e9)
 _DECIMALS = 2  # of a light's direction up to which objects share a map: 0.3 degrees

@@ -10,7 +10,6 @@ from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.kernels import render_batch
 from osfcore.render.launch import screen_boxes
 from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.table_kernels import render_base
 from osfcore.render.types import EXACT, OUTPUTS, PLANNING, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, state, view
 
@@ -74,6 +73,38 @@ def test_no_shadow_is_cut_off(azimuth_deg, elevation_deg):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
+@given(seed=st.integers(0, 10**6), near=st.booleans(), has_pusher=st.booleans())
+def test_a_scene_of_a_batch_looks_as_it_does_alone(seed, near, has_pusher):
+    """Whatever it has in common with others: objects, light, nothing; one that moves shades one that does not."""
+    rng = np.random.default_rng(seed)
+    scenes, names = 5, ("a", "b", "c")
+    fields = {"a": ball(), "b": block(), "c": block((0.05, 0.02, 0.1))}
+    poses = rng.uniform(-0.12, 0.12, (2, 3, 3)) + [0, 0, 0.13]  # each object in one of two places
+    turns = np.array([[quaternion_exp(rng.normal(size=3)) for _ in names] for _ in range(2)])
+    which = (rng.uniform(size=(scenes, 3)) < 0.3).astype(int)
+    lights = np.array([[0.5, 0.1, 0.86], [-0.8, 0.3, 0.52]])[(rng.uniform(size=scenes) < 0.2).astype(int)]
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    pusher = np.array([[0.1, -0.1, PUSHER_CENTRE_Z_M], [-0.1, 0.1, PUSHER_CENTRE_Z_M]])[which[:, 0]]
+    spots = tuple(SpotLamp(np.array([0.1, 0.2, 0.5 + 0.1 * n]), np.zeros(3), 30, 40) for n in which[:, 1])
+    batch = SceneBatch(
+        names, poses[which, np.arange(3)], turns[which, np.arange(3)], lights, pusher if has_pusher else None,
+        spots if near else None,
+    )  # fmt: skip
+    renderer = SceneRenderer(fields, plain_table())
+    cameras = [view((0.3, 0.2, 0.6), (0, 0, 0), 24, 60), view((-0.4, 0.1, 0.3), (0, 0, 0), 24, 60)]
+    only = rng.uniform(size=(2, 24, 24)) < 0.9
+    together = renderer.render(batch, cameras, quality=PLANNING, outputs=OUTPUTS, only=only)
+    for number in range(scenes):
+        row = slice(number, number + 1)
+        one = SceneBatch(
+            names, batch.positions[row], batch.quaternions[row], batch.lights[row],
+            None if batch.pusher is None else batch.pusher[row], None if batch.spots is None else batch.spots[row],
+        )  # fmt: skip
+        alone = renderer.render(one, cameras, quality=PLANNING, outputs=OUTPUTS, only=only)
+        for output in ("rgb", "opacity", "masks", "depth"):
+            np.testing.assert_array_equal(getattr(together, output)[row], getattr(alone, output))
+
+
 def test_no_batch_makes_the_compiler_work_again():
     """Every way of building a batch leads to arrays of one layout: compiling anew takes half a minute."""
     fields, spot = {"a": ball(), "b": block()}, SpotLamp(np.array([0, 0.1, 0.5]), np.zeros(3), 30, 40)
@@ -91,4 +122,4 @@ def test_no_batch_makes_the_compiler_work_again():
                             for cameras in ([view(size=16)], [view(size=16).resized(16, 20)] * 2):
                                 SceneRenderer(fields, table).render(batch, cameras, quality=quality, outputs=OUTPUTS)
                                 SceneRenderer(fields, table).render(batch, cameras, quality=quality)
-    assert len(render_batch.signatures) == len(render_base.signatures) == 2  # distant lights, near lamps
+    assert len(render_batch.signatures) == 2  # distant lights, near lamps
