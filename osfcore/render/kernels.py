@@ -165,10 +165,10 @@ def _trace(pack, table, fields, scene, lamps, cameras, b, view, u, v, near, rule
 
 
 @numba.njit(**HELPER)
-def _row_span(outlines, boxes, b, view, n, row):
+def _row_span(outlines, boxes, b, view, n, row, count):
     """The columns of a row of pixels, from and to, that the outline of object n may touch.
 
-    The outline is the convex hull of some points; between any two of them a line lies in it, and some are its edges.
+    The outline is the convex hull of `count` points; between any two of them a line lies in it, and some are its edges.
     """
     if not boxes[b, view, n, 2] <= row < boxes[b, view, n, 3]:
         return 0, 0
@@ -177,7 +177,7 @@ def _row_span(outlines, boxes, b, view, n, row):
         return first, last
     top, bottom = np.float32(row), np.float32(row + 1)
     low, high = FAR, -FAR
-    for i in range(outlines.shape[3]):
+    for i in range(count):
         x0, y0 = outlines[b, view, n, i, 0], outlines[b, view, n, i, 1]
         for j in range(i):
             x1, y1 = outlines[b, view, n, j, 0], outlines[b, view, n, j, 1]
@@ -209,11 +209,11 @@ def _row_spans(scene, b, view, row, count, width, spans):
             spans[n, c] = 0
         if scene.part[b, n] == GONE:
             continue
-        spans[n, 0], spans[n, 1] = _row_span(scene.outline, scene.box, b, view, n, row)
+        spans[n, 0], spans[n, 1] = _row_span(scene.outline, scene.box, b, view, n, row, 8)
         if scene.part[b, n] == MOVES:
-            spans[n, 2], spans[n, 3] = _row_span(scene.shadow, scene.shadow_box, b, view, n, row)
+            spans[n, 2], spans[n, 3] = _row_span(scene.shadow, scene.shadow_box, b, view, n, row, 8)
             if has_still:
-                spans[n, 4], spans[n, 5] = _row_span(scene.swept, scene.swept_box, b, view, n, row)
+                spans[n, 4], spans[n, 5] = _row_span(scene.swept, scene.swept_box, b, view, n, row, 16)
             for c in range(3):
                 if spans[n, 2 * c] < spans[n, 2 * c + 1]:
                     first, last = min(first, spans[n, 2 * c]), max(last, spans[n, 2 * c + 1])
