@@ -17,6 +17,7 @@ from osfcore.render.types import EXACT, OUTPUTS, PLANNING, Quality, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, random_scene, state, view, wooden_table
 
 ALBEDO = 0.5  # of the plain table
+ROUNDING = 1e-5  # of sums of single precision: near lamps and distant lights are compiled apart
 LAMP = SpotLamp(np.array([0.25, -0.15, 0.45]), np.array([0.02, 0.03, 0.0]), 25, 40)
 WIDE = SpotLamp(np.array([0.25, -0.15, 0.45]), np.zeros(3), 80, 90)
 
@@ -83,7 +84,7 @@ def test_a_lamp_200_m_away_is_the_distant_light(seed):
         strict=True,
     ):
         np.testing.assert_allclose(rendered.rgb, distant.rgb, atol=5e-3)
-        np.testing.assert_array_equal(rendered.opacity, distant.opacity)
+        np.testing.assert_allclose(rendered.opacity, distant.opacity, atol=ROUNDING)
 
 
 def test_nothing_but_the_light_changes():
@@ -91,7 +92,7 @@ def test_nothing_but_the_light_changes():
     fast = SceneRenderer(fields, wooden_table())
     near, distant = (fast.render(SceneBatch.of(scene, spot), [view()], outputs=OUTPUTS) for spot in (LAMP, None))
     for name in ("opacity", "masks", "depth"):
-        np.testing.assert_allclose(getattr(near, name), getattr(distant, name), atol=1e-6)
+        np.testing.assert_allclose(getattr(near, name), getattr(distant, name), atol=ROUNDING)
     assert np.abs(near.rgb - distant.rgb).max() > 0.05
 
 
