@@ -13,7 +13,7 @@ from osfcore.fields.dense_kernels import ANY, dense_layer, three_outputs
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, NETWORK_INPUTS
 from osfcore.fields.ray_marching import interpolate, inverted, leave_blocks, optical_density, within
 from osfcore.render.lamp_kernels import lamp_gain, toward_lamp
-from osfcore.render.numba_options import FAR, HELPER
+from osfcore.render.numba_options import FAR, GONE, HELPER
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _NEXT = np.uint64(1)
@@ -117,7 +117,7 @@ def light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, step_voxels, 
     """
     depth = _ZERO
     for m in range(len(fields)):
-        if m != n and scene.part[b, m] > 0 and depth < enough:  # 0: `kernels.GONE`
+        if m != n and scene.part[b, m] != GONE and depth < enough:
             a = fields[m]
             qx, qy, qz = _transform(scene.between, b, n, m, x, y, z)
             step = step_voxels * pack.scales[a, 3]

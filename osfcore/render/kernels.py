@@ -18,12 +18,11 @@ import numpy as np
 from osfcore.fields.kiloosf import MOST_HIDDEN, NETWORK_INPUTS
 from osfcore.fields.ray_marching import inverted
 from osfcore.render.field_kernels import clip_to_extent, light_transmittance, next_sample, radiance_at
-from osfcore.render.numba_options import FAR, HELPER, KERNEL, TINY
+from osfcore.render.numba_options import FAR, GONE, HELPER, KERNEL, MOVES, STILL, TINY
 from osfcore.render.table_kernels import empty_pixel, meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
-GONE, STILL, MOVES = 0, 1, 2  # an object that is not there, or that is in the base, or in the scene alone
 BAND_ROWS = 4  # rows of an image that one thread draws at a time
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _FAINT = np.float32(1e-3)  # of a pixel that shows anything less, the distance is not told

@@ -13,8 +13,9 @@ from osfcore.fields.ray_marching import ONE_AT_A_TIME
 from osfcore.fields.table_field import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import quaternion_to_matrix
-from osfcore.render.kernels import BAND_ROWS, GONE, MOVES, NO_OUTLINE, STILL, render_batch
+from osfcore.render.kernels import BAND_ROWS, NO_OUTLINE, render_batch
 from osfcore.render.lamps import Lamps, below_lamps, lamps_of, numbers_of_lamps, place_lamps
+from osfcore.render.numba_options import GONE, MOVES, STILL
 from osfcore.render.packing import Packed
 from osfcore.render.types import MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, poses_of
 
