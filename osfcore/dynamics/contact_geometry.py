@@ -21,11 +21,11 @@ from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHE
 OUTLINE = 64  # corners of an outline
 TOUCH_M = 0.008  # a substep's sweep is sampled at three points: nothing nearer than this is missed
 PAIR_REACH_M = 0.025  # objects closer than this may touch within a substep
-_PAIR_STRIDE = 2  # pairs are compared with every second corner
-_PUSHER_TOP_M = PUSHER_CENTRE_Z_M + PUSHER_HEIGHT_M / 2
-_CLEAR_M = 0.02  # parts this far above others are not met within a substep
-_FAR_M = 1.0  # distance that stands for never
-_SLACK_M = 0.006  # by how much the bound of the nearest parts may exceed that of others
+PAIR_STRIDE = 2  # pairs are compared with every second corner
+PUSHER_TOP_M = PUSHER_CENTRE_Z_M + PUSHER_HEIGHT_M / 2
+CLEAR_M = 0.02  # parts this far above others are not met within a substep
+FAR_M = 1.0  # distance that stands for never
+SLACK_M = 0.006  # by how much the bound of the nearest parts may exceed that of others
 
 
 class Solids(NamedTuple):
@@ -138,7 +138,7 @@ def pusher_contact(parts: Solids, shift: Float[Tensor, "A 2"]) -> PusherContact:
     """Each object's nearest part to a pusher that starts at the origin."""
     own = shift[parts.owner]
     halfway = _rim_gap(parts.outline, 0.5 * own)
-    halfway = halfway._replace(distance=torch.where(parts.low < _PUSHER_TOP_M, halfway.distance, _FAR_M))
+    halfway = halfway._replace(distance=torch.where(parts.low < PUSHER_TOP_M, halfway.distance, FAR_M))
     reached = halfway.distance - 0.5 * own.norm(dim=1) < TOUCH_M  # elsewhere neither end comes near
     before, after = (_gap_where(reached, parts.outline, share * own, halfway) for share in (0.0, 1.0))
     nearest = [_nearest(parts.owner, gap.distance, len(shift)) for gap in (before, halfway, after)]
@@ -170,7 +170,7 @@ def pair_contact(
         first: object of each pair.
         second: the other one.
     """
-    gap = gap_between(*(outline[place, ::_PAIR_STRIDE] for place in (first, second)))
+    gap = gap_between(*(outline[place, ::PAIR_STRIDE] for place in (first, second)))
     a, b = parts.first[first], parts.first[second]
     many = ((parts.many[first] * parts.many[second] > 1) & (gap.distance < PAIR_REACH_M)).nonzero()[:, 0]
     if len(many):
@@ -190,16 +190,16 @@ def _nearest_parts(parts: Solids, first: Int[Tensor, "E"], second: Int[Tensor, "
     b = parts.first[second][pair] + local % width[pair]
     bound = _separation_bound(parts, a, b)
     least = bound.new_full((len(first),), torch.inf).scatter_reduce(0, pair, bound, "amin")
-    close = (bound <= least[pair] + _SLACK_M).nonzero()[:, 0]
+    close = (bound <= least[pair] + SLACK_M).nonzero()[:, 0]
     a, b, pair = a[close], b[close], pair[close]
-    gap = gap_between(*(parts.outline[place, ::_PAIR_STRIDE] for place in (a, b)))
-    gap = gap._replace(distance=torch.where(bound[close] < _FAR_M, gap.distance, _FAR_M))
+    gap = gap_between(*(parts.outline[place, ::PAIR_STRIDE] for place in (a, b)))
+    gap = gap._replace(distance=torch.where(bound[close] < FAR_M, gap.distance, FAR_M))
     best = _nearest(pair, gap.distance, len(first))
     return a[best], b[best], _rows(gap, best)
 
 
 def _separation_bound(parts: Solids, a: Int[Tensor, "R"], b: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-    """Largest separation of two parts along the directions of outlines; `_FAR_M` where one is well above the other [m].
+    """Largest separation of two parts along the directions of outlines; `FAR_M` where one is well above the other [m].
 
     It is a few millimetres less than their distance at most, and tells which of many pairs are worth comparing exactly:
     two hollow objects side by side have hundreds.
@@ -207,8 +207,8 @@ def _separation_bound(parts: Solids, a: Int[Tensor, "R"], b: Int[Tensor, "R"]) -
     count = parts.outline.shape[1]
     reach = dot(parts.outline, circle(count, parts.outline.device))
     bound = -(reach[a] + reach.roll(count // 2, dims=1)[b]).amin(dim=1)
-    apart = torch.maximum(parts.low[a] - parts.high[b], parts.low[b] - parts.high[a]) > _CLEAR_M
-    return torch.where(apart, _FAR_M, bound)
+    apart = torch.maximum(parts.low[a] - parts.high[b], parts.low[b] - parts.high[a]) > CLEAR_M
+    return torch.where(apart, FAR_M, bound)
 
 
 def _nearest(owner: Int[Tensor, "R"], distance: Float[Tensor, "R"], count: int) -> Int[Tensor, "A"]:

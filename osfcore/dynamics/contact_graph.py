@@ -36,7 +36,7 @@ from osfcore.geometry.polygons import Gap, dot
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 
 TRAVEL_M = MAX_SPEED_M_S * STEP_S  # of the pusher in one step, per axis
-_LOOKUP_M = 0.005  # error of an extent looked up in a single direction
+LOOKUP_M = 0.005  # error of an extent looked up in a single direction
 
 
 class Graph(NamedTuple):
@@ -130,7 +130,7 @@ def _near_pusher(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, 
     shift = sweep.shift[:, None]
     along = (-dot(away, shift) / (dot(shift, shift) + 1e-12)).clamp(0, 1)
     away = away + along[..., None] * shift
-    distance = away.norm(dim=-1) - PUSHER_RADIUS_M - TOUCH_M - _LOOKUP_M
+    distance = away.norm(dim=-1) - PUSHER_RADIUS_M - TOUCH_M - LOOKUP_M
     near = distance < table.radius[number]
     rows = near.nonzero().unbind(1)
     reach = _extent(table, number, motion, rows, away[rows])
@@ -142,7 +142,7 @@ def _candidate_pairs(table: ShapeTable, number: Int[Tensor, "B N"], motion: Moti
     radius = table.radius[number]
     couples = adjacency(motion.centre, table.half_extent[number])
     away = motion.centre[:, None, :, :2] - motion.centre[:, :, None, :2]
-    distance = away.norm(dim=-1) - PAIR_REACH_M - 2 * _LOOKUP_M
+    distance = away.norm(dim=-1) - PAIR_REACH_M - 2 * LOOKUP_M
     couples &= distance < radius[:, :, None] + radius[:, None]
     scene, i, j = couples.triu().nonzero().unbind(1)
     line = away[scene, i, j]

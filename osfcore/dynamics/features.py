@@ -22,17 +22,17 @@ from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import Gap, dot
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 
-_AROUND = 16  # horizontal directions in which an object's extent is told
-_SLANTED = 8  # directions 45 deg below and above the horizon
-_FOOT = 8  # directions close to straight down, in which lies what an object stands on
-_FOOT_ANGLE = math.radians(12)  # off the vertical
+AROUND = 16  # horizontal directions in which an object's extent is told
+SLANTED = 8  # directions 45 deg below and above the horizon
+FOOT = 8  # directions close to straight down, in which lies what an object stands on
+FOOT_ANGLE = math.radians(12)  # off the vertical
 LENGTH_M = 0.05  # that becomes 1
 SHIFT_M = 0.01  # displacement that becomes 1
 TURN_RAD = 0.1  # rotation that becomes 1
-_MAGNIFIED = 5  # heights over the table: millimetres matter there
-_GAP_M = 0.004  # near contact, gaps count in these
-_CLOSE_M = 0.01  # an object this close gives the direction, rather than the motion
-NODE_FEATURES = _AROUND + 2 * _SLANTED + 2 + 1 + 3 + 3 + 2 + 3 + 3 * _FOOT + 1
+MAGNIFIED = 5  # heights over the table: millimetres matter there
+GAP_M = 0.004  # near contact, gaps count in these
+CLOSE_M = 0.01  # an object this close gives the direction, rather than the motion
+NODE_FEATURES = AROUND + 2 * SLANTED + 2 + 1 + 3 + 3 + 2 + 3 + 3 * FOOT + 1
 EDGE_FEATURES = 35
 
 
@@ -80,7 +80,7 @@ def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
     closest = speed.new_full((len(speed),), 1.0).scatter_reduce(0, graph.receiver, graph.pair.gap.distance, "amin")
     is_closest = graph.pair.gap.distance <= closest[graph.receiver]
     neighbour = moving.index_put((graph.receiver[is_closest],), -graph.pair.gap.normal[is_closest])
-    by_neighbour = (closest < _CLOSE_M)[:, None] | ((closest < 1.0)[:, None] & (speed <= 1e-6))
+    by_neighbour = (closest < CLOSE_M)[:, None] | ((closest < 1.0)[:, None] & (speed <= 1e-6))
     direction = torch.where(by_neighbour, neighbour, moving)
     return torch.where(graph.touched[:, None], -graph.pusher.after.normal, direction)
 
@@ -98,26 +98,26 @@ def _quasistatic_sliding(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -
 
 def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, quasistatic: Tensor) -> Float[Tensor, "A F"]:
     """Extents in 34 directions, height over the table, motion, the pusher's motion, how it would slide, its foot."""
-    slanted = functional.pad(_fan_of(_SLANTED, turn), (0, 1))
+    slanted = functional.pad(_fan_of(SLANTED, turn), (0, 1))
     vertical = slanted.new_tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     half = math.sqrt(0.5)
-    flat = functional.pad(_fan_of(_AROUND, turn), (0, 1))
+    flat = functional.pad(_fan_of(AROUND, turn), (0, 1))
     directions = torch.cat([flat, half * (slanted + vertical[0]), half * (slanted + vertical[1]), vertical])
     extents = table.extents(graph.number, turn @ graph.rotation, directions)
     height = graph.centre[:, 2:] - extents[:, -2:-1]
     motion = torch.stack([graph.linear, graph.angular, functional.pad(graph.shift, (0, 1))], dim=2)
     linear, angular, shift = (turn @ motion).unbind(2)
-    lengths = torch.cat([extents, _MAGNIFIED * height], dim=1) / LENGTH_M
+    lengths = torch.cat([extents, MAGNIFIED * height], dim=1) / LENGTH_M
     motions = [linear / SHIFT_M, angular / TURN_RAD, shift[:, :2] / SHIFT_M]
     return torch.cat([lengths, *motions, quasistatic, _foot(table, graph, turn)], dim=1)
 
 
 def _foot(table: ShapeTable, graph: Graph, turn: Tensor) -> Float[Tensor, "A 25"]:
     """What an object stands on, for friction acts there: its lowest points all around, and their mean distance."""
-    fan = math.sin(_FOOT_ANGLE) * _fan_of(_FOOT, turn)
-    downward = functional.pad(fan, (0, 1), value=-math.cos(_FOOT_ANGLE))
+    fan = math.sin(FOOT_ANGLE) * _fan_of(FOOT, turn)
+    downward = functional.pad(fan, (0, 1), value=-math.cos(FOOT_ANGLE))
     points = table.farthest(graph.number, turn @ graph.rotation, downward)
-    height = _MAGNIFIED * (points[..., 2] + graph.centre[:, None, 2])
+    height = MAGNIFIED * (points[..., 2] + graph.centre[:, None, 2])
     distance = points[..., :2].norm(dim=2).mean(dim=1, keepdim=True)
     return torch.cat([points[..., 0], points[..., 1], height, distance], dim=1) / LENGTH_M
 
@@ -184,7 +184,7 @@ def _edge(
     gap = torch.stack(gaps, dim=1)
     solid = turn @ torch.stack([away / LENGTH_M, motion[0] / SHIFT_M, motion[1] / TURN_RAD], dim=2)
     flat = turn[:, :2, :2] @ torch.stack([*(p / LENGTH_M for p in points), *directions], dim=2)
-    near = (gap / _GAP_M).clamp(-4, 4)
+    near = (gap / GAP_M).clamp(-4, 4)
     kind = torch.full_like(gap[:, :1], is_pusher)
     parts = [
         kind,
@@ -228,11 +228,11 @@ _SCALAR, _PLANE = ([0], [1.0]), ([0, 1], [1.0, -1])
 _POLAR, _AXIAL = ([0, 1, 2], [1.0, -1, 1]), ([0, 1, 2], [-1.0, 1, -1])
 _SLIDE = ([0, 1, 2], [1.0, -1, -1])
 _ENDS = ([2, 3, 0, 1], [1.0, -1, 1, -1])
-_FEET = _fan(_FOOT)
-_ACROSS = (_FEET[0], [-1.0] * _FOOT)
+_FEET = _fan(FOOT)
+_ACROSS = (_FEET[0], [-1.0] * FOOT)
 _MIRRORS = {
     "node": _mirror(
-        *(_fan(_AROUND), _fan(_SLANTED), _fan(_SLANTED), *[_SCALAR] * 3, _POLAR, _AXIAL, _PLANE, _SLIDE),
+        *(_fan(AROUND), _fan(SLANTED), _fan(SLANTED), *[_SCALAR] * 3, _POLAR, _AXIAL, _PLANE, _SLIDE),
         *(_FEET, _ACROSS, _FEET, _SCALAR),
     ),
     "edge": _mirror(*[_SCALAR] * 5, _SLIDE, _POLAR, _POLAR, _AXIAL, _PLANE, _PLANE, _ENDS, _ENDS, *[_PLANE] * 3),

@@ -20,12 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 FRICTION = 0.25  # between pusher and object, as in the simulator
-_ARM_RATIO = 1.2  # c over the mean radius of the outline: objects stand on their corners
+ARM_RATIO = 1.2  # c over the mean radius of the outline: objects stand on their corners
 
 
 def friction_arm(outline: Float[Tensor, "*batch K 2"]) -> Float[Tensor, "*batch"]:
     """c: moment over force that friction with the table can hold, from outlines around their centres of mass [m]."""
-    return _ARM_RATIO * outline.norm(dim=-1).mean(dim=-1)
+    return ARM_RATIO * outline.norm(dim=-1).mean(dim=-1)
 
 
 def push_motion(

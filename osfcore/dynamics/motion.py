@@ -16,7 +16,7 @@ from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import circle
 
 _MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
-_ASIDE = 0.035  # about a cell of the map of directions [rad]
+ASIDE = 0.035  # about a cell of the map of directions [rad]
 
 
 class Motion(NamedTuple):
@@ -65,7 +65,7 @@ def lowest_point(
         centre: of mass, in the world [m].
         quaternion: orientations in the world, unit.
     """
-    around = functional.pad(_ASIDE * circle(8, centre.device), (0, 1), value=-1.0)
+    around = functional.pad(ASIDE * circle(8, centre.device), (0, 1), value=-1.0)
     down = torch.cat([centre.new_tensor([[0.0, 0.0, -1.0]]), around])
     return centre[:, 2] + table.farthest(number, rotations.matrix(quaternion), down)[..., 2].amin(dim=1)
 

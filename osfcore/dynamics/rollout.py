@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from osfcore.dynamics.kernels.network_kernels import Weights, packed_weights
+from osfcore.dynamics.kernels.rollout_kernels import BLOCK, unroll_block
+from osfcore.dynamics.kernels.shape_kernels import Shapes, packed_shapes
 from osfcore.dynamics.motion import Motion, going_on, lowest_point
 from osfcore.dynamics.propagation_network import PropagationNetwork
 from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
@@ -26,6 +31,9 @@ _CHUNK = 4096  # sequences rolled out at once: more would not be faster
 
 class PushModel:
     """The dynamics model: a trained network with the shapes of its objects.
+
+    On CPUs rollouts are compiled (`kernels`), unless the width of the network is no multiple of four; they are those of
+    torch but for rounding.
 
     Args:
         network: predicts the motion of one substep.
@@ -45,6 +53,9 @@ class PushModel:
         self._network = network.to(self.device).eval()
         self._names = tuple(sorted(shapes))
         self._table = ShapeTable(tuple(shapes[name] for name in self._names), self.device)
+        self._packed = None
+        if self.device.type == "cpu" and network.hidden % 4 == 0:
+            self._packed = packed_shapes(self._table), packed_weights(self._network)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,6 +142,8 @@ class PushModel:
         self, number: Tensor, start: Motion, actions: np.ndarray, begins: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres of mass, orientations and whether anything moved since the start, after each action."""
+        if self._packed is not None:
+            return _unroll_compiled(*self._packed, number[0], start, actions, begins)
         centres, turned, moved = [], [], []
         has_moved = torch.zeros(len(actions), number.shape[1], dtype=torch.bool, device=self.device)
         count = len(actions)
@@ -172,3 +185,25 @@ class PushModel:
         path = path[:, ::SUBSTEPS]
         height = np.full((*path.shape[:2], 1), state.pusher[2])
         return Rollouts(state.names, positions, quaternions, np.concatenate([path, height], axis=-1))
+
+
+def _unroll_compiled(
+    shapes: Shapes,
+    weights: Weights,
+    number: Int[Tensor, "N"],
+    start: Motion,
+    actions: Float[np.ndarray, "K T 3"],
+    begins: Float[np.ndarray, "K 2"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `PushModel._unroll` returns, without torch: six times as fast on two cores."""
+    begins, velocity = begins.astype(np.float32), np.ascontiguousarray(actions[..., :2], np.float32)
+    shifts = np.diff(pusher_path(begins, velocity.astype(float)), axis=1).astype(np.float32)
+    scene = (start.centre, start.quaternion, start.linear, start.angular, start.floor)
+    many = (*velocity.shape[:2], len(number))
+    results = np.empty((*many, 3), np.float32), np.empty((*many, 4), np.float32), np.empty(many, bool)
+    first = tuple(np.ascontiguousarray(part[0].numpy(), np.float32) for part in scene)
+    given = shapes, weights, number.numpy(), first, begins, velocity, shifts
+    blocks = range(0, len(begins), BLOCK)
+    with ThreadPoolExecutor(min(numba.get_num_threads(), len(blocks))) as threads:
+        list(threads.map(lambda k: unroll_block(*given, k, *results), blocks))
+    return results
