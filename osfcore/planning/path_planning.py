@@ -7,6 +7,8 @@ in contact is possible and, where no path is free, the one with the fewest such 
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import cv2
@@ -122,36 +124,46 @@ def actions_along(
         horizon: number of actions.
         speeds: share of the highest speed on each leg, above 0; all 1 by default.
     """
-    times = np.concatenate([[0.0], np.cumsum(_legs_s(path, speeds))]) / STEP_S
-    moments = np.zeros(horizon + 1)
-    for k in range(horizon):
-        moments[k + 1] = _next_moment(path, times, moments[k])
-    velocity = np.diff(_places(path, times, moments), axis=0) / STEP_S
-    return np.pad(velocity, ((0, 0), (0, 1)))
+    corners = path.tolist()  # numbers one by one: arrays of so few would take ten times as long
+    times = [0.0, *(float(end) / STEP_S for end in np.cumsum(_legs_s(path, speeds)))]
+    now, places = 0.0, [corners[0]]
+    for _ in range(horizon):
+        now = _next_moment(corners, times, now, places[-1])
+        places.append(_place_at(corners, times, now))
+    return np.pad(np.diff(np.array(places), axis=0) / STEP_S, ((0, 0), (0, 1)))
 
 
-def _next_moment(path: Float[np.ndarray, "n 2"], times: Float[np.ndarray, "n"], now: float) -> float:
+def _next_moment(corners: list[list[float]], times: list[float], now: float, here: list[float]) -> float:
     """When the action that begins now ends [actions of the path's time]: after a whole one, or at a corner."""
     end = now + 1
-    first, last = int(np.searchsorted(times, now, side="right")), int(np.searchsorted(times, end))
-    if last == first:
-        return end
-    here = _places(path, times, np.array([now]))[0]
+    first, last = bisect_right(times, now), bisect_left(times, end)
     while last > first:
-        way = _places(path, times, np.array([end]))[0] - here
-        to_corners = path[first:last] - here
-        share = (to_corners @ way / max(float(way @ way), 1e-12)).clip(0, 1)
-        if np.linalg.norm(to_corners - share[:, None] * way, axis=1).max() <= _CUT_M:
+        there = _place_at(corners, times, end)
+        if all(_distance_to_line(corner, here, there) <= _CUT_M for corner in corners[first:last]):
             break
         last -= 1
-        end = float(times[last])
+        end = times[last]
     return end
 
 
-def _places(
-    path: Float[np.ndarray, "n 2"], times: Float[np.ndarray, "n"], moments: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "m 2"]:
-    return np.stack([np.interp(moments, times, path[:, axis]) for axis in range(2)], axis=1)
+def _place_at(corners: list[list[float]], times: list[float], moment: float) -> list[float]:
+    """Where the path is at a moment; at its last corner after its end."""
+    after = bisect_right(times, moment)
+    if after == len(times):
+        return corners[-1]
+    begin, end, share = (
+        corners[after - 1],
+        corners[after],
+        (moment - times[after - 1]) / (times[after] - times[after - 1]),
+    )
+    return [a + share * (b - a) for a, b in zip(begin, end, strict=True)]
+
+
+def _distance_to_line(point: list[float], begin: list[float], end: list[float]) -> float:
+    """Distance of a point from a line segment [m]."""
+    x, y, u, v = end[0] - begin[0], end[1] - begin[1], point[0] - begin[0], point[1] - begin[1]
+    share = min(max((u * x + v * y) / max(x * x + y * y, 1e-12), 0.0), 1.0)
+    return math.hypot(u - share * x, v - share * y)
 
 
 def duration_s(path: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:

@@ -25,7 +25,7 @@ from osfcore.planning.pose_cost import PoseGoal
 from osfcore.planning.push_order import Outlines, OutlinesAt, Stage, push_orders
 from osfcore.planning.push_outcomes import PushPredictor, push_outcomes
 from osfcore.planning.push_primitives import outline_points, straight_pushes
-from osfcore.planning.push_sequences import ObjectPushes
+from osfcore.planning.push_sequences import DrawnPushes, ObjectPushes
 
 _REACHED_M, _REACHED_RAD = 0.004, 0.045  # an object this close to its goal is not pushed on purpose
 _SPEEDS = (0.5, 1.0)  # of the highest
@@ -160,7 +160,7 @@ class _PushSequences:
     def _ways(self, leg: _Leg, stage: Stage, count: int) -> list[Float[np.ndarray, "C 2"]]:
         """Pushes of a stage that begin where the pusher has room."""
         offset = (stage.target.position - leg.here.position)[:2]
-        ways = [leg.pool[k] for k in self._rng.permutation(len(leg.pool))[: count - round(_STRAIGHT * count)]]
+        ways = leg.pool.sample(count - round(_STRAIGHT * count), self._rng)
         straight = 0 if ways and leg.rolls else count - len(ways)
         if straight and np.linalg.norm(offset) > _REACHED_M:
             sides = outline_points(self._outlines(stage.number, leg.here))
@@ -189,7 +189,7 @@ class _Leg:
     begin: Float[np.ndarray, "2"]
     paths: ShortestPaths
     around: tuple[ObjectPushes, Pose] | None
-    pool: list[Float[np.ndarray, "C 2"]]
+    pool: DrawnPushes
     rolls: bool
 
     def walk(self, at: Float[np.ndarray, "2"], start: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2"]]:

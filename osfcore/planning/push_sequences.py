@@ -13,8 +13,10 @@ with probability proportional to exp(-s / temperature).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from itertools import islice
+from functools import cache
+from itertools import chain, islice
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -80,8 +82,8 @@ class ObjectPushes:
         pusher: Float[np.ndarray, "2"],
         count: int,
         rng: np.random.Generator,
-    ) -> list[Float[np.ndarray, "C 2"]]:
-        """Corners of the pusher's path, from the start of the first push to the end of the last [m].
+    ) -> DrawnPushes:
+        """Sequences of up to three pushes that bring the object nearer.
 
         Args:
             pose: of the object, on the side that the table was made for.
@@ -89,7 +91,7 @@ class ObjectPushes:
             later: pushes on the side that the goal shows: these ones, or others if that is another side.
             space: where first pushes may begin.
             pusher: where it comes from [m].
-            count: of sequences at most; none where no push that has room brings the object nearer.
+            count: of sequences at most; fewer or none where no push that has room brings the object nearer.
             rng: draws them.
         """
         yaw, centre = self.yaw(pose) or 0.0, pose.apply(self._centre)[:2]
@@ -98,7 +100,7 @@ class ObjectPushes:
         has_room = space.is_free(self._outcomes.starts @ turn.T + centre)
         possible = np.flatnonzero(is_within & np.repeat(has_room, len(self._outcomes.lengths)))
         if not len(possible):
-            return []
+            return DrawnPushes(0, 0, lambda _: np.zeros((0, 2)))
         first = self._first_pushes(possible, yaw, goal, later)
         shift = turn.T @ (goal.apply(self._centre)[:2] - centre)
         rows, left = _sequences(first, np.array([*shift, (later.yaw(goal) or 0.0) - yaw]), later, rng)
@@ -109,9 +111,8 @@ class ObjectPushes:
         if np.any(stays & (left < _MUCH_NEARER * before)):
             better = better[stays[better]]
         drawn = (left + _PATH_PRICE * path)[better] / _TEMPERATURE_M - rng.gumbel(size=len(better))
-        paths = (self._corners(row, first, later) @ turn.T + centre for row in rows[better[np.argsort(drawn)]])
-        within = (path for path in paths if np.abs(path).max() <= PUSHER_REACH_M)
-        return list(islice(within, count))
+        kept = rows[better[np.argsort(drawn)]]
+        return DrawnPushes(len(kept), count, lambda k: self._corners(kept[k], first, later) @ turn.T + centre)
 
     def _first_pushes(self, rows: Int[np.ndarray, "M"], yaw: float, goal: Pose, later: ObjectPushes) -> _FirstPushes:
         """What some pushes of the table do to an object that is turned by `yaw`, in the terms of later ones."""
@@ -170,6 +171,32 @@ class ObjectPushes:
         own, aim = turn.T @ (at - centre), turn.T @ (toward - centre)
         exit_ = loop[np.linalg.norm(loop - aim, axis=1).argmin()]
         return np.vstack([around_loop(loop, own, exit_), exit_]) @ turn.T + centre
+
+
+class DrawnPushes:
+    """Push sequences that were drawn, the best first. Paths are computed when they are asked for: few of them are.
+
+    Args:
+        known: how many sequences there are.
+        wanted: how many of them may be used; those that lead out of the pusher's reach do not count.
+        path: corners of the pusher's path of one of them, from the start of the first push to the end of the last [m].
+    """
+
+    def __init__(self, known: int, wanted: int, path: Callable[[int], Float[np.ndarray, "C 2"]]) -> None:
+        self._known, self._wanted, self._path = known, wanted, cache(path)
+
+    def __iter__(self) -> Iterator[Float[np.ndarray, "C 2"]]:
+        """Paths within the pusher's reach."""
+        return islice(self._within(range(self._known)), self._wanted)
+
+    def sample(self, count: int, rng: np.random.Generator) -> list[Float[np.ndarray, "C 2"]]:
+        """So many of them at most, in random order."""
+        best = min(self._wanted, self._known)
+        order = chain(rng.permutation(best).tolist(), range(best, self._known))
+        return list(islice(self._within(order), count))
+
+    def _within(self, order: Iterable[int]) -> Iterator[Float[np.ndarray, "C 2"]]:
+        return (path for path in map(self._path, order) if np.abs(path).max() <= PUSHER_REACH_M)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

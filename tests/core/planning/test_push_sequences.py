@@ -49,7 +49,7 @@ def turned(pose: Pose, yaw: float, shift=(0.0, 0.0)) -> Pose:
 def test_an_object_that_is_only_turned_is_turned_back(shapes, pushes, model):
     state = scene(shapes, {BOX: (0.0, 0.0)}, pusher=tuple(PUSHER))
     goal = turned(state.pose(BOX), 0.6)
-    ways = pushes.draw(state.pose(BOX), goal, pushes, FreeSpace([]), PUSHER, 30, np.random.default_rng(0))
+    ways = list(pushes.draw(state.pose(BOX), goal, pushes, FreeSpace([]), PUSHER, 30, np.random.default_rng(0)))
     actions = np.array([actions_along(np.vstack([PUSHER, way]), 30) for way in ways])
     futures = model.rollout(state, actions)
     turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
@@ -60,7 +60,7 @@ def test_an_object_that_is_only_turned_is_turned_back(shapes, pushes, model):
 def test_ways_stay_within_the_reach_of_the_pusher(shapes, pushes):
     pose = turned(scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX), 0.0, (0.27, 0.27))
     goal = turned(pose, 0.5, (0.0, -0.1))
-    ways = pushes.draw(pose, goal, pushes, FreeSpace([]), PUSHER, 60, np.random.default_rng(0))
+    ways = list(pushes.draw(pose, goal, pushes, FreeSpace([]), PUSHER, 60, np.random.default_rng(0)))
     assert len(ways) > 20
     assert max(np.abs(way).max() for way in ways) <= PUSHER_REACH_M
 
@@ -69,7 +69,7 @@ def test_ways_stay_within_the_reach_of_the_pusher(shapes, pushes):
 def test_pushes_turn_with_the_scene(shapes, pushes, yaw):
     pose = scene(shapes, {BOX: (0.0, 0.0)}, pusher=PUSHER).pose(BOX)
     goal = turned(pose, 0.4, (0.05, 0.02))
-    plain = pushes.draw(pose, goal, pushes, FreeSpace([]), PUSHER, 5, np.random.default_rng(0))
+    plain = list(pushes.draw(pose, goal, pushes, FreeSpace([]), PUSHER, 5, np.random.default_rng(0)))
     spin = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     around = quaternion_exp(np.array([0.0, 0.0, yaw]))
     places = (np.array([*spin @ one.position[:2], one.position[2]]) for one in (pose, goal))
@@ -77,7 +77,7 @@ def test_pushes_turn_with_the_scene(shapes, pushes, yaw):
         Pose(place, quaternion_multiply(around, one.quaternion))
         for place, one in zip(places, (pose, goal), strict=True)
     ]
-    other = pushes.draw(*both, pushes, FreeSpace([]), spin @ PUSHER, 5, np.random.default_rng(0))
+    other = list(pushes.draw(*both, pushes, FreeSpace([]), spin @ PUSHER, 5, np.random.default_rng(0)))
     for a, b in zip(plain, other, strict=True):
         np.testing.assert_allclose(a @ spin.T, b, atol=1e-9)
 
@@ -97,7 +97,7 @@ def test_a_can_that_has_rolled_is_rolled_on_to_its_goal(shapes, model):
     there = replace(state, poses=Pose.stacked([goal]))
     own, later = sequences(shapes, model, state), sequences(shapes, model, there)
     assert own.yaw(goal) is None
-    ways = own.draw(here, goal, later, FreeSpace([]), PUSHER, 40, np.random.default_rng(0))
+    ways = list(own.draw(here, goal, later, FreeSpace([]), PUSHER, 40, np.random.default_rng(0)))
     futures = model.rollout(state, np.array([actions_along(np.vstack([PUSHER, way]), 60) for way in ways]))
     turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
     shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - goal.position[:2], axis=1)
@@ -115,7 +115,7 @@ def test_a_can_on_its_side_is_slid_across_its_axis_rather_than_rolled(shapes, mo
     lying = scene(shapes, {CAN: (0.0, 0.0, (np.pi / 2, 0.0, 0.0))}, pusher=PUSHER)
     goal = turned(lying.pose(CAN), 0.0, (0.12, 0.0))
     own = sequences(shapes, model, lying)
-    ways = own.draw(lying.pose(CAN), goal, own, FreeSpace([]), PUSHER, 40, np.random.default_rng(0))
+    ways = list(own.draw(lying.pose(CAN), goal, own, FreeSpace([]), PUSHER, 40, np.random.default_rng(0)))
     futures = model.rollout(lying, np.array([actions_along(np.vstack([PUSHER, way]), 50) for way in ways]))
     turn = rotation_angle(futures.quaternions[:, -1, 0], np.broadcast_to(goal.quaternion, (len(ways), 4)))
     shift = np.linalg.norm(futures.positions[:, -1, 0, :2] - goal.position[:2], axis=1)
