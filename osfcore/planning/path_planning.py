@@ -130,7 +130,7 @@ def actions_along(
     for _ in range(horizon):
         now = _next_moment(corners, times, now, places[-1])
         places.append(_place_at(corners, times, now))
-    return np.pad(np.diff(np.array(places), axis=0) / STEP_S, ((0, 0), (0, 1)))
+    return np.pad(np.diff(np.asarray(places, np.float64), axis=0) / STEP_S, ((0, 0), (0, 1)))
 
 
 def _next_moment(corners: list[list[float]], times: list[float], now: float, here: list[float]) -> float:
