@@ -18,7 +18,7 @@ from osfcore.dynamics.motion import ASIDE
 from osfcore.dynamics.pusher_path import SUBSTEPS
 from osfcore.dynamics.recorded_states import SLEEP_M, SLEEP_RAD
 
-BLOCK = 40
+BLOCK = 40  # scenes whose objects go through the network together
 _ANGLES = 2 * np.pi / 8 * np.arange(8)
 _DOWN_X, _DOWN_Y = (np.float32(ASIDE) * np.append(f(_ANGLES), 0).astype(np.float32) for f in (np.cos, np.sin))
 _SHIFT, _TURN = np.float32(SHIFT_M), np.float32(TURN_RAD)
