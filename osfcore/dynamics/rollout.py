@@ -195,7 +195,7 @@ def _unroll_compiled(
     actions: Float[np.ndarray, "K T 3"],
     begins: Float[np.ndarray, "K 2"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `PushModel._unroll` returns, without torch: six times as fast on two cores."""
+    """What `PushModel._unroll` returns, without torch; what that gains: BENCHMARKS.md."""
     begins, velocity = begins.astype(np.float32), np.ascontiguousarray(actions[..., :2], np.float32)
     shifts = np.diff(pusher_path(begins, velocity.astype(float)), axis=1).astype(np.float32)
     scene = (start.centre, start.quaternion, start.linear, start.angular, start.floor)

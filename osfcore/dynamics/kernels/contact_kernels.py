@@ -22,7 +22,7 @@ from osfcore.dynamics.kernels.shape_kernels import (
 )
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 
-_TRAVEL, _LOOKUP, _TOUCH, _RIM = (np.float32(x) for x in (TRAVEL_M, LOOKUP_M, TOUCH_M, PUSHER_RADIUS_M))
+_TRAVEL, _TOUCH, _RIM = (np.float32(x) for x in (TRAVEL_M, TOUCH_M, PUSHER_RADIUS_M))
 _REACH, _TOP, _FAR = (np.float32(x) for x in (PAIR_REACH_M, PUSHER_TOP_M, FAR_M))
 _CLEAR, _SLACK = np.float32(CLEAR_M), np.float32(SLACK_M)
 _NEAR = np.float32(PUSHER_RADIUS_M + TOUCH_M + LOOKUP_M)

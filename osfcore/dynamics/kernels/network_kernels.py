@@ -2,7 +2,8 @@
 
 Indices are unsigned: signed ones may count from the end in numba, which is decided at each access, so that numbers are
 gathered one by one instead of loaded sixteen at once. Products take four rows and four inputs at a time, so that
-weights are loaded and outputs stored less often: as fast as OpenBLAS with 40 rows, twice as fast with six.
+weights are loaded and outputs stored less often. That is as fast as OpenBLAS, whose threads would get in each
+other's way here.
 """
 # ruff: noqa: ANN001, ANN201, ANN202 - compiled helpers; types are given by their callers
 
@@ -20,7 +21,7 @@ from osfcore.dynamics.propagation_network import MOTION, PropagationNetwork
 
 NODE_WIDTH, EDGE_WIDTH, MOTION_WIDTH = (np.int64(-(-n // 4) * 4) for n in (NODE_FEATURES, EDGE_FEATURES, MOTION))
 _u = np.uint64
-_U0, _U1, _U2, _U3, _U4 = (np.uint64(n) for n in range(5))
+_U1, _U2, _U3, _U4 = (np.uint64(n) for n in range(1, 5))
 _LOG2_E, _LARGEST = np.float32(np.log2(np.e)), np.float32(126)
 _C1, _C2, _C3, _C4, _C5, _C6 = (  # of 2^f for 0 <= f <= 1: least squares, relative error 2e-9
     np.float32(c) for c in (0.693147042, 0.240229325, 0.0554852202, 0.00967553263, 0.00124673764, 0.000216138082)
