@@ -40,14 +40,14 @@ class LatestComparison {
       this.next = null;
       try {
         const answer = await fetch(url);
-        if (!isOn) continue;
-        if (!answer.ok) {
-          this.show({ problem: answer.status === 404 ? "" : await problemOf(answer) }); // 404: deleted meanwhile
-          continue;
+        const found = answer.ok ? await answer.blob() : await problemOf(answer);
+        if (!isOn) continue; // switched off while it was on its way
+        if (answer.ok) {
+          this.#keep(URL.createObjectURL(found));
+          this.show({ url: this.url, psnr: Number(answer.headers.get("X-PSNR-dB")) });
+        } else {
+          this.show({ problem: answer.status === 404 ? "" : found }); // 404: deleted meanwhile
         }
-        const image = URL.createObjectURL(await answer.blob());
-        this.#keep(image);
-        this.show({ url: image, psnr: Number(answer.headers.get("X-PSNR-dB")) });
       } catch {
         // The service is gone; the status line says so.
       }

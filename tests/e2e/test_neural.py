@@ -21,6 +21,7 @@ BOX = "003_cracker_box"
 COMPILE_S = 180  # the first time on a machine
 DRAW_S = 60  # 3D in software, on a busy machine
 WINDOW_PX = 60
+LATE_MS = 1000
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +102,23 @@ def test_camera_images_stand_beside_what_the_fields_render(page, url):
     wait_until(lambda: page.get_attribute(".part.rendered >> nth=0", "src") != before, DRAW_S)
     page.uncheck("#compare")
     assert page.is_visible('img[data-camera="0"]')
+    assert decibels(page) == []
+    assert page.problems == []
+
+
+def test_a_comparison_that_arrives_after_it_was_switched_off_is_not_shown(page):
+    page.evaluate(f"""() => {{
+        const read = Response.prototype.blob;
+        Response.prototype.blob = async function () {{
+            window.arriving = true;
+            await new Promise((done) => setTimeout(done, {LATE_MS}));
+            return read.call(this);
+        }};
+    }}""")
+    page.check("#compare")
+    page.wait_for_function("window.arriving", timeout=1000 * COMPILE_S)
+    page.uncheck("#compare")
+    page.wait_for_timeout(2 * LATE_MS)
     assert decibels(page) == []
     assert page.problems == []
 
