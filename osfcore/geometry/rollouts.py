@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,14 @@ class Rollouts:
         """One sequence alone, K = 1."""
         k = slice(sequence, sequence + 1)
         return Rollouts(self.names, self.positions[k], self.quaternions[k], self.pusher[k])
+
+    @staticmethod
+    def joined(parts: Sequence[Rollouts]) -> Rollouts:
+        """Futures of the same scene, one after another."""
+        positions, quaternions, pusher = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("positions", "quaternions", "pusher")
+        )
+        return Rollouts(parts[0].names, positions, quaternions, pusher)
 
     def after(self, actions: int) -> Rollouts:
         """What is left of the futures after some actions; at least the last state."""

@@ -7,12 +7,14 @@ K sequences of T actions, a_k, are sampled, rolled out and scored, S_k = cost(ro
 and the next plan is warm-started from it, shifted by the actions that were executed.
 
 Deviations: samples are not drawn around the nominal sequence alone but from three sources (the nominal sequence, push
-proposals, random walks), and the average is taken in a second round of samples around the best of the first: the mean
-of a path around the left and one around the right of an object leads into it. The second round has a shorter horizon,
-since later actions are planned again before they are executed; only every third plan has a first round, and those that
-only walk no second one. The average, or the best sample, replaces the plan so far if it costs less over the whole
-horizon. lambda is relative to the spread of the costs, temperature * (median S - min S). Noise is added to the pusher's
-path at knots, not to its velocity, so that its variance does not grow along the horizon.
+proposals, random walks), what succeeded in them is recombined, and the average is taken in a second round of samples
+around the best of the first: the mean of a path around the left and one around the right of an object leads into it.
+The second round has a shorter horizon, since later actions are planned again before they are executed; only every third
+plan has a first round, and those that only walk no second one. The average, or the best sample, replaces the plan so
+far if it costs less over the whole horizon. Where few sequences are compared, their cost is the mean over begins of the
+pusher a few millimetres apart, for a push that slips off an object when it begins elsewhere will slip off. lambda is
+relative to the spread of the costs, temperature * (median S - min S). Noise is added to the pusher's path at knots, not
+to its velocity, so that its variance does not grow along the horizon.
 """
 
 from __future__ import annotations
@@ -33,6 +35,8 @@ from osfcore.planning.pose_cost import Cost, PoseGoal
 
 _SOON, _TOUCHED_M = 3, 1e-4  # a plan is refined where it moves something by so much after as many actions or fewer
 COMPARED = 3  # sequences that are rolled out once more after the second round, over the whole horizon
+_FINALISTS = 24  # sequences of the first round that are rolled out from other begins
+_BEGINS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 _RANDOM_WALK_M = 0.06  # standard deviation of random walks at their knots
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
@@ -55,6 +59,16 @@ class PushSource(Protocol):
         """
         ...
 
+    def recombine(self, goal: PoseGoal, rollouts: Rollouts, count: int) -> Float[np.ndarray, "P T 3"]:
+        """At most `count` sequences made of what succeeded in different futures; perhaps none.
+
+        Args:
+            goal: where everything should be.
+            rollouts: the futures, from one state.
+            count: of sequences.
+        """
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
@@ -68,6 +82,8 @@ class PlanSettings:
         knot_every: actions between the places where the noise is drawn, with straight lines between them.
         refined: actions that the second round looks at and changes.
         proposals_every: plans of which one has a first round; the others refine the nominal sequence alone.
+        recombined: sequences that are made of what succeeded in those of the first round.
+        begins_m: how far apart the pusher's begins are over which costs are averaged [m]; 0 to trust in rollouts.
     """
 
     samples: int = 160
@@ -77,6 +93,8 @@ class PlanSettings:
     knot_every: int = 3
     refined: int = 12
     proposals_every: int = 3
+    recombined: int = 12
+    begins_m: float = 0.003
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -92,6 +110,8 @@ class PlanSettings:
             ("actions between knots", self.knot_every, 1, MAX_HORIZON),
             ("refined actions", self.refined, 1, MAX_HORIZON),
             ("plans of which one draws proposals", self.proposals_every, 1, MAX_HORIZON),
+            ("number of recombined sequences", self.recombined, 0, MAX_SEQUENCES),
+            ("distance of begins [m]", self.begins_m, 0.0, PUSHER_REACH_M),
         )
 
 
@@ -105,17 +125,19 @@ class PlanRound:
             softmax average.
         rollouts: all futures of the round; those of the second are shorter.
         costs: theirs.
+        chosen: number of the sequence that was chosen; by default the one that costs least.
     """
 
     number: int
     actions: Float[np.ndarray, "T 3"]
     rollouts: Rollouts
     costs: Float[np.ndarray, "K"]
+    chosen: int | None = None
 
     @property
     def best(self) -> Rollouts:
-        """The future of the sequence that costs least, K = 1; the plan's own lies close to it."""
-        return self.rollouts[int(self.costs.argmin())]
+        """The future of the chosen sequence, K = 1; the plan's own lies close to it."""
+        return self.rollouts[int(self.costs.argmin()) if self.chosen is None else self.chosen]
 
 
 class MPPIPlanner:
@@ -171,7 +193,7 @@ class MPPIPlanner:
         self._refinements += 1
         if self._nominal is None or self._refinements >= self.settings.proposals_every or not self._nominal[0].any():
             self._refinements = 0
-            round_ = self._evaluate(0, state, self._sample_first_round(state, goal, rng), cost, before)
+            round_ = self._first_round(state, goal, cost, rng, before)
             yield round_
             self._follow(round_)
         assert self._nominal is not None
@@ -188,14 +210,43 @@ class MPPIPlanner:
         mean = np.einsum("k,kta->ta", _mppi_weights(round_.costs, self.settings.temperature), second)
         plans = np.stack([np.concatenate([head, rest]) for head in (mean, begin, round_.actions)])
         # Over the whole horizon: later pushes need the objects where they were expected.
-        whole = self._evaluate(1, state, plans, cost, before)
+        whole = self._chosen(self._evaluate(1, state, plans, cost, before), plans, state, cost, before)
         self._follow(whole)
         yield replace(round_, actions=whole.actions)
 
     def _follow(self, round_: PlanRound) -> None:
-        """Take the best sequence of a round for the nominal one."""
+        """Take the chosen sequence of a round for the nominal one."""
+        assert round_.chosen is not None
         self._nominal = round_.actions
-        self._known = replace(round_, rollouts=round_.best, costs=round_.costs.min()[None])
+        self._known = replace(round_, rollouts=round_.best, costs=round_.costs[[round_.chosen]], chosen=None)
+
+    def _first_round(
+        self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None
+    ) -> PlanRound:
+        actions = self._sample_first_round(state, goal, rng)
+        round_ = self._evaluate(0, state, actions, cost, before)
+        more = self._proposals.recombine(goal, round_.rollouts, self.settings.recombined)
+        if len(more):
+            actions = np.concatenate([actions, more])
+            other = self._evaluate(0, state, more, cost, before)
+            rollouts = Rollouts.joined([round_.rollouts, other.rollouts])
+            round_ = PlanRound(0, round_.actions, rollouts, np.concatenate([round_.costs, other.costs]))
+        return self._chosen(round_, actions, state, cost, before)
+
+    def _chosen(
+        self, round_: PlanRound, actions: Float[np.ndarray, "K T 3"], state: SceneState, cost: Cost,
+        before: SceneState | None,
+    ) -> PlanRound:  # fmt: skip
+        """A round with the sequence for its plan that costs least on average over begins of the pusher."""
+        finalists = np.argsort(round_.costs, kind="stable")[: _FINALISTS if self.settings.begins_m else 1]
+        total = round_.costs[finalists]
+        if len(finalists) > 1:
+            assert state.pusher is not None
+            for begin in self.settings.begins_m * np.pad(_BEGINS, ((0, 0), (0, 1))):
+                elsewhere = replace(state, pusher=state.pusher + begin)
+                total = total + cost(self._rollout(elsewhere, actions[finalists], before))
+        chosen = int(finalists[total.argmin()])
+        return replace(round_, actions=actions[chosen], chosen=chosen)
 
     def _evaluate(
         self, number: int, state: SceneState, actions: Float[np.ndarray, "K T 3"], cost: Cost, before: SceneState | None

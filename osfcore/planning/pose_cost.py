@@ -15,7 +15,7 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 
 ARM_M = 0.06  # a rotation counts as its angle times this
-_TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
+TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
 
 
 class Cost(Protocol):
@@ -83,11 +83,21 @@ class PoseCost:
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
         """Running cost averaged over the horizon, plus the weighted terminal cost."""
-        order = [self.goal.names.index(name) for name in rollouts.names]
-        shift = rollouts.positions[:, 1:, :, :2] - self.goal.poses.position[order, :2]
-        cost = np.linalg.norm(shift, axis=-1)
-        if self.arm_m > 0:
-            target = np.broadcast_to(self.goal.poses.quaternion[order], rollouts.quaternions[:, 1:].shape)
-            cost = cost + self.arm_m * rotation_angle(rollouts.quaternions[:, 1:], target)
-        running_cost = cost.sum(axis=2)
-        return running_cost.mean(axis=1) + _TERMINAL_WEIGHT * running_cost[:, -1]
+        running_cost = object_costs(rollouts, self.goal, self.arm_m)[:, 1:].sum(axis=2)
+        return running_cost.mean(axis=1) + TERMINAL_WEIGHT * running_cost[:, -1]
+
+
+def object_costs(rollouts: Rollouts, goal: PoseGoal, arm_m: float = ARM_M) -> Float[np.ndarray, "K T1 N"]:
+    """|p_n(t) - p_n*| + arm * angle(q_n(t), q_n*) of each object, before the first and after each action [m].
+
+    Args:
+        rollouts: the futures.
+        goal: where everything should be.
+        arm_m: what a rotation counts [m/rad]; 0 to leave rotations out.
+    """
+    order = [goal.names.index(name) for name in rollouts.names]
+    cost = np.linalg.norm(rollouts.positions[..., :2] - goal.poses.position[order, :2], axis=-1)
+    if arm_m > 0:
+        target = np.broadcast_to(goal.poses.quaternion[order], rollouts.quaternions.shape)
+        cost = cost + arm_m * rotation_angle(rollouts.quaternions, target)
+    return cost

@@ -107,16 +107,24 @@ def _between(values: Float[np.ndarray, "P T1 D"]) -> Float[np.ndarray, "P S D"]:
 
 
 def silhouette(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "V 2"]:
-    """The outer outline of the union of convex outlines, counterclockwise, within a millimetre [m]."""
+    """The outer outline of a union of convex outlines, counterclockwise, within a millimetre [m].
+
+    Gaps that the pusher does not fit into are closed, and what is still apart is joined by the convex hull.
+    """
     every = np.concatenate(list(outlines))
-    low = every.min(axis=0) - 3 * _PIXEL_M
-    side = np.ceil((every.max(axis=0) - low) / _PIXEL_M).astype(int) + 4
-    solid = np.zeros((side[1], side[0]), np.uint8)
+    border = PUSHER_RADIUS_M + 3 * _PIXEL_M
+    low = every.min(axis=0) - border
+    columns, rows = np.ceil((every.max(axis=0) + border - low) / _PIXEL_M).astype(int) + 1
+    solid = np.zeros((rows, columns), np.uint8)
     for part in outlines:
         cv2.fillConvexPoly(solid, np.rint((part - low) / _PIXEL_M).astype(np.int32), 1)
-    contours, _ = cv2.findContours(solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    largest = max(contours, key=cv2.contourArea)
-    points = cv2.approxPolyDP(largest, _CORNER_M / _PIXEL_M, closed=True)[:, 0] * _PIXEL_M + low
+    width = 2 * round(PUSHER_RADIUS_M / _PIXEL_M) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    contours, _ = cv2.findContours(
+        cv2.morphologyEx(solid, cv2.MORPH_CLOSE, disc), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    outer = contours[0] if len(contours) == 1 else cv2.convexHull(np.concatenate(contours))
+    points = cv2.approxPolyDP(outer, _CORNER_M / _PIXEL_M, closed=True)[:, 0] * _PIXEL_M + low
     area = np.sum(points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1))
     return points if area > 0 else points[::-1].copy()
 

@@ -18,13 +18,15 @@ from jaxtyping import Float
 from osfcore.dynamics.contact_geometry import part_outlines
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
 from osfcore.geometry.poses import Pose, rotation_angle
+from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.planning.path_planning import FreeSpace, ShortestPaths, actions_along, duration_s
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.pose_cost import PoseGoal, object_costs
 from osfcore.planning.push_order import Outlines, OutlinesAt, Stage, push_orders
 from osfcore.planning.push_outcomes import PushPredictor, push_outcomes
 from osfcore.planning.push_primitives import outline_points, straight_pushes
+from osfcore.planning.push_recombination import recombined
 from osfcore.planning.push_sequences import DrawnPushes, ObjectPushes
 
 _REACHED_M, _REACHED_RAD = 0.004, 0.045  # an object this close to its goal is not pushed on purpose
@@ -66,14 +68,7 @@ class PushProposals:
         if not off:
             return np.zeros((0, horizon, 3))
         assert state.pusher is not None
-        known: dict[tuple[int, bytes], Outlines] = {}
-
-        def outlines(n: int, pose: Pose) -> Outlines:
-            key = n, pose.position.tobytes() + pose.quaternion.tobytes()
-            if key not in known:
-                known[key] = list(part_outlines(self._tables[state.names[n]], 0, pose).astype(float))
-            return known[key]
-
+        outlines = self._outlines(state.names)
         orders = push_orders(now, goals, off, outlines, _ORDERS, rng)
 
         def pushes(n: int, pose: Pose) -> ObjectPushes:
@@ -83,6 +78,28 @@ class PushProposals:
         each = -(-count // len(orders))
         proposals = [actions for order in orders for actions in chains.draw(order, each)]
         return np.array(proposals[:count]).reshape(-1, horizon, 3)
+
+    def recombine(self, goal: PoseGoal, rollouts: Rollouts, count: int) -> Float[np.ndarray, "P T 3"]:
+        """At most `count` sequences of pushes that succeeded in different futures (`push_recombination`).
+
+        Args:
+            goal: where everything should be.
+            rollouts: the futures, from one state.
+            count: of sequences.
+        """
+        return recombined(rollouts, object_costs(rollouts, goal), self._outlines(rollouts.names), count)
+
+    def _outlines(self, names: Sequence[str]) -> OutlinesAt:
+        """Tells the outlines of objects, each pose's once."""
+        known: dict[tuple[int, bytes], Outlines] = {}
+
+        def at(n: int, pose: Pose) -> Outlines:
+            key = n, pose.position.tobytes() + pose.quaternion.tobytes()
+            if key not in known:
+                known[key] = list(part_outlines(self._tables[names[n]], 0, pose).astype(float))
+            return known[key]
+
+        return at
 
     def _pushes_at(self, state: SceneState, n: int, pose: Pose, outlines: Outlines) -> ObjectPushes:
         name = state.names[n]

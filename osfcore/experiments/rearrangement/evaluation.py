@@ -56,7 +56,7 @@ from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"
 MAX_TASKS = 10_000
-_ORACLE_PLAN = PlanSettings(samples=96)
+_ORACLE_PLAN = PlanSettings(samples=96, begins_m=0.0)  # it is told what will happen
 _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
 _ORACLE_REPLANS_EVERY = 2
 

@@ -159,9 +159,10 @@ def test_what_was_executed_is_dropped(shapes, start):
     goal = goal_of(start, (0.1, 0.0))
     plan = planned(planner, start, goal)[-1].actions
     planner.shift(3)
+    before = len(seen)
     planned(planner, start, goal)
-    np.testing.assert_array_equal(seen[3][:-3], plan[3:])  # the first sample is the last plan itself
-    np.testing.assert_array_equal(seen[3][-3:], 0)
+    np.testing.assert_array_equal(seen[before][:-3], plan[3:])  # the first sample is the last plan itself
+    np.testing.assert_array_equal(seen[before][-3:], 0)
     planner.settings = PlanSettings(samples=64, horizon=5)
     assert planned(planner, start, goal)[-1].actions.shape == (5, 3)
     planner.settings = PlanSettings(samples=64, horizon=20)
@@ -175,12 +176,43 @@ def test_proposals_are_drawn_in_every_third_plan_and_when_there_is_none(shapes, 
     assert len(planned(planner, start, goal)) == 2
 
 
-def test_a_plan_that_hesitates_is_hurried(start):
-    class Slow:
-        def draw(self, state, goal, count, horizon, rng):
-            return np.broadcast_to([0.03, 0.0, 0.0], (count, horizon, 3))
+class Straight:
+    """Proposes to go along +x at one speed or another [m/s]."""
 
-    planner, goal = MPPIPlanner(carried, Slow(), PlanSettings(samples=64, horizon=24)), goal_of(start, (0.1, 0.0))
+    def __init__(self, *speeds: float) -> None:
+        self._speeds = speeds
+
+    def draw(self, state, goal, count, horizon, rng):
+        return np.multiply.outer(np.resize(self._speeds, count), np.broadcast_to([1.0, 0.0, 0.0], (horizon, 3)))
+
+    def recombine(self, goal, rollouts, count):
+        return np.zeros((0, rollouts.pusher.shape[1] - 1, 3))
+
+
+@pytest.mark.parametrize(("begins_m", "speed"), [(0.0, 0.05), (0.003, 0.04)])
+def test_a_push_that_works_from_one_place_alone_is_not_chosen_unless_rollouts_are_trusted(start, begins_m, speed):
+    """The faster push ends at the goal, but slips off the object where the pusher begins elsewhere."""
+
+    def slippery(state, actions, before=None):
+        future = carried(state, actions)
+        slips = (actions[:, :, 0] > 0.045).all(axis=1) & ~np.array_equal(state.pusher, start.pusher)
+        still = np.broadcast_to(state.poses.position, future.positions.shape)
+        positions = np.where(slips[:, None, None, None], still, future.positions)
+        return Rollouts(state.names, positions, future.quaternions, future.pusher)
+
+    settings = PlanSettings(samples=64, horizon=12, noise_m=0.0, begins_m=begins_m)
+    first = planned(MPPIPlanner(slippery, Straight(0.05, *[0.04] * 20), settings), start, goal_of(start, (0.12, 0.0)))[
+        0
+    ]
+    np.testing.assert_allclose(first.actions, np.broadcast_to([speed, 0.0, 0.0], (12, 3)))
+    np.testing.assert_allclose(first.best.positions[0, -1, 0, 0], start.poses.position[0, 0] + 12 * STEP_S * speed)
+
+
+def test_a_plan_that_hesitates_is_hurried(start):
+    planner, goal = (
+        MPPIPlanner(carried, Straight(0.03), PlanSettings(samples=64, horizon=24)),
+        goal_of(start, (0.1, 0.0)),
+    )
     for seed in range(2):
         planned(planner, start, goal, seed)
     assert planner.nominal(1)[0, 0] > 0.2
@@ -219,6 +251,8 @@ def test_a_can_is_brought_to_its_goal_by_the_shipped_network(shapes, start):
         ({"noise_m": 0.4}, "noise"),
         ({"knot_every": 0}, "knots"),
         ({"refined": 0}, "refined"),
+        ({"recombined": -1}, "recombined"),
+        ({"begins_m": 0.5}, "begins"),
     ],
 )
 def test_settings_out_of_range_are_told(change, message):

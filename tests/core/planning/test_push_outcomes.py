@@ -46,6 +46,22 @@ def test_a_silhouette_runs_counterclockwise_around_all_parts():
     assert np.abs(outline).max() == pytest.approx(0.05, abs=0.002)
 
 
+@pytest.mark.parametrize("gap", [0.004, 0.05])
+def test_parts_that_lie_apart_are_all_within_the_silhouette_and_the_loop(gap):
+    """A small part beside a large one, with room for the pusher between them or not."""
+    parts = [rectangle(0.05, 0.02), rectangle(0.01, 0.01, (0.06 + gap, 0.0))]
+    outline = silhouette(parts)
+    np.testing.assert_allclose(outline.max(axis=0), [0.07 + gap, 0.02], atol=0.002)
+    assert area(outline) > 0.1 * 0.04 + 0.02 * 0.02
+    outcomes = push_outcomes(carried, STATE, CENTRE, [part + ORIGIN for part in parts])
+    for part in parts:
+        low, high = part.min(axis=0), part.max(axis=0)
+        away = np.maximum(np.maximum(low - outcomes.starts, outcomes.starts - high), 0)
+        assert np.linalg.norm(away, axis=1).min() > PUSHER_RADIUS_M
+        away = np.maximum(np.maximum(low - outcomes.loop, outcomes.loop - high), 0)
+        assert np.linalg.norm(away, axis=1).min() > PUSHER_RADIUS_M
+
+
 def test_pushes_begin_clear_of_the_object_on_all_sides_and_lead_into_it():
     outcomes = table()
     outside = np.linalg.norm(np.maximum(np.abs(outcomes.starts) - [0.05, 0.02], 0), axis=1)

@@ -60,7 +60,8 @@ class OurPlanner:
 
     def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
         self._futures, self._goal, self._rng = _Futures(problem.step), problem.goal, rng
-        settings = PlanSettings(samples=(problem.samples - COMPARED) // 2, horizon=problem.horizon)
+        samples = (problem.samples - COMPARED) // 2
+        settings = PlanSettings(samples, problem.horizon, recombined=0, begins_m=0.0)
         self._planner = MPPIPlanner(self._futures, PushProposals({NAME: tee_shape()}), settings)
 
     def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
