@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from osfcore.dynamics.kernels.network_kernels import Weights, packed_weights
-from osfcore.dynamics.kernels.rollout_kernels import BLOCK, unroll_block
+from osfcore.dynamics.kernels.rollout_kernels import unroll_block
 from osfcore.dynamics.kernels.shape_kernels import Shapes, packed_shapes
 from osfcore.dynamics.motion import Motion, going_on, lowest_point
 from osfcore.dynamics.propagation_network import PropagationNetwork
@@ -27,6 +27,7 @@ from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
 
 _CHUNK = 4096  # sequences rolled out at once: more would not be faster
+_BLOCK = 40  # scenes whose objects go through the compiled network together, at most
 
 
 class PushModel:
@@ -203,7 +204,8 @@ def _unroll_compiled(
     results = np.empty((*many, 3), np.float32), np.empty((*many, 4), np.float32), np.empty(many, bool)
     first = tuple(np.ascontiguousarray(part[0].numpy(), np.float32) for part in scene)
     given = shapes, weights, number.numpy(), first, begins, velocity, shifts
-    blocks = range(0, len(begins), BLOCK)
-    with ThreadPoolExecutor(min(numba.get_num_threads(), len(blocks))) as threads:
-        list(threads.map(lambda k: unroll_block(*given, k, *results), blocks))
+    size = min(_BLOCK, -(-len(begins) // 2))  # no matter how many threads there are, so that rounding is the same
+    ends = range(0, len(begins), size)
+    with ThreadPoolExecutor(min(numba.get_num_threads(), len(ends))) as threads:
+        list(threads.map(lambda k: unroll_block(*given, k, min(k + size, len(begins)), *results), ends))
     return results

@@ -18,7 +18,6 @@ from osfcore.dynamics.motion import ASIDE
 from osfcore.dynamics.pusher_path import SUBSTEPS
 from osfcore.dynamics.recorded_states import SLEEP_M, SLEEP_RAD
 
-BLOCK = 40  # scenes whose objects go through the network together
 _ANGLES = 2 * np.pi / 8 * np.arange(8)
 _DOWN_X, _DOWN_Y = (np.float32(ASIDE) * np.append(f(_ANGLES), 0).astype(np.float32) for f in (np.cos, np.sin))
 _SHIFT, _TURN = np.float32(SHIFT_M), np.float32(TURN_RAD)
@@ -28,9 +27,9 @@ _STANDS, _RESTS, _TINY = np.float32(1e-6), np.float32(1e-9), np.float32(1e-20)
 
 @numba.njit(**KERNEL)
 def unroll_block(
-    shapes, weights, number, start, begins, velocity, shifts, first, centre, quaternion, has_moved
+    shapes, weights, number, start, begins, velocity, shifts, first, last, centre, quaternion, has_moved
 ) -> None:
-    """Roll out `BLOCK` of K sequences of T actions from one state of N objects.
+    """Roll out some of K sequences of T actions from one state of N objects, which go through the network together.
 
     Args:
         shapes, weights: `Shapes`, `Weights`.
@@ -39,10 +38,10 @@ def unroll_block(
         begins: K x 2, the pusher [m].
         velocity: K x T x 2, of the pusher [m/s].
         shifts: K x S x 2, of the pusher in each substep [m].
-        first: number of the first sequence.
+        first, last: numbers of the first sequence, and of the one after the last.
         centre, quaternion, has_moved: results after each action: K x T x N x 3, x 4, and without.
     """
-    objects, size = len(number), min(BLOCK, len(velocity) - first)
+    objects, size = len(number), last - first
     parts = 0
     for n in range(objects):
         parts += shapes.part_count[number[n]]
