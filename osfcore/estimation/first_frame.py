@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, yaw_hypotheses
+from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, side_hypotheses, yaw_hypotheses
 from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.objective.observed_views import FINE_SIDE, ObjectView, ObservedViews, crop_to_masks, views_of
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
@@ -213,7 +213,8 @@ class _FirstFrameEstimator:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Replace each object's orientation by any hypothesis under which the whole images fit better."""
         for n, found in enumerate(starts):
-            others = Pose.joined(Pose(found.positions, found.quaternions), yaw_hypotheses(self._models, at.params, n))
+            turned = (find(self._models, at.params, n) for find in (yaw_hypotheses, side_hypotheses))
+            others = Pose.joined(Pose(found.positions, found.quaternions), *turned)
             at, self._rivals[n] = compare_orientations(
                 self._models, self._coarse, self._middle, self._fine, at, n, others
             )

@@ -14,9 +14,17 @@ from osfcore.estimation.objective.photometric_loss import loss_of, photometric_l
 from osfcore.estimation.objective.resting_orientations import yaw_quaternions
 from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
 from osfcore.estimation.uncertainty import evaluate_fit, object_residuals
-from osfcore.geometry.poses import Pose, quaternion_multiply, rotate, rotation_angle
+from osfcore.geometry.poses import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_multiply,
+    rotate,
+    rotation_angle,
+)
 
 _YAWS = 24
+_DOWN = np.array([0.0, 0.0, -1.0])
 _RANKED_COARSE = 64  # hypotheses that are ranked again in coarse images
 _REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
 _REFINED_COARSE = 3  # of these, so many are refined in coarse ones
@@ -43,6 +51,34 @@ def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -
     centre = models.resting(params.names[number]).centre
     middle = params.positions[number] + rotate(params.quaternions[number], centre)
     return Pose(middle - rotate(quaternions, centre), quaternions)
+
+
+def side_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
+    """An object tipped over in place, by the least rotation, onto each side that it may lie on; a batch of poses.
+
+    A can on its side is rolled about its axis so: labels that repeat around it make it look alike in coarse images.
+    Each pose is among the result also turned by 180 deg about the vertical. The axis of a rotation by about 180 deg is
+    the object's longest one.
+
+    Args:
+        models: fields, for the sides, and the centre of mass.
+        params: the guess; the side that the object lies on is not among the result.
+        number: of the object.
+    """
+    resting, own = models.resting(params.names[number]), params.quaternions[number]
+    sides = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
+    sides, first = np.unique(np.round(sides, 6), axis=0, return_index=True)
+    now = rotate(own, sides)
+    axes, angles = np.cross(now, _DOWN), np.arccos((now @ _DOWN).clip(-1, 1))
+    longest = rotate(own, np.linalg.svd(resting.hull - resting.hull.mean(axis=0), full_matrices=False)[2][0])
+    axes[angles > np.pi - _SAME_RAD] = longest * [1, 1, 0]
+    other = angles > _SAME_RAD
+    turns = axes[other] / np.linalg.norm(axes[other], axis=1, keepdims=True).clip(1e-9) * angles[other, None]
+    tipped = quaternion_multiply(quaternion_exp(turns), own[None])
+    quaternions = np.concatenate([tipped, quaternion_multiply(yaw_quaternions(np.array([np.pi])), tipped)])
+    middle = np.tile(params.positions[number] + rotate(own, resting.centre), (len(quaternions), 1))
+    middle[:, 2] = np.tile(resting.heights[first][other], 2)
+    return Pose(middle - rotate(quaternions, resting.centre), quaternions)
 
 
 def compare_orientations(

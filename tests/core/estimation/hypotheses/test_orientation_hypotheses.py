@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, yaw_hypotheses
+from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, side_hypotheses, yaw_hypotheses
 from osfcore.estimation.objective.observed_views import QUALITY
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.search.gauss_newton import GaussNewtonState
@@ -46,6 +46,39 @@ def test_turned_in_place_about_the_vertical(models, truth, flips):
     np.testing.assert_allclose(np.sort(angles), np.sort([15 * min(k, 24 - k) for k in range(1, 24)]), atol=1e-6)
     up = rotate(flips.quaternion * [1, -1, -1, -1], np.array([0, 0, 1.0]))
     np.testing.assert_allclose(up, np.tile(up[0], (23, 1)), atol=1e-12)
+
+
+def test_tipped_in_place_onto_each_other_side(models, truth):
+    """Each pose rests on the table, on another side, and half of them are the others turned by 180 deg."""
+    resting, pose = models.resting(truth.names[0]), truth.poses[0]
+    sides = side_hypotheses(models, params_of(truth), 0)
+    assert len(sides.position) >= 2
+    middle = rotate(sides.quaternion, resting.centre) + sides.position
+    np.testing.assert_allclose(middle[:, :2], np.tile(pose.apply(resting.centre)[:2], (len(middle), 1)), atol=1e-12)
+    for side in sides:
+        assert abs(resting.lowest(side)) < 3e-3  # the axis of half a turn is about the longest one
+    up, now = (rotate(q * [1, -1, -1, -1], np.array([0, 0, 1.0])) for q in (sides.quaternion, pose.quaternion))
+    assert (up @ now < np.cos(np.deg2rad(10))).all()
+    half = len(sides.position) // 2
+    np.testing.assert_allclose(up[:half], up[half:], atol=1e-12)
+    between = rotation_angle(sides.quaternion[:half], sides.quaternion[half:])
+    np.testing.assert_allclose(between, np.pi, atol=1e-6)
+
+
+def test_an_object_on_its_other_side_is_tipped_over(models, truth, coarse, fine):
+    right = params_of(truth)
+    tipped = side_hypotheses(models, right, 0)
+    farthest = int(np.argmax(rotation_angle(tipped.quaternion, right.quaternions[0])))
+    positions, quaternions = right.positions.copy(), right.quaternions.copy()
+    positions[0], quaternions[0] = tipped.position[farthest], tipped.quaternion[farthest]
+    wrong = replace(right, positions=positions, quaternions=quaternions)
+    at, ratio = compare_orientations(
+        models, coarse, coarse, fine, GaussNewtonState.at(wrong), 0, side_hypotheses(models, wrong, 0)
+    )
+    shift, turn, _ = apart(at.params, truth)
+    assert shift[0] < 0.002
+    assert turn[0] < np.deg2rad(2)
+    assert ratio > 1.5
 
 
 def test_a_flipped_object_is_turned_round(models, truth, coarse, fine, flips):
