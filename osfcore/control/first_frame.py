@@ -1,7 +1,8 @@
 """The first frame, whatever its pictures are like: exposure, response, ambient light and the table's colour are found.
 
 Where the table looks as it is known (`check_table`), `osfcore.estimation.first_frame` does everything. Where no shadow
-tells, it is asked first, and its answer taken if the image model at its poses is the usual one. Otherwise an image
+tells, it is asked first, and its answer taken if the loss at its end is low or the image model at its poses the usual
+one: under a high lamp and beside one object exposure, ambient light and table explain each other. Otherwise an image
 model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
 linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one too if the loss
 at its end is high: then the lower one decides. Pictures and fields are made to agree, and the usual estimator finds
@@ -68,6 +69,9 @@ def estimate_first(
     if verdict == "unclear":
         last = yield from all_but_last(estimate_usual(models, observation, rng, config))
         assert last.estimate is not None
+        if last.loss < _SETTLED and last.estimate.trusted:
+            yield last
+            return
         params = SceneParameters.of(last.estimate.state, observation.pusher)
         views = views_of(observation, _COARSE_SIDE, samples=2)
         if calibrator.refine(views, params, 1.0, hold_light=True).model.is_usual:

@@ -12,6 +12,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
@@ -55,6 +56,32 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
         models: of which the table is used.
         views: pictures with masks.
     """
+    x, error, on_table = table_light(models, views)
+    table = _table_pixels(views, on_table)
+    if table.sum() < _FEWEST:
+        return TableCheck(0.0, 0.0, 0.0, "unclear")
+    darkest, shadow, brightest = np.quantile(x[table], [*_DARKEST, 0.99])
+    colour = float(np.median(error[table]))
+    has_shadow = brightest - shadow > _LEAST_CONTRAST and shadow - darkest < _SAME
+    is_dark = abs(shadow) < _SHADOW if has_shadow else darkest > -_SHADOW
+    is_usual = is_dark and brightest < _BRIGHTEST and colour < _COLOUR
+    verdict: TableVerdict = "other" if not is_usual else "usual" if has_shadow else "unclear"
+    return TableCheck(float(shadow), float(brightest), colour, verdict)
+
+
+def table_light(
+    models: ObjectModels, views: ObservedViews
+) -> tuple[Float[np.ndarray, "V h w"], Float[np.ndarray, "V h w"], Bool[np.ndarray, "V h w"]]:
+    """What would be the light on the table, if every pixel showed it.
+
+    Args:
+        models: of which the table is used.
+        views: pictures.
+
+    Returns:
+        x by which the pixel's radiance is best explained, the error of its colours that this leaves [radiance], and
+        whether the table would be seen if it were empty.
+    """
     nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), OVERHEAD[None], None)
     empty = models.together.render(nothing, views.cameras, quality=QUALITY, outputs={"rgb", "depth"})
     assert empty.depth is not None
@@ -63,17 +90,7 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
     # The known table facing the lamp sends out `full`, that is ambient and all direct light.
     lit = (seen * full).sum(axis=-1) / np.maximum((full * full).sum(axis=-1), 1e-6)
     error = np.abs(seen - lit[..., None] * full).mean(axis=-1)
-    table = _table_pixels(views, empty.depth[0] > 0)
-    if table.sum() < _FEWEST:
-        return TableCheck(0.0, 0.0, 0.0, "unclear")
-    x = (lit[table] - AMBIENT) / DIFFUSE
-    darkest, shadow, brightest = np.quantile(x, [*_DARKEST, 0.99])
-    colour = float(np.median(error[table]))
-    has_shadow = brightest - shadow > _LEAST_CONTRAST and shadow - darkest < _SAME
-    is_dark = abs(shadow) < _SHADOW if has_shadow else darkest > -_SHADOW
-    is_usual = is_dark and brightest < _BRIGHTEST and colour < _COLOUR
-    verdict: TableVerdict = "other" if not is_usual else "usual" if has_shadow else "unclear"
-    return TableCheck(float(shadow), float(brightest), colour, verdict)
+    return (lit - AMBIENT) / DIFFUSE, error, empty.depth[0] > 0
 
 
 def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Light search: the direction toward the light by coarse-to-fine grid search, given roughly known poses.
 
-A grid over the hemisphere, then shrinking 3 x 3 grids around the best directions, ranked by the truncated absolute
-error mean(min(|r|, e_max)) of renderings with shadows. The table's shading determines the light's elevation, cast
-shadows its azimuth; neither needs accurate poses.
+A grid over the hemisphere and a ring at the elevation that the table's shading tells, then shrinking 3 x 3 grids around
+the best directions, ranked by the truncated absolute error mean(min(|r|, e_max)) of renderings with shadows. Lit parts
+of the table reflect ambient + direct * sin(elevation); cast shadows tell the azimuth; neither needs accurate poses.
+Without the ring lights near the horizon are missed: there shading changes by half from one direction to the next.
 """
 
 from __future__ import annotations
@@ -16,9 +17,13 @@ from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
 from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
-from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
+from osfcore.estimation.photometry.table_check import table_light
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 
 _DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
+_AZIMUTHS = 48  # of a ring at the horizon; higher ones are shorter
+_TABLE_ERROR, _SHADOW = 0.012, 0.03  # of a pixel that may show the lit table: of its colours [radiance], and its light
+_FEWEST = 20  # such pixels in each image
 _FIRST_STEP_RAD = np.deg2rad(8.0)
 _ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
 _MAX_ERROR = 0.25  # e_max [radiance]: orientations may still be wrong
@@ -40,7 +45,7 @@ def search_light(
     Returns:
         The direction.
     """
-    directions = hemisphere()
+    directions = np.concatenate([hemisphere(), _ring(models, fine)])
     best = directions[np.argsort(_losses(models, coarse, params, directions))[:_FIRST_SURVIVORS]]
     step = _FIRST_STEP_RAD
     for _ in range(_ROUNDS):
@@ -67,6 +72,18 @@ def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
     """Where a light may be: those of `count` directions, spread over the whole sphere, that are high enough."""
     directions = fibonacci_sphere(count)
     return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
+
+
+def _ring(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "K 3"]:
+    """Directions from all around at the elevation that the table's lit pixels tell; none where none is seen."""
+    x, error, on_table = table_light(models, views)
+    lit = x[on_table & (error < _TABLE_ERROR) & (x > _SHADOW)]
+    if len(lit) < _FEWEST * len(views.images):
+        return np.zeros((0, 3))
+    elevation = np.arcsin(np.median(lit).clip(np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG)), 1))
+    count = int(np.ceil(_AZIMUTHS * np.cos(elevation))) + 1
+    azimuths = 2 * np.pi * np.arange(count) / count
+    return np.stack([Light.from_angles(azimuth, elevation).direction for azimuth in azimuths])
 
 
 def _neighbours(params: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:

@@ -9,12 +9,16 @@ from osfcore.control.first_frame import estimate_first
 from osfcore.errors import InvalidInput
 from osfcore.estimation.first_frame import FirstFrameConfig
 from osfcore.estimation.first_frame import estimate_first as estimate_usual
+from osfcore.estimation.objective.observed_views import views_of
 from osfcore.estimation.photometry.camera_response import srgb_of_linear
 from osfcore.estimation.photometry.image_model import ImageModel
 from osfcore.estimation.photometry.scaled_fields import adapted
+from osfcore.estimation.photometry.table_check import check_table
 from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.light import Light
 from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, apart, lying, observe, scene, shipped_models
 
+BRICK = "061_foam_brick"
 QUICK = FirstFrameConfig(2, 6, 2, 8, 2, 3, 2)
 OTHER = ImageModel(np.array([0.75, 0.75, 0.75]), 1.8, np.array([0.5, 0.7, 0.9]))
 
@@ -45,6 +49,19 @@ def test_usual_pictures_are_estimated_as_ever_to_the_last_bit(models, truth):
 @pytest.mark.slow
 def test_usual_pictures_have_no_image_model_of_their_own(models, truth):
     assert steps_of(estimate_first, models, observe(models, truth, default_cameras(48)[2:]))[-1].image_model is None
+
+
+@pytest.mark.slow
+def test_usual_pictures_of_one_plain_object_under_a_high_lamp_are_taken_for_usual():
+    """No full shadow is seen, and a fit of exposure, ambient light and table explains the lamp in another way."""
+    light, models = Light.from_angles(*np.deg2rad([-60, 72])).direction, shipped_models((BRICK,))
+    alone = scene({BRICK: lying(models, BRICK, 30, 0.05, -0.08)}, light)
+    seen = observe(models, alone, default_cameras(128))
+    assert check_table(models, views_of(seen, 128)).verdict == "unclear"
+    last = steps_of(estimate_first, models, seen, FirstFrameConfig())[-1]
+    assert last.image_model is None
+    assert np.rad2deg(last.estimate.state.light.angle_to(alone.light)) < 4
+    assert last.estimate.trusted
 
 
 @pytest.mark.slow

@@ -20,6 +20,15 @@ def test_the_light_of_a_scene_is_found(models, azimuth_deg, elevation_deg):
     assert np.rad2deg(angle(found(models, state, params_of(state)), light)) < 2
 
 
+@pytest.mark.parametrize("azimuth_deg", range(0, 360, 30))
+@pytest.mark.parametrize("elevation_deg", [7, 13])
+def test_a_light_near_the_horizon_is_found_with_one_object(models, azimuth_deg, elevation_deg):
+    """Shading changes by half from one direction of a grid to the next, and the table's alone tells no azimuth."""
+    light = Light.from_angles(*np.deg2rad([azimuth_deg, elevation_deg])).direction
+    state = scene({BOX: lying(models, BOX, 30, 0.03, -0.05)}, light)
+    assert np.rad2deg(angle(found(models, state, params_of(state)), light)) < 2
+
+
 def test_poses_need_not_be_right_to_the_degree(models, truth):
     params = params_of(truth)
     change = np.array([0.008, -0.005, 0.002, 0.05, 0, 0.1, -0.006, 0.007, 0, 0, 0.05, -0.12, 0, 0])
