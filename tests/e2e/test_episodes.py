@@ -284,7 +284,7 @@ def test_the_method_as_published_is_chosen_in_the_settings(page, service):
     page.wait_for_selector("#settings-facts:text-is('as published, 8 samples, 2 pushes')", timeout=WAIT_MS)
     assert page.is_disabled("#episode-settings select[name=method]")
     assert page.is_disabled("#setting-samples")
-    assert "the method as published" in page.inner_text("#shown-text")
+    page.wait_for_selector("#shown-text:has-text('the method as published')", timeout=WAIT_MS)
     page.click("#run-cancel")
     page.wait_for_selector("#run-idle:not([hidden])", timeout=WAIT_MS)
     assert service.episode()["status"] == "cancelled"
