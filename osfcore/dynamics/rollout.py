@@ -205,7 +205,7 @@ def _unroll_compiled(
     first = tuple(np.ascontiguousarray(part[0].numpy(), np.float32) for part in scene)
     given = shapes, weights, number.numpy(), first, begins, velocity, shifts
     size = min(_BLOCK, -(-len(begins) // 2))  # no matter how many threads there are, so that rounding is the same
-    ends = range(0, len(begins), size)
-    with ThreadPoolExecutor(min(numba.get_num_threads(), len(ends))) as threads:
-        list(threads.map(lambda k: unroll_block(*given, k, min(k + size, len(begins)), *results), ends))
+    blocks = range(0, len(begins), size)
+    with ThreadPoolExecutor(min(numba.get_num_threads(), len(blocks))) as threads:
+        list(threads.map(lambda k: unroll_block(*given, k, min(k + size, len(begins)), *results), blocks))
     return results

@@ -225,7 +225,8 @@ class MPPIPlanner:
     ) -> PlanRound:
         actions = self._sample_first_round(state, goal, rng)
         round_ = self._evaluate(0, state, actions, cost, before)
-        more = self._proposals.recombine(goal, round_.rollouts, self.settings.recombined)
+        count = self.settings.recombined
+        more = self._proposals.recombine(goal, round_.rollouts, count) if count else actions[:0]
         if len(more):
             actions = np.concatenate([actions, more])
             other = self._evaluate(0, state, more, cost, before)

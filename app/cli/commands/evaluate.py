@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -130,7 +130,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.control.episode_settings import EpisodeSettings
-        from osfcore.experiments.rearrangement.evaluation import EvaluateMpc, evaluate_mpc
+        from osfcore.experiments.rearrangement.evaluation import ORACLE_PLAN, EvaluateMpc, evaluate_mpc
         from osfcore.experiments.rearrangement.methods import Variant
         from osfcore.experiments.rivals.visual_foresight import ForesightSettings
         from osfcore.paper.mppi import GaussianPlanSettings
@@ -142,7 +142,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
         config = EvaluateMpc(
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,
             self.factor, self.cost, self.names, self.oracle, EpisodeSettings(plan=PlanSettings(**plan)),
-            PlanSettings(samples=self.oracle_samples), GaussianPlanSettings(**plan), ForesightSettings(**plan),
+            replace(ORACLE_PLAN, samples=self.oracle_samples), GaussianPlanSettings(**plan), ForesightSettings(**plan),
         )  # fmt: skip
         return evaluate_mpc(config, fields, assets, executor)
 

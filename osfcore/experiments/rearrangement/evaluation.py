@@ -56,7 +56,7 @@ from osfcore.planning.mppi import PlanSettings
 
 REPORT_FILE = "mpc.json"
 MAX_TASKS = 10_000
-_ORACLE_PLAN = PlanSettings(samples=96, begins_m=0.0)  # it is told what will happen
+ORACLE_PLAN = PlanSettings(samples=96, begins_m=0.0)  # it is told what will happen
 _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
 _ORACLE_REPLANS_EVERY = 2
 
@@ -106,7 +106,7 @@ class EvaluateMpc:
     names: tuple[str, ...] | None = None
     oracle: bool = True
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
-    oracle_plan: PlanSettings = _ORACLE_PLAN
+    oracle_plan: PlanSettings = ORACLE_PLAN
     published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
     foresight: ForesightSettings = field(default_factory=ForesightSettings)
 
@@ -218,7 +218,7 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
         work = partial(episodes.from_images, settings=settings, published=config.published)
     kinds = [(method, {**own, "settings": asdict(settings), "plan": asdict(config.plan)}, work)]
     if config.oracle:
-        told = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, _ORACLE_PLAN)) if part)
+        told = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN)) if part)
         kinds.append((told, {"settings": asdict(told_truth)}, partial(episodes.oracle, settings=told_truth)))
     return [
         Piece(f"{n:04d}", TaskCache(folder / kind), {**given, **circumstances}, partial(work, n))

@@ -201,18 +201,15 @@ def test_a_push_that_works_from_one_place_alone_is_not_chosen_unless_rollouts_ar
         return Rollouts(state.names, positions, future.quaternions, future.pusher)
 
     settings = PlanSettings(samples=64, horizon=12, noise_m=0.0, begins_m=begins_m)
-    first = planned(MPPIPlanner(slippery, Straight(0.05, *[0.04] * 20), settings), start, goal_of(start, (0.12, 0.0)))[
-        0
-    ]
+    planner = MPPIPlanner(slippery, Straight(0.05, *[0.04] * 20), settings)
+    first = planned(planner, start, goal_of(start, (0.12, 0.0)))[0]
     np.testing.assert_allclose(first.actions, np.broadcast_to([speed, 0.0, 0.0], (12, 3)))
     np.testing.assert_allclose(first.best.positions[0, -1, 0, 0], start.poses.position[0, 0] + 12 * STEP_S * speed)
 
 
 def test_a_plan_that_hesitates_is_hurried(start):
-    planner, goal = (
-        MPPIPlanner(carried, Straight(0.03), PlanSettings(samples=64, horizon=24)),
-        goal_of(start, (0.1, 0.0)),
-    )
+    planner = MPPIPlanner(carried, Straight(0.03), PlanSettings(samples=64, horizon=24))
+    goal = goal_of(start, (0.1, 0.0))
     for seed in range(2):
         planned(planner, start, goal, seed)
     assert planner.nominal(1)[0, 0] > 0.2

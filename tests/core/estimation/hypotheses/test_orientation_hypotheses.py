@@ -3,7 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, side_hypotheses, yaw_hypotheses
+from osfcore.estimation.hypotheses.orientation_hypotheses import (
+    compare_orientations,
+    side_hypotheses,
+    with_pose,
+    yaw_hypotheses,
+)
 from osfcore.estimation.objective.observed_views import QUALITY
 from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.search.gauss_newton import GaussNewtonState
@@ -29,10 +34,7 @@ def flips(models, truth):
 
 
 def flipped(params, flips) -> SceneParameters:
-    other = flips[11]  # half a turn
-    positions, quaternions = params.positions.copy(), params.quaternions.copy()
-    positions[0], quaternions[0] = other.position, other.quaternion
-    return replace(params, positions=positions, quaternions=quaternions)
+    return with_pose(params, 0, flips[11])  # half a turn
 
 
 def test_turned_in_place_about_the_vertical(models, truth, flips):
@@ -69,9 +71,7 @@ def test_an_object_on_its_other_side_is_tipped_over(models, truth, coarse, fine)
     right = params_of(truth)
     tipped = side_hypotheses(models, right, 0)
     farthest = int(np.argmax(rotation_angle(tipped.quaternion, right.quaternions[0])))
-    positions, quaternions = right.positions.copy(), right.quaternions.copy()
-    positions[0], quaternions[0] = tipped.position[farthest], tipped.quaternion[farthest]
-    wrong = replace(right, positions=positions, quaternions=quaternions)
+    wrong = with_pose(right, 0, tipped[farthest])
     at, ratio = compare_orientations(
         models, coarse, coarse, fine, GaussNewtonState.at(wrong), 0, side_hypotheses(models, wrong, 0)
     )
