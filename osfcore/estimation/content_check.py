@@ -111,12 +111,13 @@ class ContentChecker:
     def _template_evidence(self, observation: Observation, prior: SceneState) -> float:
         coarse, rough = views_of(observation, _COARSE_SIDE), views_of(observation, _ROUGH_SIDE)
         turns = yaw_quaternions(np.arange(_YAWS) * 2 * np.pi / _YAWS)
-        matches = []
+        matches, behind = [], table_errors(self._models, coarse)
         for name in observation.names:
             pose = prior.pose(name)
             quaternions = quaternion_multiply(turns, pose.quaternion[None])
             heights = np.full(_YAWS, pose.position[2])
-            matches.append(match_templates(self._models, coarse, name, quaternions, heights, most=_MATCHES))
+            found = match_templates(self._models, coarse, name, quaternions, heights, most=_MATCHES, behind=behind)
+            matches.append(found)
         params = quick_scene(self._models, rough, coarse, observation.names, matches)
         loss = loss_of(self._models, coarse, params)
         without = [loss_of(self._models, coarse, without_objects(params, [n])) for n in range(len(observation.names))]

@@ -15,7 +15,9 @@ from jaxtyping import Float, Int
 from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews, crop_camera
 from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.photometry.table_check import lit_table_level
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.poses import Pose, rotate
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.render.types import SceneBatch
@@ -26,6 +28,7 @@ _ANCHORS = 5  # along each side of the workspace; templates are rendered there, 
 _BLOCK_M = 0.025  # side of a square from which each orientation is kept once
 _RIDGE = 0.05
 _MAX_TABLE_ERROR = 0.3
+_UNEVEN = 0.03  # share by which pixels of the lit table may differ
 _NEAR_M, _NEAR_RAD = 0.02, np.deg2rad(20.0)
 
 
@@ -61,15 +64,26 @@ class TemplateMatches:
         return TemplateMatches(self.positions[numbers], self.quaternions[numbers], self.scores[numbers])
 
 
-def table_errors(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "h w"]:
-    """Squared error of the first view's pixels, the table being lit or shaded at will."""
+def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None = None) -> Float[np.ndarray, "h w"]:
+    """Squared error of the first view's pixels if they show the table.
+
+    Args:
+        models: fields.
+        views: what was observed.
+        lit: light on the lit table, see `lit_table_level`: then each pixel shows that, or shadow. Else it is lit or
+            shaded at will, and grey objects pass for table, too.
+    """
     view = views.cameras[:1]
     nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), _BASIS[:1], None)
     table = models.together.render(nothing, view, quality=QUALITY).rgb[0, 0]
     image = views.images[0]
     share = (image * table).sum(axis=-1) / np.maximum((table * table).sum(axis=-1), 1e-6)
-    errors = image - table * np.clip(share, 0.2, 1.05)[..., None]
-    return np.minimum((errors**2).sum(axis=-1), _MAX_TABLE_ERROR**2)
+    errors = np.full(share.shape, _MAX_TABLE_ERROR**2)
+    full = AMBIENT + DIFFUSE * (lit or 0)
+    for low, high in [(0.2, 1.05)] if lit is None else [(0.2, AMBIENT), ((1 - _UNEVEN) * full, (1 + _UNEVEN) * full)]:
+        left = image - table * np.clip(share, low, high)[..., None]
+        errors = np.minimum(errors, (left**2).sum(axis=-1))
+    return errors
 
 
 def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> Float[np.ndarray, "h w"]:
@@ -104,12 +118,12 @@ def match_templates(
         quaternions: of the orientations.
         heights: for each of them.
         most: how many matches are kept.
-        behind: squared errors of the pixels without the object; `table_errors` by default.
+        behind: squared errors of the pixels without the object; those of the table under its own light by default.
         light: unit vector toward the light, where it is known; any light else.
     """
     lights = _BASIS if light is None else light[None]
     camera, image = views.cameras[0], views.images[0]
-    table = table_errors(models, views) if behind is None else behind
+    table = table_errors(models, views, lit_table_level(models, views)) if behind is None else behind
     grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
     found = [
         _match_at_anchor(models, camera, image, table, name, quaternions, heights, lights, (x, y))

@@ -29,6 +29,7 @@ _SAME = 0.025  # difference of x within a shadow
 _SHADOW, _BRIGHTEST = 0.05, 1.06  # |x| in shadow, and x in full light
 _LEAST_CONTRAST = 0.05  # of x: less is noise, not a shadow
 _COLOUR = 0.012  # median error of colours [radiance]
+_LIT, _FEWEST_LIT = 0.03, 20  # least x of a lit pixel, and how many each picture needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +92,21 @@ def table_light(
     lit = (seen * full).sum(axis=-1) / np.maximum((full * full).sum(axis=-1), 1e-6)
     error = np.abs(seen - lit[..., None] * full).mean(axis=-1)
     return (lit - AMBIENT) / DIFFUSE, error, empty.depth[0] > 0
+
+
+def lit_table_level(models: ObjectModels, views: ObservedViews) -> float | None:
+    """Light x = sin(elevation) on the table where the lamp reaches it: the median over pixels of its colours.
+
+    Args:
+        models: of which the table is used.
+        views: pictures; masks play no part.
+
+    Returns:
+        x, or None where too little of a lit table is seen.
+    """
+    x, error, on_table = table_light(models, views)
+    lit = x[on_table & (error < _COLOUR) & (x > _LIT)]
+    return float(np.median(lit)) if len(lit) >= _FEWEST_LIT * len(views.images) else None
 
 
 def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:

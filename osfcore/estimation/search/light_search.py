@@ -17,13 +17,11 @@ from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
 from osfcore.estimation.objective.observed_views import ObservedViews
 from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
 from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
-from osfcore.estimation.photometry.table_check import table_light
+from osfcore.estimation.photometry.table_check import lit_table_level
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 
 _DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
 _AZIMUTHS = 48  # of a ring at the horizon; higher ones are shorter
-_TABLE_ERROR, _SHADOW = 0.012, 0.03  # of a pixel that may show the lit table: of its colours [radiance], and its light
-_FEWEST = 20  # such pixels in each image
 _FIRST_STEP_RAD = np.deg2rad(8.0)
 _ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
 _MAX_ERROR = 0.25  # e_max [radiance]: orientations may still be wrong
@@ -76,11 +74,10 @@ def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
 
 def _ring(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "K 3"]:
     """Directions from all around at the elevation that the table's lit pixels tell; none where none is seen."""
-    x, error, on_table = table_light(models, views)
-    lit = x[on_table & (error < _TABLE_ERROR) & (x > _SHADOW)]
-    if len(lit) < _FEWEST * len(views.images):
+    level = lit_table_level(models, views)
+    if level is None:
         return np.zeros((0, 3))
-    elevation = np.arcsin(np.median(lit).clip(np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG)), 1))
+    elevation = np.arcsin(np.clip(level, np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG)), 1))
     count = int(np.ceil(_AZIMUTHS * np.cos(elevation))) + 1
     azimuths = 2 * np.pi * np.arange(count) / count
     return np.stack([Light.from_angles(azimuth, elevation).direction for azimuth in azimuths])

@@ -6,9 +6,10 @@ import pytest
 from osfcore.estimation.hypotheses.scene_assembly import without_objects
 from osfcore.estimation.hypotheses.template_matching import TemplateMatches, match_templates, scene_errors, table_errors
 from osfcore.estimation.objective.observed_views import views_of
+from osfcore.estimation.photometry.table_check import lit_table_level
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.poses import rotate, rotation_angle
-from tests.core.estimation.scenes import BOTTLE, BOX, lying, observe, params_of, scene
+from tests.core.estimation.scenes import BOTTLE, BOX, lying, observe, params_of, scene, shipped_models
 
 SLOW = pytest.mark.slow
 
@@ -63,6 +64,24 @@ def test_a_bare_table_has_no_errors_in_whatever_light(models):
     assert errors.max() > 0.01
     dim = replace(shadow, images=shadow.images * np.float32(0.8))
     np.testing.assert_allclose(table_errors(models, dim)[errors < 1e-4], 0, atol=2e-4)
+
+
+def test_where_the_light_on_the_table_is_known_grey_things_are_not_table():
+    name, light = "021_bleach_cleanser", np.array((-0.842, 0.483, 0.242))  # white, under a lamp at 14 deg
+    bottle = shipped_models((name,))
+    pose = lying(bottle, name, 2, 0.068, -0.051)
+    views = image_of(bottle, scene({name: pose}, light), side=96)
+    lit = lit_table_level(bottle, views)
+    assert lit == pytest.approx(light[2] / np.linalg.norm(light), abs=0.01)
+    drawn = views_of(observe(bottle, scene({name: pose}, light), [goal_camera(96)]), 96)
+    on_bottle = drawn.masks[0, 0] > 0.9
+    at_will, known = (table_errors(bottle, views, level) for level in (None, lit))
+    assert known[on_bottle].mean() > 3 * at_will[on_bottle].mean()
+    assert (known >= at_will - 1e-6).all()
+    empty = image_of(bottle, scene({}, light), side=96)
+    assert table_errors(bottle, empty, lit)[2:].max() < 1e-3
+    found = match_templates(bottle, views, name, *ways(bottle, name, 2), most=20)
+    assert np.linalg.norm(found.positions[0] - pose.position) < 0.02
 
 
 def test_what_a_known_scene_leaves_unexplained(models, truth):
