@@ -4,6 +4,7 @@ A map of the rooms, each importing only from those above it:
 
     geometry     poses, rotations, cameras, light, scene states, rollouts, convex parts
     io           file formats with their checks: scenes, states, observations, image sets, pushes, rollouts
+    client       the service over REST, in the core's own types
     objects      the catalogue of objects, their meshes, and the library on disk
     metrics      errors of poses and images, success of rearrangements
     fields       neural scattering functions (OSF, KiloOSF), the table's field, and their training

@@ -22,6 +22,7 @@ ROOMS = (
     "osfcore.random_streams",
     "osfcore.geometry",
     "osfcore.io",
+    "osfcore.client",
     "osfcore.objects",
     "osfcore.metrics",
     "osfcore.fields",
@@ -48,6 +49,7 @@ ROOMS = (
 OWNERS = {  # who alone may import a package
     "pybullet": ("osfcore.world.physics", "osfcore.world.imaging.tiny_renderer"),
     "embreex": ("osfcore.world.imaging.traced_mesh",),
+    "httpx2": ("osfcore.client.connection",),
     "cma": ("osfcore.estimation.search.cma_es",),
     "coacd": ("osfcore.geometry.convex_parts",),
     "viser": ("app.viewer", "app.episodes.recording", "app.api.relay"),

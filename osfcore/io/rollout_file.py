@@ -17,7 +17,7 @@ from osfcore.errors import InvalidInput
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import read_json, write_json
-from osfcore.io.json_codec import Entry, decode
+from osfcore.io.json_codec import Entry, Vector3, Vector4, decode
 
 _DIGITS = 9  # nanometres
 
@@ -52,6 +52,24 @@ def rollouts_to_json(rollouts: Rollouts) -> dict[str, Any]:
     """Rollouts as plain lists and numbers."""
     arrays = {key: np.round(getattr(rollouts, key), _DIGITS).tolist() for key in ("positions", "quaternions", "pusher")}
     return {"names": list(rollouts.names), **arrays, "step_s": STEP_S}
+
+
+class _Rollouts(Entry):
+    names: list[str]
+    positions: list[list[list[Vector3]]]
+    quaternions: list[list[list[Vector4]]]
+    pusher: list[list[Vector3]]
+
+
+def rollouts_from_json(data: object) -> Rollouts:
+    """The rollouts of parsed JSON.
+
+    Raises:
+        InvalidInput: if something is missing or not a number; the message names it.
+    """
+    entry = decode(_Rollouts, data, "the rollouts")
+    arrays = (np.array(part, float) for part in (entry.positions, entry.quaternions, entry.pusher))
+    return Rollouts(tuple(entry.names), *arrays)
 
 
 def write_rollouts(path: Path, rollouts: Rollouts) -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.io.rollout_file import actions_from_json, read_actions, rollouts_to_json, write_rollouts
+from osfcore.io.rollout_file import actions_from_json, read_actions, rollouts_from_json, rollouts_to_json, write_rollouts
 
 GOOD = {"actions": [[[0.1, -0.2, 0.0], [0.3, 0.0, 0.0]]], "step_s": 0.2}
 
@@ -70,6 +70,16 @@ def test_mistakes_are_told_with_the_file_that_has_them(tmp_path, content, words)
     with pytest.raises(CorruptFile, match=f"actions.json cannot be used: .*{words}") as caught:
         read_actions(path)
     assert len(str(caught.value)) < 600
+
+
+def test_rollouts_are_read_as_they_were_written():
+    given = example()
+    read = rollouts_from_json(json.loads(json.dumps(rollouts_to_json(given))))
+    assert read.names == given.names
+    for part in ("positions", "quaternions", "pusher"):
+        np.testing.assert_allclose(getattr(read, part), getattr(given, part), atol=1e-9)
+    with pytest.raises(OsfError, match="positions"):
+        rollouts_from_json({**rollouts_to_json(given), "positions": "somewhere"})
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.95])

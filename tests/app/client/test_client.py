@@ -1,0 +1,224 @@
+"""The client against a running service; what both say to each other is as the OpenAPI schema has it."""
+
+import json
+import re
+
+import httpx2
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+
+from app.api.app_factory import create_app
+from osfcore.client import Client, ServiceError
+from osfcore.client.connection import Connection
+from osfcore.errors import InvalidInput
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.io.image_file import encode_png, to_uint8
+from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
+from tests.app.conftest import LONG
+
+SLOW = pytest.mark.slow
+BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
+TINY = {"steps": 1, "samples": 8, "horizon": 4}
+SCHEMA = create_app().openapi()
+
+
+def operation(request):
+    """What the schema says of a request."""
+    for path, methods in SCHEMA["paths"].items():
+        pattern = re.sub(r"\\\{\w+\\\}", "[^/]+", re.escape(path))
+        if re.fullmatch(pattern, request.url.path) and request.method.lower() in methods:
+            return methods[request.method.lower()]
+    pytest.fail(f"the schema knows no {request.method} {request.url.path}")
+
+
+def check(schema, value):
+    Draft202012Validator({**schema, "components": SCHEMA["components"]}).validate(value)
+
+
+def judge_request(request):
+    known = operation(request)
+    parameters = {one["name"] for one in known.get("parameters", ()) if one["in"] == "query"}
+    assert set(request.url.params) <= parameters
+    kind = request.headers.get("content-type", "")
+    if kind:
+        allowed = known["requestBody"]["content"]
+        assert kind in allowed or f"{kind.partition('/')[0]}/*" in allowed
+    if kind == "application/json":
+        check(known["requestBody"]["content"][kind]["schema"], json.loads(request.content))
+
+
+def judge_answer(answer):
+    kind = answer.headers.get("content-type", "")
+    told = operation(answer.request)["responses"][str(answer.status_code)]["content"]
+    assert kind.partition(";")[0] in told
+    if "json" in kind:
+        answer.read()
+        check(told[kind]["schema"], answer.json())
+
+
+@pytest.fixture
+def osf(live):
+    hooks = {"request": [judge_request], "response": [judge_answer]}
+    with Client(connection=Connection(httpx2.Client(base_url=live.url, event_hooks=hooks, timeout=60))) as client:
+        yield client
+
+
+@pytest.fixture
+def table(osf, live):
+    scene = osf.new_scene([BOX, BOTTLE], seed=1)
+    yield scene
+    live.request("DELETE", f"/api/scenes/{scene.id}")
+
+
+def test_how_the_service_is_and_what_it_has(osf):
+    assert osf.health().status in ("ok", "degraded")
+    assert {BOX, BOTTLE} <= set(osf.objects())
+
+
+def test_a_table_is_made_pushed_and_seen(osf, table):
+    assert table.state.names == (BOX, BOTTLE)
+    assert [camera.name for camera in table.cameras] == ["0", "1", "2", "3", "goal"]
+    velocity = -table.state.pusher / np.abs(table.state.pusher).max() * [0.2, 0.2, 0]
+    moved = osf.act(np.tile(velocity, (2, 1)))
+    np.testing.assert_allclose(moved.state.pusher - table.state.pusher, 0.4 * velocity, atol=2e-3)
+    assert moved.time_s == pytest.approx(0.4)
+    np.testing.assert_array_equal(osf.scene().state.poses.position, moved.state.poses.position)
+    image = osf.image(size=64, pusher=False)
+    assert image.shape == (64, 64, 3)
+    assert 0.05 < image.mean() < 0.95
+    assert np.abs(osf.image("2", size=64) - image).max() > 0.1
+
+
+def test_light_and_poses_are_as_given(osf, live):
+    poses = {BOX: Pose(np.array([0.1, 0.0, 0.2]), np.array([1.0, 0, 0, 0]))}
+    light = Light(np.array([0.6, 0.0, 0.8]))
+    scene = osf.new_scene([BOX], poses=poses, light=light)
+    np.testing.assert_allclose(scene.state.light.direction, light.direction, atol=1e-9)
+    np.testing.assert_allclose(scene.state.pose(BOX).position, poses[BOX].position)
+    live.request("DELETE", f"/api/scenes/{scene.id}")
+
+
+def test_goals_are_sent_and_made(osf, table, tmp_path):
+    drawn = osf.random_goal(1, moved=1)
+    assert set(drawn.names) == {BOX, BOTTLE}
+    image = osf.goal_image(drawn)
+    assert image.shape == (drawn.camera.height, drawn.camera.width, 3)
+    sent = osf.upload_goal(image, name="As drawn")
+    assert (sent.name, sent.names) == ("As drawn", ())
+    np.testing.assert_allclose(osf.goal_image(sent), image, atol=2 / 255)
+    assert osf.goal_problem(drawn) == ""
+    (tmp_path / "table.png").write_bytes(encode_png(to_uint8(image)))
+    assert osf.upload_goal(tmp_path / "table.png").name == "table"
+    pose = table.state.pose(BOX)
+    made = osf.goal_of({BOX: Pose(pose.position + [0.0, 0.05, 0.0], pose.quaternion)}, light=table.state.light)
+    assert np.abs(osf.goal_image(made) - image).max() > 0.1
+
+
+def test_what_is_no_photo_is_told_without_asking_the_service(osf, tmp_path):
+    (tmp_path / "goal.txt").write_text("a table")
+    for path in (tmp_path / "goal.txt", tmp_path / "none.png"):
+        with pytest.raises(InvalidInput, match="photo is .*, but it must be a file that is there and ends in"):
+            osf.upload_goal(path)
+
+
+def test_predictions_are_futures(osf, table):
+    away = table.state.pusher / np.linalg.norm(table.state.pusher[:2]) * [0.2, 0.2, 0]
+    rollouts = osf.predict(np.stack([np.tile(away, (3, 1)), np.zeros((3, 3))]))
+    assert rollouts.names == table.state.names
+    assert rollouts.positions.shape == (2, 4, 2, 3)
+    np.testing.assert_allclose(rollouts.pusher[:, 0], np.tile(table.state.pusher, (2, 1)), atol=1e-6)
+    again = osf.predict(np.zeros((1, 3, 3)), table.state)
+    np.testing.assert_allclose(again.positions[0], rollouts.positions[1], atol=1e-6)
+    with pytest.raises(InvalidInput, match=r"action 0 of sequence 0 \[m/s\]"):
+        osf.predict(np.full((1, 1, 3), 9.0))
+
+
+def test_what_the_service_refuses_is_one_sentence(osf, live):
+    with pytest.raises(ServiceError, match=r"There is no object named 'teapot'; .*known:") as refused:
+        osf.new_scene(["teapot"])
+    assert refused.value.status == 422
+    with pytest.raises(ServiceError, match="There is no scene named") as unknown:
+        osf.image(scene="none")
+    assert unknown.value.status == 404
+    with Client(live.url) as plain, pytest.raises(ServiceError, match="steps"):
+        plain.episode({BOX: Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))}, steps=0)
+
+
+def test_a_service_that_is_not_there():
+    with Client("http://127.0.0.1:9") as osf, pytest.raises(ServiceError, match="start it with 'osf serve'") as silent:
+        osf.health()
+    assert silent.value.status == 0
+
+
+def talking_to(answer):
+    """A client of something that is played."""
+    return Client(connection=Connection(httpx2.Client(base_url="http://desk", transport=httpx2.MockTransport(answer))))
+
+
+def test_another_programs_answer_is_told_as_such():
+    page = talking_to(lambda request: httpx2.Response(404, text="<html>nothing here"))
+    with page as osf, pytest.raises(ServiceError, match=r"http://desk/api/health answered 404 as .*; give the address"):
+        osf.health()
+
+
+def test_an_episode_is_followed_over_a_broken_network(table, osf):
+    waiting = osf.episode({name: table.state.pose(name) for name in table.state.names})
+    known = {**_fields(next(waiting)), "id": "e1"}
+    osf.cancel(osf.episodes()[0])
+    streams = []
+
+    def answer(request):
+        if not request.url.path.endswith("/events"):
+            return httpx2.Response(200, json={**known, "status": "done" if len(streams) == 3 else "running"})
+        streams.append(request)
+        if len(streams) < 3:
+            raise httpx2.ReadError("cut", request=request)
+        return httpx2.Response(200, headers={"Content-Type": "text/event-stream"}, text="event: job\ndata: {}\n\n")
+
+    with talking_to(answer) as far:
+        assert [one.status for one in far.episode({})] == ["running", "done"]
+    assert len(streams) == 3
+
+
+def _fields(entry):
+    return json.loads(entry.model_dump_json())
+
+
+def test_an_estimate_that_waits_is_ended(osf, table, live):
+    _, job = live.request("POST", "/api/jobs", LONG)  # has the turn
+    follow = osf.estimate("first", seed=3)
+    waiting = next(follow)
+    assert (waiting.status, waiting.estimated, waiting.is_over) == ("queued", None, False)
+    osf.cancel(waiting)
+    assert [one.status for one in follow][-1] == "cancelled"
+    live.request("DELETE", f"/api/jobs/{job['id']}")
+
+
+@SLOW
+def test_an_observation_is_estimated(osf, library, tmp_path):
+    folder = tmp_path / "seen"
+    collect_observation(CollectObservation(folder, (BOTTLE,), size=64), library)
+    with pytest.raises(InvalidInput, match=r"a folder with observation.json in it"):
+        osf.estimate(observation=tmp_path)
+    *before, last = osf.estimate(observation=folder)
+    assert {one.status for one in before} <= {"queued", "running", "done"}
+    assert last.status == "done"
+    assert last.is_over
+    assert last.estimated.state.names == (BOTTLE,)
+    assert last.estimated.trusted
+
+
+@SLOW
+def test_an_episode_from_photo_to_files(osf, table, tmp_path):
+    poses = {name: table.state.pose(name) for name in table.state.names}
+    *before, last = osf.episode(poses, **TINY)
+    assert all(one.status in ("queued", "running", "done") for one in before)
+    assert (last.status, last.outcome, last.scene) == ("done", "reached", table.id)
+    assert max(last.steps[-1].to_goal_mm.values()) < 10
+    assert last.id in [one.id for one in osf.episodes()]
+    report = osf.download(last, "report.json", tmp_path)
+    assert json.loads(report.read_text())["steps"]
+    with pytest.raises(ServiceError):
+        osf.download(last, "none.json", tmp_path)
