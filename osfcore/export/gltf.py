@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
@@ -28,11 +27,6 @@ _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 _OPENCV_TO_GLTF = np.diag([1.0, -1, -1, 1])  # glTF's cameras look along -z with y up
 _NEAR_M = 0.01
 _MATTE = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # glTF's default is polished metal
-
-
-def as_linear(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The linear values that a screen shows as these, by the transfer function of sRGB (IEC 61966-2-1)."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def glb(
