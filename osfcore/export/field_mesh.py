@@ -29,11 +29,12 @@ def coloured_mesh(field: KiloOSF, light: Light | None = None) -> trimesh.Trimesh
         InvalidInput: if nothing in the field is solid.
     """
     import trimesh
+    from trimesh.visual import ColorVisuals
 
     vertices, faces = field_mesh(field)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     colours = baked_colours(field, vertices, np.array(mesh.vertex_normals), light)
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=to_uint8(linear_of_srgb(colours)))
+    mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(linear_of_srgb(colours)))
     return mesh
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
+from osfcore.geometry.poses import orthogonal_basis
 
 if TYPE_CHECKING:
     import trimesh
@@ -72,10 +73,9 @@ def camera_node(camera: Camera) -> str:
 
 
 def _add_light(scene: trimesh.Scene, light: Light) -> None:
-    from trimesh.geometry import align_vectors
-
-    matrix = align_vectors((0, 0, 1), light.direction)  # it shines along -z of its node
-    matrix[:3, 3] = light.position
+    right, up = orthogonal_basis(light.direction)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, up, light.direction, light.position], axis=1)  # it shines along -z of its node
     extras = {"gltf_extensions": {LIGHTS_EXTENSION: {"light": 0}}, "ambient": AMBIENT, "diffuse": DIFFUSE}
     scene.graph.update(frame_from=TABLE_FRAME, frame_to=LIGHT_NODE, matrix=matrix, metadata=extras)
     sun = {"type": "directional", "name": LIGHT_NODE, "color": [1.0, 1.0, 1.0], "intensity": DIFFUSE * np.pi}

@@ -70,16 +70,19 @@ def _table_mesh(table: TableField) -> trimesh.Trimesh:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     vertices = np.column_stack([half * corners, np.zeros(4)]).astype(np.float32)
     uv = (0.5 + (0.5 - inset) * corners).astype(np.float32)
-    texture = np.ascontiguousarray(to_uint8(table.albedo.swapaxes(0, 1)[::-1]))  # rows of an image run against y
+    colour = table.albedo * (table.ambient + table.direct(np.array([[0.0, 0.0, 1.0]])))  # fully lit, as of objects
+    texture = np.ascontiguousarray(to_uint8(colour.swapaxes(0, 1)[::-1]))  # rows of an image run against y
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    normals = np.tile(np.float32([0, 0, 1]), (4, 1))
+    normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     return light_mesh(TexturedMesh(vertices, normals, faces, uv, texture), MAX_TEXTURE_SIDE)
 
 
 def _pusher_mesh() -> trimesh.Trimesh:
     import trimesh
+    from trimesh.visual import ColorVisuals
 
     mesh = trimesh.creation.cylinder(PUSHER_RADIUS_M, PUSHER_HEIGHT_M, sections=48)
+    mesh.unmerge_vertices()  # its edges are sharp
     colours = np.tile(to_uint8(linear_of_srgb(np.array(PUSHER_ALBEDO))), (len(mesh.vertices), 1))
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colours)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=colours)
     return mesh

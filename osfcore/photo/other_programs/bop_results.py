@@ -2,10 +2,10 @@
 
     scene_id,im_id,obj_id,score,R,t,time
 
-R are 9 numbers, row by row, t 3 in mm, separated by spaces: x_camera = R x_model + t in the frame of BOP's model. Objects
-here have their origin at the centre of their bounding box; BOP's models of YCB-V have theirs there, too, and where the
-folder of other models is given, models_info.json tells where the centre lies. `time` is that of the whole image [s], -1
-where it is not known.
+R are 9 numbers, row by row, t 3 in mm, separated by spaces: x_camera = R x_model + t in the frame of BOP's model.
+Objects here have their origin at the centre of their bounding box; BOP's models of YCB-V have theirs there, too, and
+where the folder of other models is given, models_info.json tells where the centre lies. `time` is that of the whole
+image [s], -1 where it is not known.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ def read_bop_scene(
         name: next(cameras_in_world[i] @ annotated[i][name] for i in images if name in annotated[i]) for name in names
     }
     if table_prior is None:
-        _check_on_table(poses)
+        _check_over_table(cameras_in_world, poses)
     views = [_view(folder, image, entries[image], cameras_in_world[image], names, choice.encoding) for image in images]
     if len({camera.width / camera.height for camera, _, _ in views}) > 1:
         raise InvalidInput("sizes of the images", "not the same", "the same; choose images of one camera")
@@ -220,12 +220,19 @@ def _over_found_table(
     return {image: found.T_world_camera @ in_bop[first].inverse() @ pose for image, pose in in_bop.items()}
 
 
-def _check_on_table(poses: Mapping[str, Pose]) -> None:
+def _check_over_table(cameras: Mapping[int, Pose], poses: Mapping[str, Pose]) -> None:
+    """Cameras above z = 0, objects near it; a world that is one of the cameras fails."""
+    for image, camera in cameras.items():
+        if not camera.position[2] > _DEEPEST_M:
+            allowed = f"above a table at z = 0; {SCENE_CAMERA} seems to mean another world or unit than mm: {_HOW}"
+            raise InvalidInput(
+                f"height of image {image}'s camera in BOP's world [m]", f"{camera.position[2]:.3f}", allowed
+            )
     for name, pose in poses.items():
         x, y, z = pose.position
         if not -_DEEPEST_M <= z <= _HIGHEST_M or max(abs(x), abs(y)) > _WIDEST_M:
             place = f"({x:.2f}, {y:.2f}, {z:.2f})"
-            allowed = f"on a table at z = 0; {SCENE_CAMERA} seems to mean another world, or another unit than mm: {_HOW}"
+            allowed = f"on a table at z = 0; {SCENE_CAMERA} seems to mean another world or unit than mm: {_HOW}"
             raise InvalidInput(f"place of {name} in BOP's world [m]", place, allowed)
 
 
@@ -246,7 +253,7 @@ def _view(
     picture = linear_from_encoded(values, encoding)
     if raw.encoded.shape[1::-1] != size:
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    masks = np.zeros((len(names), *size[::-1]), bool)
+    found: Mapping[str, np.ndarray] = {}
     if any(name in names for name in scene_gt_names(folder / SCENE_GT, image)):
         try:
             found = read_masks(folder / MASKS, names, (raw.sent_size, size), image)
@@ -254,7 +261,8 @@ def _view(
             raise
         except OsfError as error:
             raise CorruptFile(folder / MASKS, str(error).rstrip(".")) from None
-        masks = np.stack([found.get(name, masks[k]) for k, name in enumerate(names)])
+    hidden = np.zeros(size[::-1], bool)
+    masks = np.stack([found.get(name, hidden) for name in names])
     return camera, np.clip(picture, 0, 1), masks
 
 
