@@ -8,7 +8,7 @@ import numpy as np
 
 from osfcore.dynamics.shapes.field_parts import field_mesh
 from osfcore.estimation.photometry.camera_response import linear_of_srgb
-from osfcore.export.baked import baked_colours
+from osfcore.export.baked import baked
 from osfcore.export.gltf import glb
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.light import Light
@@ -33,7 +33,7 @@ def coloured_mesh(field: KiloOSF, light: Light | None = None) -> trimesh.Trimesh
 
     vertices, faces = field_mesh(field)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    colours = baked_colours(field, vertices, np.array(mesh.vertex_normals), light)
+    colours = baked(field, vertices, np.array(mesh.vertex_normals), light).colours
     mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(linear_of_srgb(colours)))
     return mesh
 

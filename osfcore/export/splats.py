@@ -17,14 +17,14 @@ from jaxtyping import Float32
 from scipy.spatial import KDTree
 
 from osfcore.dynamics.shapes.field_parts import field_mesh
-from osfcore.export.baked import baked_colours
+from osfcore.export.baked import baked
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
 
 SH_C0 = 0.5 / np.sqrt(np.pi)  # the spherical harmonic of degree 0
 _OPACITY = 0.95
 _NEIGHBOURS = 6
-_WIDTH, _THICKNESS = 0.6, 0.1  # standard deviations across and along the normal, per distance to the neighbours
+_WIDTH, _THICKNESS = 0.45, 0.1  # standard deviations across and along the normal, per distance to the neighbours
 _FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -55,7 +55,7 @@ class Splats:
 
 
 def field_splats(field: KiloOSF, light: Light) -> Splats:
-    """Discs at the vertices of the field's surface, each triangle of which is cut into four.
+    """Discs where the field is seen below the vertices of its surface, each triangle of which is cut into four.
 
     Colours are the radiance seen along the normal: splats of degree 0 do not change with the view, nor any with the
     light. Discs are as wide as the mean distance to the six nearest neighbours asks for, much as Kerbl et al. begin.
@@ -70,13 +70,14 @@ def field_splats(field: KiloOSF, light: Light) -> Splats:
     import trimesh
 
     mesh = trimesh.Trimesh(*field_mesh(field), process=False).subdivide()
-    points, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
-    distances, _ = KDTree(points).query(points, k=_NEIGHBOURS + 1)
+    normals = np.array(mesh.vertex_normals)
+    seen = baked(field, np.array(mesh.vertices), normals, light)
+    distances, _ = KDTree(seen.points).query(seen.points, k=_NEIGHBOURS + 1)
     spacing = distances[:, 1:].mean(axis=1, keepdims=True)
     return Splats(
-        points.astype(np.float32),
+        seen.points,
         normals.astype(np.float32),
-        baked_colours(field, points, normals, light),
+        seen.colours,
         (spacing * (_WIDTH, _WIDTH, _THICKNESS)).astype(np.float32),
         _from_z(normals),
         _OPACITY,

@@ -135,7 +135,9 @@ def test_a_field_s_surface_has_its_colours(light, one_thread):
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices / HALF, axis=1), 1, atol=0.05)
     normals = mesh.vertices / HALF**2
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    shade = np.ones((1, 1)) if light is None else 0.25 + 0.75 * np.maximum(normals @ light.direction, 0)[:, None]
+    shade = (
+        np.ones((len(normals), 1)) if light is None else 0.25 + 0.75 * np.maximum(normals @ light.direction, 0)[:, None]
+    )
     colours = np.asarray(mesh.visual.vertex_attributes["color"])[:, :3] / 255
     np.testing.assert_allclose(colours, linear_of_srgb(shade * np.array(ALBEDO)), atol=0.06)
     (material,) = tree["materials"]

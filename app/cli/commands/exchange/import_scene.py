@@ -43,13 +43,15 @@ class Import:
         """Import; the result tells images and objects."""
         from osfcore.io.files import folder_at_once, write_json
         from osfcore.io.observation_file import write_observation
-        from osfcore.photo.other_programs.bop_scene import BopChoice, read_bop_scene
+        from osfcore.photo.other_programs.bop_images import BopChoice
+        from osfcore.photo.other_programs.bop_scene import read_bop_scene
 
         out = self.out.absolute()
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InvalidInput("output folder", self.out, "new or empty")
-        choice = BopChoice(self.images, self.names, self.encoding, self.models)
-        scene = read_bop_scene(self.scene, choice, self._prior if self.table == "objects" else None)
+        choice = BopChoice(self.images, self.encoding, self.models)
+        prior = self._prior if self.table == "objects" else None
+        scene = read_bop_scene(self.scene, choice, self.names, prior)
         poses = {
             name: {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
             for name, pose in scene.poses.items()

@@ -82,7 +82,16 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
     for name in NAMES:
         np.testing.assert_allclose(poses[name]["position"], rendered[1].pose(name).position, atol=1e-6)
     state.write_text(json.dumps(scene_to_json(Scene(rendered[1], ()))))
-    arguments = ["--state", str(state), "--observation", str(seen), "--scene", "48", "--out", str(tmp_path / "ours.csv")]
+    arguments = [
+        "--state",
+        str(state),
+        "--observation",
+        str(seen),
+        "--scene",
+        "48",
+        "--out",
+        str(tmp_path / "ours.csv"),
+    ]
     assert main(["export", "bop", *arguments]) == 0
     assert "4 poses in 2 images of scene 48" in capsys.readouterr().out
     assert len((tmp_path / "ours.csv").read_text().splitlines()) == 5
