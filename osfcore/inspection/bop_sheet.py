@@ -49,7 +49,7 @@ def _fits(image: BopImage, name: str) -> bool:
 
 
 def bop_sheet(images: Sequence[BopImage]) -> UInt8[np.ndarray, "H W 3"]:
-    """A tile for each of up to eight images, BGR: outlines of the masks, and the axes of each annotated object, 5 cm."""
+    """A tile for each of up to eight images, BGR: outlines of masks, and axes of 5 cm of each annotated object."""
     tiles = [_tile(image) for image in images[:_MOST_TILES]]
     columns = min(_COLUMNS, len(tiles))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)

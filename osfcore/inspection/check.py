@@ -179,8 +179,8 @@ def draw_overlay(path: Path, out: Path) -> None:
     observation see `observation_sheet`, for a scene of BOP `bop_sheet`.
 
     Args:
-        path: folder of an observation or scene of BOP, or folder or zip of an image set; it may be a set in which `check_path` found
-            contradicting silhouettes.
+        path: folder of an observation or scene of BOP, or folder or zip of an image set; it may be a set in which
+            `check_path` found contradicting silhouettes.
         out: PNG to write.
 
     Raises:

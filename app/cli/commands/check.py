@@ -14,9 +14,7 @@ from osfcore.errors import CorruptFile, OsfError
 
 @dataclass(frozen=True)
 class Check:
-    """Validate a scene.json or state.json, a folder with an observation, image set or scene of BOP, a push file or a
-    field.
-    """
+    """Validate a scene, a state, a push file, a field, or a folder: an observation, image set or scene of BOP."""
 
     path: tyro.conf.Positional[Path]
     """File or folder to check; an image set may be zipped."""
