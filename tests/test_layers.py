@@ -34,6 +34,7 @@ ROOMS = (
     "osfcore.control",
     "osfcore.paper",
     "osfcore.world",
+    "osfcore.export",
     "osfcore.inspection",
     "osfcore.experiments",
     "app.processes",

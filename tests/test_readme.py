@@ -20,7 +20,10 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 GUIDES = [
     ROOT / "README.md",
-    *(ROOT / "docs" / f"{name}.md" for name in ("command-line", "rest", "own-objects", "evaluation", "photos")),
+    *(
+        ROOT / "docs" / f"{name}.md"
+        for name in ("command-line", "exchange", "rest", "own-objects", "evaluation", "photos")
+    ),
 ]
 OSF = Path(sys.executable).with_name("osf")
 

@@ -18,6 +18,8 @@ from app.cli.commands.episode import RunEpisode
 from app.cli.commands.estimate import Estimate
 from app.cli.commands.evaluate import Evaluate
 from app.cli.commands.evaluations.reproduce import ReproduceCommand
+from app.cli.commands.exchange.export import Export
+from app.cli.commands.exchange.import_scene import Import
 from app.cli.commands.photo import Photo
 from app.cli.commands.predict import Predict
 from app.cli.commands.recordings.clip import Clip
@@ -58,6 +60,8 @@ Commands = Annotated[
         ReproduceCommand, tyro.conf.subcommand("reproduce", description="The paper's experiments in one report.")
     ]
     | Annotated[Bench, tyro.conf.subcommand("bench", description="Measure what things cost on this machine.")]
+    | Annotated[Export, tyro.conf.subcommand("export", description="Scenes, fields and poses for other programs.")]
+    | Annotated[Import, tyro.conf.subcommand("import", description="Data sets of others for 'osf estimate'.")]
     | Annotated[Backup, tyro.conf.subcommand("backup", description="Write all that the service keeps to one zip.")]
     | Annotated[Restore, tyro.conf.subcommand("restore", description="Make a data directory from a backup.")]
     | Annotated[Check, tyro.conf.subcommand("check", description="Check a file or folder of any kind.")],

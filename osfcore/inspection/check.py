@@ -17,6 +17,7 @@ from osfcore.fields.field_weights import FORMAT as FIELD_FORMAT
 from osfcore.fields.field_weights import read_field, tensor_format
 from osfcore.fields.table_field import TABLE_FORMAT, read_table
 from osfcore.fields.training.visual_hull import carve, silhouette_box
+from osfcore.inspection.bop_sheet import bop_sheet, check_places
 from osfcore.inspection.image_set_overlay import overlay_sheet
 from osfcore.inspection.observation_overlay import observation_sheet
 from osfcore.io.archives import unpack_set
@@ -28,6 +29,7 @@ from osfcore.io.output_paths import check_place
 from osfcore.io.rollout_file import actions_from_json
 from osfcore.io.scene_file import scene_from_json
 from osfcore.io.state_file import estimated_from_json, is_estimated
+from osfcore.photo.other_programs.bop_images import is_bop_scene, read_images
 
 _REASON_CHARACTERS = 500
 
@@ -37,7 +39,7 @@ class Report:
     """What a file turned out to be.
 
     Attributes:
-        kind: "scene", "state", "observation", "image set", "push file",
+        kind: "scene", "state", "observation", "scene of BOP", "image set", "push file",
             "actions", "field" or "dynamics".
         summary: its contents in words.
         facts: its contents in numbers.
@@ -56,6 +58,8 @@ def check_path(path: Path) -> Report:
     """
     if is_observation(path):
         return _check_observation(path)
+    if is_bop_scene(path):
+        return _check_bop(path)
     if path.is_dir() or path.suffix.lower() == ".zip":
         with _unpacked(path) as folder:
             return _check_image_set(folder)
@@ -69,7 +73,7 @@ def check_path(path: Path) -> Report:
         return _check_field(path)
     kinds = (
         "a .json scene, state or actions, a .h5 push file, a .safetensors field or network, "
-        "nor the folder of an observation or image set"
+        "nor the folder of an observation, image set or scene of BOP"
     )
     raise CorruptFile(path, f"it is neither {kinds}")
 
@@ -96,6 +100,20 @@ def _check_observation(folder: Path) -> Report:
     facts["masks"] = 0 if observation.masks is None else int(observation.masks.any(axis=(2, 3)).sum())
     views = f"{facts['cameras']} view{'s' * (facts['cameras'] != 1)} of {width} x {height} px"
     return Report("observation", f"{views}, {facts['objects']} objects, {facts['masks']} masks", facts)
+
+
+def _check_bop(folder: Path) -> Report:
+    images = read_images(folder)
+    try:
+        check_places(images)
+    except InvalidInput as error:
+        raise CorruptFile(folder, str(error).rstrip(".")) from None
+    names = {name for image in images for name in image.poses}
+    facts = {"images": len(images), "objects": len(names), "masks": sum(len(image.masks) for image in images)}
+    facts["cameras in a world"] = sum(image.T_camera_world is not None for image in images)
+    world = "cameras in one world" if facts["cameras in a world"] == len(images) else "cameras without a common world"
+    summary = f"{facts['images']} images of {facts['objects']} objects, {facts['masks']} masks, {world}"
+    return Report("scene of BOP", summary, facts)
 
 
 def _check_field(path: Path) -> Report:
@@ -158,11 +176,11 @@ def draw_overlay(path: Path, out: Path) -> None:
     For some images of a set that is the world's axes (x red, y green, z blue), the direction of the light (yellow) and
     the box that holds every silhouette (magenta). Where cameras and silhouettes contradict each other there is no such
     box; one of about the object's size is drawn where most cameras look, and lies beside the silhouettes. For an
-    observation see `observation_sheet`.
+    observation see `observation_sheet`, for a scene of BOP `bop_sheet`.
 
     Args:
-        path: folder of an observation, or folder or zip of an image set; it may be a set in which `check_path` found
-            contradicting silhouettes.
+        path: folder of an observation or scene of BOP, or folder or zip of an image set; it may be a set in which
+            `check_path` found contradicting silhouettes.
         out: PNG to write.
 
     Raises:
@@ -171,8 +189,13 @@ def draw_overlay(path: Path, out: Path) -> None:
         CannotWrite: if it cannot be written.
     """
     check_overlay_place(out)
-    sheet = observation_sheet(read_observation(path)) if is_observation(path) else _set_sheet(path)
-    write_png(out, sheet[..., ::-1])
+    write_png(out, _sheet(path)[..., ::-1])
+
+
+def _sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    if is_observation(path):
+        return observation_sheet(read_observation(path))
+    return bop_sheet(read_images(path)) if is_bop_scene(path) else _set_sheet(path)
 
 
 def _set_sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:

@@ -51,7 +51,7 @@ def _tile(observation: Observation, view: int) -> UInt8[np.ndarray, "h w 3"]:
     _draw_workspace(bgr, camera)
     if observation.masks is not None:
         for number, name in enumerate(observation.names):
-            _draw_mask(bgr, observation.masks[view, number], name, object_colour(number))
+            draw_mask(bgr, observation.masks[view, number], name, object_colour(number))
     for axis, colour, letter in zip(np.eye(3), (_RED, _GREEN, _BLUE), "xyz", strict=True):
         draw_line(bgr, camera, np.zeros(3), _AXIS_M * axis, colour, 2, letter)
     if observation.pusher is not None:
@@ -70,7 +70,7 @@ def _draw_workspace(bgr: UInt8[np.ndarray, "h w 3"], camera: Camera) -> None:
         draw_line(bgr, camera, a, b, _WHITE, 1)
 
 
-def _draw_mask(
+def draw_mask(
     bgr: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "H W"], name: str, colour: tuple[int, int, int]
 ) -> None:
     """The outline of a mask, and its name beside its top."""

@@ -14,13 +14,13 @@ from osfcore.errors import CorruptFile, OsfError
 
 @dataclass(frozen=True)
 class Check:
-    """Validate a scene.json or state.json, a folder with an observation or image set, a push file or a field."""
+    """Validate a scene, a state, a push file, a field, or a folder: an observation, image set or scene of BOP."""
 
     path: tyro.conf.Positional[Path]
     """File or folder to check; an image set may be zipped."""
     overlay: Path | None = None
     """For an image set: PNG to write, with axes, light and the silhouettes' box drawn into some of its images; for an
-    observation with axes, workspace and masks."""
+    observation with axes, workspace and masks; for a scene of BOP with masks and the annotated objects' axes."""
     json: bool = False
     """Print the result as one JSON object in the last line."""
 

@@ -1,0 +1,1 @@
+"""The commands that write for other programs, and read what they wrote."""

@@ -1,0 +1,1 @@
+"""Scenes and fields as files that other programs open: binary glTF and Gaussian splats."""

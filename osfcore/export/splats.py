@@ -1,0 +1,116 @@
+"""A field as Gaussian splats (Kerbl et al. 2023): flat discs on its surface, with the lighting baked in.
+
+The file is the PLY that 3D Gaussian splatting writes and viewers read, of spherical harmonics of degree 0:
+
+    x y z  nx ny nz  f_dc_0..2  opacity  scale_0..2  rot_0..3                               float32 each
+
+with colour = 1/2 + C0 f_dc, opacity = sigmoid(opacity), standard deviations = exp(scale) [m] along the axes of the unit
+quaternion rot (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.spatial import KDTree
+
+from osfcore.dynamics.shapes.field_parts import field_mesh
+from osfcore.export.baked import baked
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
+
+SH_C0 = 0.5 / np.sqrt(np.pi)  # the spherical harmonic of degree 0
+_OPACITY = 0.95
+_NEIGHBOURS = 6
+_WIDTH, _THICKNESS = 0.45, 0.1  # standard deviations across and along the normal, per distance to the neighbours
+_FIELDS = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Splats:
+    """Gaussians in the field's frame.
+
+    Attributes:
+        means: centres [m].
+        normals: unit, outward.
+        colours: in [0, 1], the same from all sides.
+        deviations: along each Gaussian's own axes [m].
+        quaternions: from its axes to the field's frame (w, x, y, z); its z axis is the normal.
+        opacity: of all of them.
+        light: under which the colours are.
+    """
+
+    means: Float32[np.ndarray, "S 3"]
+    normals: Float32[np.ndarray, "S 3"]
+    colours: Float32[np.ndarray, "S 3"]
+    deviations: Float32[np.ndarray, "S 3"]
+    quaternions: Float32[np.ndarray, "S 4"]
+    opacity: float
+    light: Light
+
+
+def field_splats(field: KiloOSF, light: Light) -> Splats:
+    """Discs where the field is seen below the vertices of its surface, each triangle of which is cut into four.
+
+    Colours are the radiance seen along the normal: splats of degree 0 do not change with the view, nor any with the
+    light. Discs are as wide as the mean distance to the six nearest neighbours asks for, much as Kerbl et al. begin.
+
+    Args:
+        field: of the object.
+        light: toward it, in the field's frame.
+
+    Raises:
+        InvalidInput: if nothing in the field is solid.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(*field_mesh(field), process=False).subdivide()
+    normals = np.array(mesh.vertex_normals)
+    seen = baked(field, np.array(mesh.vertices), normals, light)
+    distances, _ = KDTree(seen.points).query(seen.points, k=_NEIGHBOURS + 1)
+    spacing = distances[:, 1:].mean(axis=1, keepdims=True)
+    return Splats(
+        seen.points,
+        normals.astype(np.float32),
+        seen.colours,
+        (spacing * (_WIDTH, _WIDTH, _THICKNESS)).astype(np.float32),
+        _from_z(normals),
+        _OPACITY,
+        light,
+    )
+
+
+def _from_z(normals: np.ndarray) -> Float32[np.ndarray, "S 4"]:
+    """The shortest rotations from z to unit vectors: (1 + n_z, -n_y, n_x, 0), brought to length 1."""
+    q = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
+    q[normals[:, 2] < -1 + 1e-6] = (0, 1, 0, 0)  # straight down: half a turn about x
+    return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+
+
+def splats_ply(splats: Splats) -> bytes:
+    """A binary PLY; its comments say under which light the colours are."""
+    x, y, z = splats.light.direction
+    header = (
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment Lighting is baked in: light toward ({x:.4f}, {y:.4f}, {z:.4f}), "
+        f"ambient {AMBIENT:g}, diffuse {DIFFUSE:g}; it cannot be lit anew.",
+        "comment Object frame, z up, metres.",
+        f"element vertex {len(splats.means)}",
+        *(f"property float {name}" for name in _FIELDS),
+        "end_header\n",
+    )
+    columns = (
+        splats.means,
+        splats.normals,
+        (splats.colours - 0.5) / SH_C0,
+        np.full((len(splats.means), 1), np.log(splats.opacity / (1 - splats.opacity))),
+        np.log(splats.deviations),
+        splats.quaternions,
+    )
+    return "\n".join(header).encode("ascii") + np.concatenate(columns, axis=1).astype("<f4").tobytes()

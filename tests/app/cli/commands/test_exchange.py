@@ -1,0 +1,118 @@
+"""`osf export` and `osf import`: what they write, and what they say of mistakes."""
+
+import io
+import json
+
+import gsply
+import numpy as np
+import pytest
+import trimesh
+
+from app.cli.main import main
+from osfcore.fields.field_weights import write_field
+from osfcore.geometry.cameras import default_cameras
+from osfcore.io.observation_file import read_observation
+from osfcore.io.scene_file import Scene, scene_to_json
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
+from tests.core.export.test_splats import HALF, ellipsoid_field
+from tests.core.photo.other_programs.bop_scenes import write_bop_scene
+
+NAMES = ("003_cracker_box", "006_mustard_bottle")
+
+
+@pytest.fixture(scope="module")
+def rendered(library):
+    cameras = default_cameras(64)
+    world = Tabletop(library, cameras=cameras, request=SceneRequest(NAMES, 2))
+    try:
+        world.arrange(3)
+        return world.render(cameras, masks=True, with_pusher=False), world.truth()
+    finally:
+        world.close()
+
+
+@pytest.fixture
+def field_file(tmp_path):
+    path = tmp_path / "solid.safetensors"
+    write_field(path, ellipsoid_field())
+    return path
+
+
+def result_of(capsys):
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_a_scene_comes_with_meshes_where_there_are_some(rendered, data_dir, tmp_path, capsys):
+    scene = tmp_path / "scene.json"
+    scene.write_text(json.dumps(scene_to_json(Scene(rendered[1], default_cameras(64)))))
+    arguments = ["export", "scene", "--scene", str(scene), "--out", str(tmp_path / "scene.glb"), "--json"]
+    assert main([*arguments, "--data-dir", str(data_dir)]) == 0
+    result = result_of(capsys)
+    assert (sorted(result["meshes"]), result["fields"]) == (list(NAMES), [])
+    content = (tmp_path / "scene.glb").read_bytes()
+    assert len(content) == result["bytes"]
+    read = trimesh.load_scene(io.BytesIO(content), file_type="glb")
+    assert set(NAMES) | {"table", "pusher"} == set(read.geometry)
+
+
+def test_a_field_from_a_file_becomes_a_mesh(field_file, tmp_path, capsys):
+    out = tmp_path / "solid.glb"
+    assert main(["export", "field", str(field_file), "--out", str(out), "--light", "1", "0", "1"]) == 0
+    assert "those under the light toward (1.0, 0.0, 1.0), baked in" in capsys.readouterr().out
+    mesh = trimesh.load_scene(out).geometry["solid"]
+    np.testing.assert_allclose(mesh.extents, 2 * HALF, atol=2e-3)
+
+
+def test_splats_say_that_their_light_is_baked_in(field_file, tmp_path, capsys):
+    out = tmp_path / "solid.ply"
+    assert main(["export", "splats", str(field_file), "--out", str(out)]) == 0
+    assert "lighting baked in, light toward (0.0, 0.0, 1.0)" in capsys.readouterr().out
+    assert b"comment Lighting is baked in: light toward (0.0000, 0.0000, 1.0000)" in out.read_bytes()[:300]
+    np.testing.assert_allclose(np.ptp(gsply.plyread(out).means, axis=0), 2 * HALF, atol=4e-3)
+
+
+def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsys):
+    write_bop_scene(tmp_path / "000048", *rendered)
+    seen, state = tmp_path / "seen", tmp_path / "state.json"
+    assert main(["import", "bop", str(tmp_path / "000048"), "--out", str(seen), "--images", "3", "9", "--json"]) == 0
+    assert result_of(capsys) == {"out": str(seen), "images": [3, 9], "objects": list(NAMES)}
+    assert [camera.name for camera in read_observation(seen).cameras] == ["3", "9"]
+    poses = json.loads((seen / "poses.json").read_text())
+    for name in NAMES:
+        np.testing.assert_allclose(poses[name]["position"], rendered[1].pose(name).position, atol=1e-6)
+    state.write_text(json.dumps(scene_to_json(Scene(rendered[1], ()))))
+    arguments = [
+        "--state",
+        str(state),
+        "--observation",
+        str(seen),
+        "--scene",
+        "48",
+        "--out",
+        str(tmp_path / "ours.csv"),
+    ]
+    assert main(["export", "bop", *arguments]) == 0
+    assert "4 poses in 2 images of scene 48" in capsys.readouterr().out
+    assert len((tmp_path / "ours.csv").read_text().splitlines()) == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("export", "scene", "--scene", "none.json", "--out", "a.glb"), "none.json cannot be used"),
+        (("export", "field", "009_gelatin_box", "--out", "a.obj"), "must be a path that ends in .glb"),
+        (("export", "field", "spoon", "--out", "a.glb"), "There is no field named 'spoon'"),
+        (("export", "splats", "009_gelatin_box", "--out", "a.glb"), "must be a path that ends in .ply"),
+        (("export", "splats", "009_gelatin_box", "--out", "a.ply", "--light", "0", "0", "-1"), "light elevation"),
+        (("import", "bop", "none", "--out", "a"), "scene_camera.json cannot be used"),
+        (("import", "bop", "none", "--out", "."), "must be new or empty"),
+    ],
+)
+def test_mistakes_are_told_in_words(arguments, sentence, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "something").write_text("")
+    assert main([*arguments]) == 1
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert error.count("\n") == 1

@@ -1,0 +1,155 @@
+"""Exported scenes as trimesh and plain JSON read them: geometry, colours, cameras and light."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import KDTree
+
+from osfcore.estimation.photometry.camera_response import linear_of_srgb
+from osfcore.export.field_mesh import field_glb
+from osfcore.export.gltf import glb
+from osfcore.export.scene_glb import scene_glb
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.states import SceneState
+from osfcore.io.scene_file import Scene
+from tests.core.export.test_splats import ALBEDO, HALF, ellipsoid_field
+
+MUSTARD, GELATIN = "006_mustard_bottle", "009_gelatin_box"
+CAMERAS = default_cameras(64)
+LIGHT = Light(np.array([1.0, -0.5, 0.8]))
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from glTF's axes to ours
+
+
+def tree_of(content):
+    length = int.from_bytes(content[12:16], "little")
+    return json.loads(content[20 : 20 + length])
+
+
+def read_back(content):
+    return trimesh.load_scene(io.BytesIO(content), file_type="glb")
+
+
+def pose_in(scene, node):
+    """`T_world_node` in our axes."""
+    matrix = scene.graph.get(node)[0]
+    return np.block([[Z_UP @ matrix[:3, :3], (Z_UP @ matrix[:3, 3])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    quaternions = quaternion_exp(np.array([[0, 0, 0.4], [1.2, 0.3, -0.5]]))
+    poses = Pose(np.array([[0.05, -0.1, 0.095], [-0.1, 0.02, 0.05]]), quaternions)
+    return Scene(SceneState((MUSTARD, "solid"), poses, LIGHT, np.array([0.0, 0.1, 0.062])), CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def content(scene, library, one_thread):
+    shapes = {MUSTARD: library.load(MUSTARD).mesh, "solid": ellipsoid_field()}
+    return scene_glb(scene, shapes, FieldLibrary(None).load_table())
+
+
+def test_everything_stands_where_the_scene_says_with_y_up(scene, content, library):
+    read = read_back(content)
+    assert set(read.geometry) == {"table", "pusher", MUSTARD, "solid"}
+    for name in scene.state.names:
+        np.testing.assert_allclose(pose_in(read, name), scene.state.pose(name).matrix(), atol=1e-6)
+    mesh = library.load(MUSTARD).mesh
+    np.testing.assert_allclose(read.geometry[MUSTARD].vertices, mesh.vertices, atol=1e-6)
+    np.testing.assert_allclose(read.bounds[:, 1], [0, (scene.state.pose(MUSTARD).apply(mesh.vertices))[:, 2].max()],
+                               atol=2e-3)  # fmt: skip
+    np.testing.assert_allclose(read.geometry["table"].extents, [1.2, 1.2, 0], atol=1e-6)
+
+
+def test_the_light_is_read_back(content):
+    tree, read = tree_of(content), read_back(content)
+    (sun,) = tree["extensions"]["KHR_lights_punctual"]["lights"]
+    assert "KHR_lights_punctual" in tree["extensionsUsed"]
+    assert (sun["type"], sun["color"]) == ("directional", [1, 1, 1])
+    assert sun["intensity"] / np.pi == pytest.approx(0.75)
+    (node,) = (n for n in tree["nodes"] if n.get("extensions") == {"KHR_lights_punctual": {"light": 0}})
+    assert node["extras"]["ambient"] == 0.25
+    np.testing.assert_allclose(pose_in(read, node["name"])[:3, 2], LIGHT.direction, atol=1e-6)
+
+
+@given(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.2, 1)))
+def test_any_light_has_a_rigid_node_that_shines_away_from_it(position):
+    light = Light(np.array(position))
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((0.1, 0.1, 0.1)), node_name="box")
+    matrix = pose_in(read_back(glb(scene, light=light)), "light")
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(matrix[:3, :3]) > 0
+    np.testing.assert_allclose(matrix[:3, 2], light.direction, atol=1e-6)
+
+
+def test_cameras_see_points_where_ours_do(content):
+    tree = tree_of(content)
+    (root,) = (tree["nodes"][number] for number in tree["scenes"][0]["nodes"])
+    np.testing.assert_allclose(np.array(root["matrix"]).reshape(4, 4).T[:3, :3], Z_UP.T, atol=1e-9)
+    hanging = {tree["nodes"][number]["name"] for number in root["children"]}
+    assert {f"camera {camera.name}" for camera in CAMERAS} <= hanging
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3))
+    for number, camera in enumerate(CAMERAS):
+        (node,) = (n for n in tree["nodes"] if n.get("camera") == number)
+        matrix = np.array(node["matrix"]).reshape(4, 4).T  # trimesh reads the first camera alone
+        local = (points - matrix[:3, 3]) @ matrix[:3, :3]
+        perspective = tree["cameras"][number]["perspective"]
+        focal = 1 / np.tan(perspective["yfov"] / 2)
+        x, y = local[:, 0] / -local[:, 2] * focal / perspective["aspectRatio"], local[:, 1] / -local[:, 2] * focal
+        pixels = np.stack([(1 + x) / 2 * camera.width, (1 - y) / 2 * camera.height], axis=1)
+        np.testing.assert_allclose(pixels, camera.project(points), atol=1e-4)
+        assert tree["cameras"][number]["extras"]["K"] == camera.intrinsics.tolist()
+
+
+def test_the_texture_is_kept(content, library):
+    image = np.asarray(read_back(content).geometry[MUSTARD].visual.material.baseColorTexture, float)
+    texture = library.load(MUSTARD).mesh.texture
+    assert image.shape == texture.shape
+    assert np.abs(image - texture).mean() < 4  # of 255; JPEG
+
+
+def test_the_table_s_texture_lies_as_its_albedo_does(scene):
+    table = FieldLibrary(None).load_table()
+    albedo = np.zeros_like(table.albedo)
+    albedo[-1, 0] = 1  # at x = 0.6, y = -0.6
+    content = scene_glb(Scene(SceneState((), Pose.identity(0), LIGHT, None), ()), {}, type(table)(
+        table.half_side, albedo, table.ambient, table.background, table.w1, table.b1, table.w2, table.b2))  # fmt: skip
+    mesh = read_back(content).geometry["table"]
+    colours = trimesh.visual.color.uv_to_interpolated_color(mesh.visual.uv, mesh.visual.material.baseColorTexture)
+    bright = mesh.vertices[np.argmax(colours[:, :3].sum(axis=1))]
+    np.testing.assert_allclose(bright, [0.6, -0.6, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("light", [None, LIGHT])
+def test_a_field_s_surface_has_its_colours(light, one_thread):
+    content = field_glb(ellipsoid_field(), "solid", light)
+    tree, mesh = tree_of(content), read_back(content).geometry["solid"]
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices / HALF, axis=1), 1, atol=0.05)
+    normals = mesh.vertices / HALF**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    shade = (
+        np.ones((len(normals), 1)) if light is None else 0.25 + 0.75 * np.maximum(normals @ light.direction, 0)[:, None]
+    )
+    colours = np.asarray(mesh.visual.vertex_attributes["color"])[:, :3] / 255
+    np.testing.assert_allclose(colours, linear_of_srgb(shade * np.array(ALBEDO)), atol=0.06)
+    (material,) = tree["materials"]
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert ("KHR_materials_unlit" in material.get("extensions", {})) == (light is not None)
+
+
+def test_the_surface_of_a_trained_field_is_that_of_the_scanned_mesh(library, one_thread):
+    surface = read_back(field_glb(FieldLibrary(None).load(GELATIN), GELATIN)).geometry[GELATIN]
+    mesh = library.load(GELATIN).mesh
+    scanned = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    np.testing.assert_allclose(surface.bounds, scanned.bounds, atol=3e-3)
+    a, b = (trimesh.sample.sample_surface(m, 20_000, seed=0)[0] for m in (surface, scanned))
+    chamfer = (KDTree(a).query(b)[0].mean() + KDTree(b).query(a)[0].mean()) / 2
+    assert chamfer < 2e-3
