@@ -15,6 +15,7 @@ A map of the rooms, each importing only from those above it:
     control      Algorithm 1 of the paper as a generator of events over a `World`
     paper        the paper's dynamics model as published, to compare ours with
     world        the simulated tabletop (PyBullet) and data collection
+    environments the tabletop as a Gymnasium environment, for programs that learn
     inspection   checks of files, and pictures of how they were understood
     experiments  evaluations and benchmarks; only the command line imports it
 
