@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_REACH_M
+from osfcore.geometry.workspace import PUSHER_REACH_M, TABLE_SIDE_M
 
 Kind = Literal["poses", "pixels", "both"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -31,7 +31,8 @@ def space_of(kind: Kind, objects: int, available: int, views: int, side: int) ->
     goal: dict[str, gymnasium.Space[Any]] = {}
     if kind != "pixels":
         spaces["objects"] = gymnasium.spaces.MultiDiscrete([available] * objects)
-        spaces["poses"] = goal["poses"] = box(-np.inf, np.inf, (objects, 7), np.float64)
+        limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (objects, 1))
+        spaces["poses"] = goal["poses"] = box(-limits, limits, dtype=np.float64)
     if kind != "poses":
         spaces["pixels"] = box(0, 255, (views, side, side, 3), np.uint8)
         goal["pixels"] = box(0, 255, (side, side, 3), np.uint8)
@@ -39,10 +40,14 @@ def space_of(kind: Kind, objects: int, available: int, views: int, side: int) ->
 
 
 def poses_of(state: SceneState) -> Float[np.ndarray, "N 7"]:
-    """Position [m] and quaternion (w, x, y, z) of each object; q and -q are one rotation, told with w >= 0."""
+    """Position [m] and quaternion (w, x, y, z) of each object.
+
+    q and -q are one rotation, told with w >= 0; what has fallen off the table is told within 1.2 m of its centre.
+    """
     quaternions = state.poses.quaternion
     signs = np.where(quaternions[:, :1] < 0, -1.0, 1.0)
-    return np.concatenate([state.poses.position, signs * quaternions], axis=1)
+    positions = state.poses.position.clip(-TABLE_SIDE_M, TABLE_SIDE_M)
+    return np.concatenate([positions, (signs * quaternions).clip(-1, 1)], axis=1)
 
 
 def observation_of(
