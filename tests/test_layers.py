@@ -20,6 +20,7 @@ ROOMS = (
     "osfcore.errors",
     "osfcore.progress",
     "osfcore.random_streams",
+    "osfcore.plugins",
     "osfcore.geometry",
     "osfcore.io",
     "osfcore.objects",

@@ -13,6 +13,7 @@ from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import Event, Stepped
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
+from osfcore.control.parts import EpisodeParts
 from osfcore.control.scene_models import SceneModels
 from osfcore.experiments.rearrangement.factors import Factor, VariedWorld
 from osfcore.experiments.rearrangement.methods import LoopParts, Variant, told_truths
@@ -89,7 +90,7 @@ def run_from_images(
             events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
         else:
             target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal
-            events = Episode(world, parts.models, target, settings, rng, estimators=parts.estimators).run()
+            events = Episode(world, parts.models, target, settings, rng, parts=EpisodeParts(parts.estimators)).run()
         for event in events:
             if isinstance(event, Stepped):
                 yield TrueState(world.truth())
