@@ -1,4 +1,4 @@
-"""Parts that other packages offer, found by name: entry points of the groups osf.worlds, osf.costs, osf.planners, osf.estimators.
+"""Parts that other packages offer by entry points of the groups osf.worlds, osf.costs, osf.planners, osf.estimators.
 
 An entry point names a factory: a class or function that takes what its kind of part is made from (`WorldInputs`,
 `CostInputs`, `PlannerInputs`, or the data directory) and returns the part. Names of ours cannot be taken.

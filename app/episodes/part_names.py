@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from osfcore.control.parts import ESTIMATOR, ESTIMATORS, EpisodeParts
+from osfcore.control.estimators import ESTIMATOR, ESTIMATORS, EpisodeParts
 from osfcore.planning.parts import COST, COSTS, PLANNER, PLANNERS
 from osfcore.plugins import part_factory
 

@@ -70,7 +70,7 @@ class EpisodeOrder:
     goal_side: int = DEFAULT_IMAGE_SIDE
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     device: str = "cpu"
-    parts: PartNames = PartNames()
+    parts: PartNames = field(default_factory=PartNames)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

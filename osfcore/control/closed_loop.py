@@ -17,6 +17,7 @@ from jaxtyping import Float
 from osfcore.control import monitor
 from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
 from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.estimators import EpisodeParts
 from osfcore.control.events import (
     ActionExecuted,
     Event,
@@ -31,7 +32,6 @@ from osfcore.control.events import (
     Stepped,
 )
 from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
-from osfcore.control.parts import EpisodeParts
 from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels

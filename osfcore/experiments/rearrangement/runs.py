@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.estimators import EpisodeParts
 from osfcore.control.events import Event, Stepped
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
-from osfcore.control.parts import EpisodeParts
 from osfcore.control.scene_models import SceneModels
 from osfcore.experiments.rearrangement.factors import Factor, VariedWorld
 from osfcore.experiments.rearrangement.methods import LoopParts, Variant, told_truths
