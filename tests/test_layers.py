@@ -57,6 +57,7 @@ OWNERS = {  # who alone may import a package
     "gymnasium": ("osfcore.environments",),
     "gym_pusht": ("osfcore.experiments.benchmarks.pusht.environment",),
     "pytorch_mppi": ("osfcore.experiments.benchmarks.pusht.planners",),
+    "foxglove": ("app.episodes.mcap",),
     "imageio_ffmpeg": ("app.episodes.frames", "app.episodes.clip.clip"),
     "fastapi": ("app",),
     "uvicorn": ("app",),
