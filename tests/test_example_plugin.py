@@ -3,6 +3,8 @@
 import contextlib
 import io
 import json
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -24,7 +26,8 @@ from osfcore.world import parts as worlds
 from osfcore.world.parts import WORLD, WORLDS
 from osfcore.world.tabletop import Tabletop
 
-SOURCE = Path(__file__).parents[1] / "examples" / "plugin"
+ROOT = Path(__file__).parents[1]
+SOURCE, GUIDE = ROOT / "examples" / "plugin", ROOT / "docs" / "extending.md"
 NAME = "009_gelatin_box"
 
 
@@ -97,14 +100,18 @@ def test_a_world_without_our_table_takes_a_goal_image(data_dir, tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_an_episode_is_made_of_its_parts(installed, data_dir, tmp_path):
-    asked = ("--world", "slippery", "--cost", "last", "--planner", "shooting", "--estimator", "daylight")
-    short = ("--names", NAME, "--steps", "2", "--samples", "16", "--horizon", "8", "--moved", "1", "--despite-doubts")
+def test_the_command_of_the_docs_makes_an_episode_of_its_parts(installed, data_dir, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (command,) = re.findall(r"```console\n(.*?)\n```", GUIDE.read_text(), flags=re.DOTALL)
     with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.redirect_stderr(io.StringIO()):
-        code = main(["episode", "--out", str(tmp_path / "out"), *asked, *short, "--json", "--data-dir", str(data_dir)])
+        code = main([*shlex.split(command)[1:], "--json", "--data-dir", str(data_dir)])
     report = json.loads(said.getvalue().splitlines()[-1])
     assert code == 0
-    assert report["parts"] == dict(zip(("world", "cost", "planner", "estimator"), asked[1::2], strict=True))
+    named = {"world": "slippery", "cost": "last", "planner": "shooting", "estimator": "daylight"}
+    assert report["parts"] == named
     assert report["steps_done"] == 2
+
+
+def test_its_estimators_hold_the_light(installed, data_dir):
     parts = parts_of(PartNames(estimator="daylight", planner="shooting", cost="last"), data_dir)
     np.testing.assert_allclose(parts.estimators.first.held_light, (0, 0, 1))

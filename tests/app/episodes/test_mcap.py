@@ -69,32 +69,24 @@ def read(folder, library, tmp_path):
     assert write_mcap(folder, library, path) == pytest.approx(0.2 * STEPS)
     messages = {}
     with path.open("rb") as file:
-        for _, channel, message, decoded in make_reader(
-            file, decoder_factories=[DecoderFactory()]
-        ).iter_decoded_messages():
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
             messages.setdefault(channel.topic, []).append((message.log_time / 1e9, decoded))
     return messages
 
 
 def poses(read, frame):
     """Times [s], positions [m] and quaternions (x, y, z, w) of a frame."""
-    rows = [
-        (
-            time_s,
-            (t.translation.x, t.translation.y, t.translation.z),
-            (t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w),
-        )
-        for time_s, message in read["/tf"]
-        for t in message.transforms
-        if t.child_frame_id == frame
-    ]
-    return tuple(np.array(column) for column in zip(*rows, strict=True))
+    found = [(s, t) for s, message in read["/tf"] for t in message.transforms if t.child_frame_id == frame]
+    positions = [(t.translation.x, t.translation.y, t.translation.z) for _, t in found]
+    quaternions = [(t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w) for _, t in found]
+    return np.array([s for s, _ in found]), np.array(positions), np.array(quaternions)
 
 
 def test_every_topic_has_its_schema(read):
     kinds = {topic: {type(message).DESCRIPTOR.full_name for _, message in found} for topic, found in read.items()}
-    scenes = dict.fromkeys(("/scene", "/estimate", "/goal", "/plan"), {"foxglove.SceneUpdate"})
-    images = dict.fromkeys(("/goal/image", "/frames"), {"foxglove.CompressedImage"})
+    scenes = {topic: {"foxglove.SceneUpdate"} for topic in ("/scene", "/estimate", "/goal", "/plan")}
+    images = {topic: {"foxglove.CompressedImage"} for topic in ("/goal/image", "/frames")}
     others = {"/tf": {"foxglove.FrameTransforms"}, "/log": {"foxglove.Log"}}
     assert kinds == {**scenes, **images, **others, "/goal/calibration": {"foxglove.CameraCalibration"}}
 
@@ -141,7 +133,7 @@ def test_plans_images_and_words_come_at_their_times(read, folder):
     way = [(p.x, p.y) for p in drawn.entities[0].lines[0].points]
     assert plan_s == 0
     np.testing.assert_allclose(way, np.linspace([-0.1, 0.1], [0.2, 0.1], 5), atol=1e-6)
-    assert [round(time_s, 6) for time_s, _ in read["/frames"]] == [0, 0.2 * STEPS]
+    assert [round(time_s, 6) for time_s, _ in read["/frames"]] == [0, 0.6]
     assert read["/goal/image"][0][1].data == (folder / GOAL_FILE).read_bytes()
     assert [(round(s, 6), word.message) for s, word in read["/log"]] == [
         (0.4, NOTICED),

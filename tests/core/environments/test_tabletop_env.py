@@ -1,5 +1,10 @@
+import os
+import re
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -157,6 +162,19 @@ def test_environments_side_by_side_are_those_one_by_one(folder, made, mode):
         alone, reward, *_ = env.step(np.full(2, 0.1, np.float32))
         np.testing.assert_array_equal(alone["poses"], later["poses"][n])
         assert reward == rewards[n]
+
+
+@pytest.mark.slow
+def test_the_program_of_the_docs_runs(folder, tmp_path):
+    guide = (Path(__file__).parents[3] / "docs" / "extending.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", guide, flags=re.DOTALL)
+    environment = {**os.environ, "OSF_DATA_DIR": str(folder)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-500:]
+    assert "shall lie as in (2, 7) (64, 64, 3)" in done.stdout
+    assert "side by side (2, 1, 7)" in done.stdout
 
 
 @pytest.mark.parametrize(
