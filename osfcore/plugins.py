@@ -71,7 +71,7 @@ def part_factory(kind: PartKind, name: str, own: Mapping[str, Callable[[Given], 
     """
     if name in own:
         return own[name]
-    found = tuple(entry_points(group=kind.group, name=name))
+    found = list(entry_points(group=kind.group, name=name))
     if not found:
         raise UnknownName(kind.noun, name, part_names(kind, own))
     packages = " and ".join(sorted({_package(one) for one in found}))

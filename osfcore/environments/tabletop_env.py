@@ -91,7 +91,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         check_request(self._library, SceneRequest(count=objects, among=names))
         self._available = self._library.names() if names is None else tuple(names)
         self._family: Family = family
-        self._count, self._kind, self.render_mode = objects, obs, render_mode
+        self._kind: Kind = obs
+        self._count, self.render_mode = objects, render_mode
         check_tasks(self._tasks(0))
         self._cameras = default_cameras(image_side)
         self._goal_camera = goal_camera(image_side)
