@@ -17,6 +17,7 @@ A map of the rooms, each importing only from those above it:
     paper        the paper's dynamics model as published, to compare ours with
     world        the simulated tabletop (PyBullet) and data collection
     export       scenes and fields as files that other programs open: binary glTF, Gaussian splats
+    environments the tabletop as a Gymnasium environment, for programs that learn
     inspection   checks of files, and pictures of how they were understood
     experiments  evaluations and benchmarks; only the command line imports it
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.episodes.file_names import RECORDING_FILE
+from app.episodes.part_names import parts_of
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import EpisodeOrder, SimulatedTable, given
 from osfcore.control.closed_loop import Episode
@@ -53,18 +54,17 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
 
     total = order.settings.steps
     yield EpisodeStep(0, total, "Loading fields and setting the table")
-    begin = given(order)
+    parts, begin = parts_of(order.parts, order.data_dir), given(order)
     try:
         assets = AssetLibrary(order.data_dir / "objects")
-        models = load_scene_models(
-            begin.world.names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device
-        )
-        symmetries = {name: assets.info(name).symmetry for name in begin.world.names}
-        about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries)
+        names = begin.world.truth().names
+        models = load_scene_models(names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
+        symmetries = {name: assets.info(name).symmetry for name in names}
+        about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries, parts=order.parts)
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = stream_rng(order.seed, Stream.EPISODE)
         done, note = 0, ""
-        for event in Episode(begin.world, models, begin.goal, order.settings, rng).run():
+        for event in Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run():
             record.take(event)
             done = event.number if isinstance(event, ActionExecuted) else done
             note = note_of(event) or note

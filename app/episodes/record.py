@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
 from app.episodes.frames import TILE_PX, frame, read_frames, write_video
+from app.episodes.part_names import PartNames
 from app.episodes.replay_clock import ReplayClock
 from app.episodes.trajectory import write_trajectory
 from app.episodes.trajectory_recorder import TrajectoryRecorder
@@ -58,6 +59,7 @@ class About:
         symmetries: which orientations of the objects look the same.
         method: whose.
         image: the goal, where a method looks at the image alone: it finds no poses in it.
+        parts: of the episode, where they were chosen by name.
     """
 
     seed: int
@@ -67,6 +69,7 @@ class About:
     symmetries: Mapping[str, Symmetry]
     method: Method = "ours"
     image: GoalImage | None = None
+    parts: PartNames | None = None
 
 
 class EpisodeRecord:
@@ -213,6 +216,8 @@ class EpisodeRecord:
             "step_s": [round(at_s, 3) for at_s in ReplayClock(self._course.trajectory).step_s],
             "steps": self._steps,
         }
+        if about.parts is not None:
+            report["parts"] = about.parts.to_json()
         if about.goal is not None:
             report["moved"] = list(about.moved)
         if about.goal is not None and about.moved:  # else there is nothing to score

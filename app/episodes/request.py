@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from app.episodes.part_names import PartNames
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.goal import GoalImage
+from osfcore.control.world_protocol import SimulatedWorld
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
@@ -23,7 +25,9 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.found_scene import FoundScene
 from osfcore.photo.table_layout import TableLayout, layout_of
 from osfcore.planning.pose_cost import PoseGoal
+from osfcore.plugins import part_factory
 from osfcore.world.goal_layouts import arranged_goal, random_goal
+from osfcore.world.parts import WORLD, WORLDS, WorldInputs
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
@@ -49,6 +53,7 @@ class EpisodeOrder:
         goal_side: of that image [px].
         settings: how it goes.
         device: that computes.
+        parts: that it is made of.
     """
 
     out: Path
@@ -65,6 +70,7 @@ class EpisodeOrder:
     goal_side: int = DEFAULT_IMAGE_SIDE
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     device: str = "cpu"
+    parts: PartNames = field(default_factory=PartNames)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,7 +84,7 @@ class Given:
         moved: objects that truly should move, where that is known.
     """
 
-    world: Tabletop
+    world: SimulatedWorld
     goal: GoalImage | PoseGoal
     truth: SceneState | None
     moved: tuple[str, ...]
@@ -92,7 +98,7 @@ class SimulatedTable:
         world: the simulation.
     """
 
-    world: Tabletop
+    world: SimulatedWorld
 
     def truth(self) -> SceneState:
         """Where everything truly is."""
@@ -115,12 +121,24 @@ def given(order: EpisodeOrder) -> Given:
     for name in names or ():
         fields.info(name)
     among = tuple(name for name in fields.names() if assets.has(name))
-    world = Tabletop(assets, request=SceneRequest(names, order.objects, order.light, among))
+    make = part_factory(WORLD, order.parts.world, WORLDS)
+    world = make(WorldInputs(assets, SceneRequest(names, order.objects, order.light, among)))
     try:
+        if not isinstance(world, Tabletop):
+            return _given_by_image(order, world)
         return _begun(order, world) if layout is None else _photographed(order, layout, world)
     except BaseException:
         world.close()
         raise
+
+
+def _given_by_image(order: EpisodeOrder, world: SimulatedWorld) -> Given:
+    """A world that only looks and pushes: goals are drawn and arranged on a `Tabletop` alone."""
+    if order.goal is None:
+        allowed = "one that derives from Tabletop, or given a goal image: only on a Tabletop can goals be arranged"
+        raise InvalidInput("world", order.parts.world, allowed)
+    world.reset(order.seed)
+    return Given(world, read_goal(order.goal, goal_camera()), None, ())
 
 
 def _found(data: object) -> FoundScene:

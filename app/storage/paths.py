@@ -1,16 +1,11 @@
 """Where data lies on this machine, and how sentences name it to those who need not know."""
 
-import os
 import re
 from pathlib import Path
 
-import platformdirs
+from osfcore.objects.data_dir import default_data_dir
 
-
-def default_data_dir() -> Path:
-    """The folder for everything that the program keeps: OSF_DATA_DIR if set, else the user's data folder for osf."""
-    chosen = os.environ.get("OSF_DATA_DIR")
-    return Path(chosen).expanduser() if chosen else platformdirs.user_data_path("osf")
+__all__ = ["default_data_dir", "static_folder", "without_places"]
 
 
 def static_folder() -> Path:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from osfcore.control import monitor
 from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
 from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.estimators import Estimators
+from osfcore.control.estimators import EpisodeParts
 from osfcore.control.events import (
     ActionExecuted,
     Event,
@@ -47,9 +47,8 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import Observation, SceneState
-from osfcore.planning.image_cost import ImageCost
-from osfcore.planning.mppi import MPPIPlanner
-from osfcore.planning.pose_cost import ARM_M, Cost, PoseCost, PoseGoal
+from osfcore.planning.parts import COSTS, CostInputs, PlannerInputs
+from osfcore.planning.pose_cost import ARM_M, Cost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.render.types import Quality, SceneBatch
 
@@ -72,7 +71,7 @@ class Episode:
         rng: draws everything.
         start: what is known of the first frame already; without it, it is estimated from images with masks.
         prepared: estimates that are used in place of new ones where they explain the images.
-        estimators: how everything is estimated.
+        parts: that estimate, plan and compare futures.
     """
 
     settings: EpisodeSettings
@@ -86,13 +85,14 @@ class Episode:
         rng: np.random.Generator,
         start: EstimatedState | None = None,
         prepared: PreparedLooks | None = None,
-        estimators: Estimators | None = None,
+        parts: EpisodeParts | None = None,
     ) -> None:
         self.settings = settings
         self._world, self._models, self._target, self._rng = world, models, goal, rng
         proposals = PushProposals(models.shapes, models.pushes.rollout)
-        self._planner = MPPIPlanner(models.dynamics.rollout, proposals, settings.plan)
-        self._start, self._prepared, self._how = start, prepared, estimators or Estimators()
+        self._parts = parts or EpisodeParts()
+        self._planner = self._parts.planner(PlannerInputs(models.dynamics.rollout, proposals, settings.plan))
+        self._start, self._prepared, self._how = start, prepared, self._parts.estimators
         self._number, self._is_stalled = 0, False
         self._progress, self._sight = monitor.ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
@@ -284,9 +284,8 @@ class Episode:
             yield Planning(self._number, one)
 
     def _cost(self) -> Cost:
-        if self.settings.cost == "pose":
-            return PoseCost(self._goal)
-        return ImageCost(self._of_goal.models.together, self._camera, self._image, self._light)
+        make = self._parts.cost or COSTS[self.settings.cost]
+        return make(CostInputs(self._goal, self._camera, self._image, self._light, self._of_goal.models.together))
 
     def _act(self) -> Iterator[Event]:
         state = self._estimate.state

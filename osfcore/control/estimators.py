@@ -1,9 +1,10 @@
-"""How a closed loop estimates: its three estimators with their configurations."""
+"""How a closed loop estimates: its three estimators with their configurations; and its parts that can be replaced."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,9 @@ from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import Observation, SceneState
+from osfcore.planning.parts import CostInputs, Planner, PlannerInputs, mppi
+from osfcore.planning.pose_cost import Cost
+from osfcore.plugins import PartKind
 
 
 @dataclass(frozen=True)
@@ -58,3 +62,28 @@ class Estimators:
             TrackingConfig(lamp_above=np.inf),
             GoalImageConfig(held_light=goal_held),  # pyright: ignore[reportArgumentType]
         )
+
+
+ESTIMATOR = PartKind("estimator", ("first_frame", "later_frame"))
+
+
+def _ours(_data_dir: Path) -> Estimators:
+    return Estimators()
+
+
+ESTIMATORS: Mapping[str, Callable[[Path], Estimators]] = {"ours": _ours}  # from the data directory
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeParts:
+    """Parts of a closed loop that can be replaced.
+
+    Attributes:
+        estimators: how everything is estimated.
+        planner: makes what decides about actions.
+        cost: makes what compares futures, anew for each plan; None for what the settings say.
+    """
+
+    estimators: Estimators = field(default_factory=Estimators)
+    planner: Callable[[PlannerInputs], Planner] = mppi
+    cost: Callable[[CostInputs], Cost] | None = None

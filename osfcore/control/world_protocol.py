@@ -5,7 +5,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.geometry.states import Observation
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.states import Observation, SceneState
 
 
 class World(Protocol):
@@ -33,4 +34,16 @@ class World(Protocol):
 
     def close(self) -> None:
         """Release what the world holds. Calling it again does nothing."""
+        ...
+
+
+class SimulatedWorld(World, Protocol):
+    """A world that knows the truth, which reports tell; nothing that estimates or plans asks for it."""
+
+    def truth(self) -> SceneState:
+        """Where everything truly is."""
+        ...
+
+    def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
+        """What any cameras would see now."""
         ...

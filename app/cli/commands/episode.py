@@ -35,8 +35,15 @@ class RunEpisode:
     """Actions at most, of 0.2 s each."""
     replan_every: int = 1
     """Actions executed of each plan."""
-    cost: Literal["pose", "image"] = "pose"
-    """Futures are compared with the goal's poses, or rendered and compared with the goal image (the paper's)."""
+    cost: str = "pose"
+    """Futures are compared with the goal's poses (pose), rendered and compared with the goal image, as in the paper
+    (image), or as another package does it."""
+    world: str = "simulated"
+    """What is pushed: our simulation, or another package's."""
+    planner: str = "mppi"
+    """What plans: MPPI, or another package's."""
+    estimator: str = "ours"
+    """What looks: ours, or another package's."""
     samples: int = 160
     """Sequences of actions in each of a plan's two rounds."""
     horizon: int = 30
@@ -56,19 +63,21 @@ class RunEpisode:
         """Run it with a progress bar; the result is report.json without the single steps."""
         from app.episodes.file_names import REPORT_FILE
         from app.episodes.headless import run_episode
-        from app.episodes.request import EpisodeOrder
-        from osfcore.control.episode_settings import EpisodeSettings
+        from app.episodes.request import EpisodeOrder, PartNames
+        from osfcore.control.episode_settings import CostKind, EpisodeSettings
         from osfcore.errors import check_seed
         from osfcore.fields.devices import pick_device
         from osfcore.io.output_paths import check_place
         from osfcore.planning.mppi import PlanSettings
 
         plan = PlanSettings(self.samples, self.horizon, self.temperature)
-        settings = EpisodeSettings(self.steps, self.replan_every, self.cost, plan, despite_doubts=self.despite_doubts)
+        cost: CostKind = "image" if self.cost == "image" else "pose"
+        settings = EpisodeSettings(self.steps, self.replan_every, cost, plan, despite_doubts=self.despite_doubts)
         check_place(self.out / REPORT_FILE)
         order = EpisodeOrder(
             self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.found, self.moved,
             settings=settings, device=str(pick_device(self.device)),
+            parts=PartNames(self.world, self.estimator, self.planner, self.cost),
         )  # fmt: skip
         last = follow(run_episode(order))
         assert last is not None

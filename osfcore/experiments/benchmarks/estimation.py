@@ -20,7 +20,6 @@ from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.experiments.estimation.tasks import episode, first_frame, goals
 from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
-from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
 from osfcore.experiments.fields.evaluation import measurable
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
@@ -29,6 +28,7 @@ from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import DEFAULT_NAMES
 from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.random_scenes import Draw, draw_scene
 
 _FIRST_SCENE = 700_000  # no figure of accuracy is measured on these scenes
 _MOST_SCENES = 10_000

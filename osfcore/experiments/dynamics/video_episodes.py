@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from osfcore.control.estimators import Estimators
 from osfcore.control.scene_models import SceneModels, load_scene_models
-from osfcore.experiments.estimation.tasks import episode, first_frame, opened, take_frame
-from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY, Draw
+from osfcore.experiments.estimation.tasks import episode, first_frame, take_frame
+from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path, read_fitvid
 from osfcore.experiments.rivals.nerf import with_nerfs
 from osfcore.experiments.task_cache import TaskResult
@@ -35,6 +35,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.stages import STAGES, PaperEstimators, with_paper_stages
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.types import SceneBatch
+from osfcore.world.random_scenes import Draw, opened
 
 VIDEO_METHODS = ("copied", "ours", "paper", "nerf", "fitvid")
 MEASURES = ("mse", "psnr", "ssim")

@@ -26,7 +26,7 @@ from osfcore.experiments.charts import Axis
 from osfcore.experiments.dynamics import video_episodes
 from osfcore.experiments.dynamics.video_episodes import MEASURES, VIDEO_METHODS, VideoEpisodes
 from osfcore.experiments.estimation import tasks
-from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY, Draw, draw_scene
+from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY
 from osfcore.experiments.image_figures import measured, summary, tables_of, write_comparison
 from osfcore.experiments.image_methods import TITLES, check_methods, common_names, field_path
 from osfcore.experiments.pieces import EvaluationStep, Piece
@@ -41,6 +41,7 @@ from osfcore.io.image_file import write_png
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
 from osfcore.random_streams import Stream
+from osfcore.world.random_scenes import Draw, draw_scene
 
 REPORT_FILE, CHART_FILE, IMAGES_FILE = "video.json", "video.png", "video_episode.png"
 HORIZONS = (10, 30)  # steps over which means are told

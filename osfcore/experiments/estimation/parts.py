@@ -34,7 +34,6 @@ from osfcore.experiments.estimation.scores import is_right as is_right_pose
 from osfcore.experiments.estimation.spoiled_inputs import FIRST_SCENE, BadCase, BadScore, bad_case
 from osfcore.experiments.estimation.tasks import STEPS, Frame, episode, first_frame, goals
 from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
-from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
 from osfcore.experiments.pieces import Piece
 from osfcore.experiments.rearrangement.factors import Factor, factor_named
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
@@ -50,6 +49,7 @@ from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.types import Quality, SceneBatch
+from osfcore.world.random_scenes import Draw, draw_scene
 
 FORMAT = 1  # of the kept results; rises when figures come to mean something else
 Part = Literal["first", "track", "goal", "ablations"]

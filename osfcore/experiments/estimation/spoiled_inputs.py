@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from osfcore.experiments.estimation.tasks import Frame, first_frame, goals, opened, take_frame
-from osfcore.experiments.fields.composite_scenes import Draw, draw_scene
+from osfcore.experiments.estimation.tasks import Frame, first_frame, goals, take_frame
 from osfcore.geometry.cameras import SCENE_CENTRE, Camera, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.random_scenes import Draw, draw_scene, opened
 
 FIRST_SCENE = 500_000  # bad cases begin with scenes from this number on, which no other part uses
 _FEW_PX = 6  # that remain of an object's mask

@@ -6,16 +6,13 @@ draw is the same scene to the last bit. Observations hold what cameras and robot
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects
-from osfcore.experiments.fields.composite_scenes import HARSH_ELEVATION_DEG, Draw
+from osfcore.errors import InvalidInput, OverlappingObjects
 from osfcore.experiments.rearrangement.factors import Factor
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
@@ -25,15 +22,13 @@ from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.collection.policies import DirectedPolicy
-from osfcore.world.conditions import Conditions
 from osfcore.world.goal_layouts import SHIFT_M
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.random_scenes import HARSH_ELEVATION_DEG, Draw, opened
 from osfcore.world.tabletop import Tabletop
 
 STEPS = 20  # of an episode
 PUSHED_M = 0.05  # an episode in which no object comes so far is drawn again
 Absence = Literal["", "off the table", "out of view"]
-_LAYOUTS = 10  # arrangements that are tried where objects do not fit
 _EPISODES = 100  # in which chance may fail to push anything
 _PLACES = 100  # that a goal tries for an object
 
@@ -160,23 +155,6 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
                 pass
             goals.append(Goal(take_frame(world, (camera,), masks=False, with_pusher=False), moved))
     return tuple(goals)
-
-
-@contextmanager
-def opened(draw: Draw, library: AssetLibrary, conditions: Conditions | None = None) -> Iterator[Tabletop]:
-    """The draw's scene as a world, for as long as it is needed, under the usual conditions or others."""
-    world = Tabletop(library, request=SceneRequest(names=draw.names, light=draw.light), conditions=conditions)
-    try:
-        for attempt in range(_LAYOUTS):
-            try:
-                world.arrange(draw.seed + attempt)
-                break
-            except NoRoom:
-                if attempt == _LAYOUTS - 1:
-                    raise
-        yield world
-    finally:
-        world.close()
 
 
 def take_frame(world: Tabletop, cameras: tuple[Camera, ...], *, masks: bool, with_pusher: bool = True) -> Frame:

@@ -12,12 +12,12 @@ from osfcore.estimation.objective.object_models import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.experiments.estimation.tasks import first_frame, goals
-from osfcore.experiments.fields.composite_scenes import Draw
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.random_scenes import Draw
 
 WARM_SCENE = 900_000  # number of a scene that no figure is measured on
 _FIRST = FirstFrameConfig(

@@ -16,14 +16,13 @@ from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.image_file import to_uint8
 from osfcore.metrics.image_errors import psnr, ssim
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.types import EXACT, Quality, Renderer, SceneBatch
 from osfcore.world.imaging.ray_tracer import Picture, RayTracer
+from osfcore.world.random_scenes import Draw
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 SCENE_QUALITY: Quality = replace(EXACT, samples_per_side=2)  # the truth is anti-aliased too
-HARSH_ELEVATION_DEG = 10.0
 MIN_PIXELS = 20  # of a kind in an image, for its figure to mean anything
 _SHADE = 1e-3  # radiance by which shadow differs from lit table
 
@@ -64,46 +63,6 @@ class SceneFigures:
     psnr_object: float | None
     psnr_shadow: float | None
     comparison: Comparison
-
-
-@dataclass(frozen=True, slots=True)
-class Draw:
-    """What chance decided about a scene.
-
-    Attributes:
-        names: its objects.
-        light: above the table.
-        seed: of the arrangement.
-    """
-
-    names: tuple[str, ...]
-    light: Light
-    seed: int
-
-
-def draw_scene(
-    available: Sequence[str],
-    count: int,
-    seed: int,
-    number: int,
-    stream: Stream = Stream.SCENE,
-    min_elevation_deg: float = HARSH_ELEVATION_DEG,
-) -> Draw:
-    """One of many random scenes; it does not depend on the others.
-
-    Args:
-        available: objects to choose from, `count` or more.
-        count: objects in the scene.
-        seed: of all the scenes.
-        number: which of them.
-        stream: that they are drawn from.
-        min_elevation_deg: of their lights.
-    """
-    rng = stream_rng(seed, stream, number)
-    light = Light.random(rng, min_elevation_deg)
-    arrangement = int(rng.integers(1 << 31))
-    chosen = rng.permutation(len(available))[:count]
-    return Draw(tuple(available[int(i)] for i in chosen), light, arrangement)
 
 
 def simulate(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) -> Truth:

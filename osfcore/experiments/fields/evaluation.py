@@ -18,7 +18,6 @@ from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, check_range
 from osfcore.experiments.fields.composite_scenes import (
     SCENE_QUALITY,
     compare_scene,
-    draw_scene,
     figures_of,
     mean_of,
     render_scene,
@@ -38,6 +37,7 @@ from osfcore.io.image_set import read_image_set
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.world.collection.collect_images import MIN_IMAGES, CollectObject, collect_object
+from osfcore.world.random_scenes import draw_scene
 
 FORMAT = 1  # of the kept results; rises when figures come to mean something else
 SET_SEED = 760_000  # image sets with this seed and the next ones are for evaluation: never train on them

@@ -23,7 +23,7 @@ from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.experiments import image_methods
 from osfcore.experiments.charts import Axis
 from osfcore.experiments.fields import composite_scenes, relit_scenes
-from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY, Draw, draw_scene
+from osfcore.experiments.fields.composite_scenes import SCENE_QUALITY
 from osfcore.experiments.fields.relit_scenes import MEASURES, RelitScenes
 from osfcore.experiments.image_figures import measured, summary, tables_of, write_comparison
 from osfcore.experiments.image_methods import FIELD_METHODS, TITLES, check_methods, common_names, field_path
@@ -37,6 +37,7 @@ from osfcore.inspection.contact_sheet import image_grid
 from osfcore.io.image_file import write_png
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream
+from osfcore.world.random_scenes import Draw, draw_scene
 
 REPORT_FILE, CHART_FILE, IMAGES_FILE = "relighting.json", "relighting.png", "relighting_scene.png"
 ELEVATIONS_DEG = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0)

@@ -7,20 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from osfcore.experiments.fields.composite_scenes import (
-    Draw,
-    compare_scene,
-    figures_of,
-    mean_of,
-    render_scene,
-    simulate_relit,
-)
+from osfcore.experiments.fields.composite_scenes import compare_scene, figures_of, mean_of, render_scene, simulate_relit
 from osfcore.experiments.image_methods import load_appearance
 from osfcore.experiments.task_cache import TaskResult
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.random_scenes import Draw
 
 MEASURES = ("psnr", "ssim", "psnr_object", "psnr_shadow")
 

@@ -38,12 +38,11 @@ from osfcore.experiments.estimation import tasks as estimation_tasks
 from osfcore.experiments.fields import composite_scenes
 from osfcore.experiments.image_methods import field_path, known_names
 from osfcore.experiments.pieces import EvaluationStep, Piece, finished
-from osfcore.experiments.rearrangement import factors, measured_episodes, methods, own_pushes, runs, sensor, tasks
+from osfcore.experiments.rearrangement import factors, measured_episodes, methods, own_pushes, runs, sensor
 from osfcore.experiments.rearrangement.factors import UNSEEN_NETWORK, factor_named
 from osfcore.experiments.rearrangement.measured_episodes import MeasuredEpisodes
 from osfcore.experiments.rearrangement.methods import Variant, check_variant
 from osfcore.experiments.rearrangement.report import MpcReport, write_pictures
-from osfcore.experiments.rearrangement.tasks import Family, TaskSet, check_tasks
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
 from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
@@ -53,6 +52,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics.weights import weights_path
 from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
+from osfcore.world.rearrangement_tasks import Family, TaskSet, check_tasks
 
 REPORT_FILE = "mpc.json"
 MAX_TASKS = 10_000
@@ -63,7 +63,6 @@ _ORACLE_REPLANS_EVERY = 2
 _CODE = (
     control, dynamics, estimation, fields_room, geometry, metrics, objects, paper, planning, random_streams, render,
     rivals, world, composite_scenes, estimation_tasks, factors, measured_episodes, methods, own_pushes, runs, sensor,
-    tasks,
 )  # fmt: skip
 
 Plan = PlanSettings | GaussianPlanSettings | ForesightSettings

@@ -22,7 +22,6 @@ from osfcore.experiments.rearrangement.factors import UNSEEN_NETWORK, Factor, fa
 from osfcore.experiments.rearrangement.methods import Variant, loop_parts
 from osfcore.experiments.rearrangement.own_pushes import Course, prediction_errors
 from osfcore.experiments.rearrangement.runs import Ended, TrueState, run_from_images, run_told_the_truth
-from osfcore.experiments.rearrangement.tasks import DrawnTask, TaskSet, draw_task
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path, read_fitvid
 from osfcore.experiments.rivals.visual_foresight import Foreseen, ForesightSettings, run_visual_foresight
 from osfcore.experiments.task_cache import TaskResult
@@ -36,6 +35,7 @@ from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.rearrangement_tasks import DrawnTask, TaskSet, draw_task
 
 _NO_ERRORS: Mapping[str, list[float]] = MappingProxyType({"mm": [], "deg": []})  # of who predicts no poses
 

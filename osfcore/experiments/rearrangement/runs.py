@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from osfcore.control.closed_loop import Episode
 from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.estimators import EpisodeParts
 from osfcore.control.events import Event, Stepped
 from osfcore.control.goal import GoalImage, nearest_symmetric_goal
 from osfcore.control.monitor import offsets
@@ -89,7 +90,7 @@ def run_from_images(
             events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
         else:
             target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal
-            events = Episode(world, parts.models, target, settings, rng, estimators=parts.estimators).run()
+            events = Episode(world, parts.models, target, settings, rng, parts=EpisodeParts(parts.estimators)).run()
         for event in events:
             if isinstance(event, Stepped):
                 yield TrueState(world.truth())

@@ -52,7 +52,7 @@ def told(monkeypatch, worlds):
     asked = {}
 
     class Told:
-        def __init__(self, world, models, goal, settings, rng):
+        def __init__(self, world, models, goal, settings, rng, parts):
             self.world, self.goal = world, goal
             asked.update(models=models, settings=settings, draws=rng.random(3).tolist())
 

@@ -17,6 +17,7 @@ from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
 from osfcore.io.scene_file import camera_to_json
 from osfcore.photo.table_layout import NoPhotographedTable
 from osfcore.world import goal_layouts
+from osfcore.world.parts import WORLDS
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
@@ -161,7 +162,7 @@ def test_a_refusal_leaves_no_simulation_behind(order, tmp_path, monkeypatch, cha
             super().__init__(*args, **more)
             worlds.append(self)
 
-    monkeypatch.setattr(orders, "Tabletop", Counted)
+    monkeypatch.setitem(WORLDS, "simulated", lambda asked: Counted(asked.library, request=asked.request))
     if "goal" in changes:
         changes = {"goal": tmp_path / changes["goal"]}
     with pytest.raises((InvalidInput, CorruptFile)):

@@ -9,7 +9,6 @@ import osfcore.experiments.estimation.tasks as tasks
 from osfcore.control.estimators import Estimators
 from osfcore.control.scene_models import load_scene_models
 from osfcore.experiments.dynamics.video_episodes import VideoEpisodes, predict_through_fields, simulate_video
-from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.experiments.rearrangement.methods import TrueEstimators
 from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
 from osfcore.experiments.rivals.fitvid.weights import write_fitvid
@@ -17,6 +16,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import goal_camera
 from osfcore.metrics.image_errors import psnr
 from osfcore.random_streams import Stream
+from osfcore.world.random_scenes import draw_scene
 from tests.core.experiments.solids import SOLIDS
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -3,8 +3,8 @@ import pytest
 import osfcore.experiments.estimation.warmup as module
 from osfcore.estimation.objective import object_models
 from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
-from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.experiments.fields.evaluation import MAX_TASKS
+from osfcore.world.random_scenes import draw_scene
 from tests.core.experiments.oracle import Oracle
 from tests.core.experiments.solids import SOLIDS
 

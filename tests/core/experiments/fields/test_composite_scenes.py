@@ -6,9 +6,7 @@ import pytest
 from osfcore.errors import MissingAssets
 from osfcore.experiments.fields.composite_scenes import (
     MIN_PIXELS,
-    Draw,
     compare_scene,
-    draw_scene,
     figures_of,
     mean_of,
     render_scene,
@@ -19,6 +17,7 @@ from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.world.imaging.optics import TABLE_ALBEDO
+from osfcore.world.random_scenes import Draw, draw_scene
 from tests.core.experiments.solids import SOLIDS
 
 

@@ -7,7 +7,6 @@ import pytest
 
 import osfcore.experiments.fields.relit_scenes as relit
 from osfcore.errors import InvalidInput
-from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.experiments.fields.relighting import (
     CHART_FILE,
     IMAGES_FILE,
@@ -18,6 +17,7 @@ from osfcore.experiments.fields.relighting import (
 from osfcore.experiments.fields.relit_scenes import MEASURES, RelitScenes
 from osfcore.experiments.image_methods import FIELD_METHODS
 from osfcore.fields.field_library import FieldLibrary
+from osfcore.world.random_scenes import draw_scene
 from tests.core.experiments.nerfs import write_nerfs
 from tests.core.experiments.solids import SOLIDS
 

@@ -15,7 +15,6 @@ from osfcore.estimation.steps import EstimateStep
 from osfcore.experiments.rearrangement.factors import VariedWorld
 from osfcore.experiments.rearrangement.methods import TRUTHS, LoopParts, SimulatedModel, Variant
 from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
-from osfcore.experiments.rearrangement.tasks import TaskSet, draw_task
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
@@ -23,6 +22,7 @@ from osfcore.metrics.success import score_of
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.planning.mppi import PlanSettings
 from osfcore.progress import Progress
+from osfcore.world.rearrangement_tasks import TaskSet, draw_task
 from osfcore.world.tabletop import Tabletop
 
 NAME = "009_gelatin_box"

@@ -25,8 +25,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects
-from osfcore.experiments.estimation.tasks import opened
-from osfcore.experiments.fields.composite_scenes import draw_scene
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
@@ -35,6 +33,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.goal_layouts import came_to_rest
 from osfcore.world.placing import GAP_M
+from osfcore.world.random_scenes import draw_scene, opened
 from osfcore.world.tabletop import Tabletop
 
 Family = Literal["shifted", "turned", "crowded", "relit"]

@@ -1,0 +1,200 @@
+"""Rearrangement of a simulated tabletop as a Gymnasium environment.
+
+Each episode is a random rearrangement task (`osfcore.world.rearrangement_tasks`): a scene at rest, and how it
+shall become.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from osfcore.environments.observations import KINDS, Kind, observation_of, space_of
+from osfcore.errors import InvalidInput, NoRoom, OsfError, finite_vector
+from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S, check_action
+from osfcore.io.image_file import to_uint8
+from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.objects.data_dir import default_data_dir
+from osfcore.world.rearrangement_tasks import Family, TaskSet, check_tasks, draw_task
+from osfcore.world.scene_request import SceneRequest, check_request
+from osfcore.world.tabletop import Tabletop
+
+_DRAWS = 10  # of a task, where objects do not fit
+_SEEDS = 1 << 31
+_TURNS = 3  # kinds of goals that take turns with a task's number
+_SPEED = np.nextafter(np.float32(MAX_SPEED_M_S), np.float32(0))  # the largest of its precision within the limit
+_FRAME_SIDE = 256
+
+
+class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
+    """A pusher moves some objects of a scene to their goals, and leaves the others alone.
+
+    The action is the pusher's velocity (vx, vy) [m/s], each within 0.3, held for 0.2 s. The observation is a dict:
+
+        pusher   (2,) its place [m]
+        objects  (N,) what each object is: its number among `objects_to_choose_from`    poses, both
+        poses    (N, 7) position [m] and quaternion (w, x, y, z) with w >= 0, T_world_object    poses, both
+        pixels   (V, h, w, 3) what the four cameras see, linear RGB, 8 bits    pixels, both
+        goal     how the table shall become: poses (N, 7), pixels (h, w, 3) from the goal camera without the pusher
+
+    The reward of an action is the negative distance to the goal afterwards, as a mean over the N objects,
+
+        r = -(1/N) sum_n sqrt(|p_n - p_n*|^2 + (2 sin(theta_n / 4))^2)
+
+    with theta_n the angle to the nearest orientation that looks like the goal's: 2 sin(theta / 4) is the distance of
+    unit quaternions, the nearer of both signs (`ObjectScore.pose6d_symmetric`). An episode terminates when every object
+    that had to move is within 2 cm and 0.1 rad of its goal and no other is farther than that from where it should be;
+    Gymnasium truncates it after 30 actions, or `max_episode_steps` of `gymnasium.make`.
+
+    `info` holds the objects' `names`, which had to move (`moved`), `success`, `moved_mm` and `moved_deg`, the mean
+    errors of these, and `others_mm`, the largest of the others.
+
+    Args:
+        data_dir: whose `objects` are used; the program's own if None.
+        names: objects to choose from; all that are there if None.
+        objects: in each scene (N).
+        family: of the tasks: "shifted", "turned", "crowded" or "relit".
+        obs: what is observed: "poses", "pixels" or "both".
+        image_side: of observed images [px].
+        render_mode: "rgb_array" or None.
+
+    Raises:
+        InvalidInput: if a choice is not among those, or there are too few objects.
+        MissingAssets, UnknownName: if an object is not there.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_S)}  # noqa: RUF012  as Gymnasium has it
+
+    def __init__(
+        self,
+        *,
+        data_dir: str | Path | None = None,
+        names: tuple[str, ...] | None = None,
+        objects: int = 3,
+        family: Family = "shifted",
+        obs: Kind = "poses",
+        image_side: int = 128,
+        render_mode: str | None = None,
+    ) -> None:
+        if obs not in KINDS:
+            raise InvalidInput("kind of observations", repr(obs), f"one of {', '.join(KINDS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InvalidInput("render_mode", repr(render_mode), '"rgb_array" or left out')
+        self._library = AssetLibrary((default_data_dir() if data_dir is None else Path(data_dir)) / "objects")
+        check_request(self._library, SceneRequest(count=objects, among=names))
+        self._available = self._library.names() if names is None else tuple(names)
+        self._family: Family = family
+        self._kind: Kind = obs
+        self._count, self.render_mode = objects, render_mode
+        check_tasks(self._tasks(0))
+        self._cameras = default_cameras(image_side)
+        self._goal_camera = goal_camera(image_side)
+        self._symmetries = {name: self._library.info(name).symmetry for name in self._available}
+        self.action_space = gymnasium.spaces.Box(-_SPEED, _SPEED, (2,), np.float32)
+        self.observation_space = space_of(obs, objects, len(self._available), len(self._cameras), image_side)
+        self._world = Tabletop(self._library, cameras=self._cameras)
+        self._task: RearrangementTask | None = None
+        self._goal_image: UInt8[np.ndarray, "h w 3"] | None = None
+
+    @property
+    def objects_to_choose_from(self) -> tuple[str, ...]:
+        """Names of the objects by the numbers that observations tell."""
+        return self._available
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin a new task.
+
+        Args:
+            seed: of this task and all that follow; None to go on.
+            options: {"task_seed": s, "task_number": n} for the task n of a set that evaluations are given with seed s
+                among the same objects; else a random one.
+
+        Raises:
+            NoRoom: if objects do not fit, also after some draws.
+            InvalidInput: if there are other options, or they are not whole numbers from 0 on.
+        """
+        super().reset(seed=seed)
+        self._task = self._drawn() if not options else self._asked(options)
+        if self._kind != "poses":
+            self._world.restore(self._task.goal)
+            self._goal_image = self._seen((self._goal_camera,), with_pusher=False)[0]
+        self._world.restore(self._task.start)
+        return self._observation(), self._info(self._score())
+
+    def step(self, action: Float[np.ndarray, "2"]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Hold a velocity for 0.2 s.
+
+        Raises:
+            InvalidInput: if it is outside the action space; the table is unchanged.
+        """
+        vx, vy = finite_vector(action, 2, "action (vx, vy) [m/s]")
+        self._begun()
+        self._world.act(check_action((vx, vy, 0.0)))
+        score = self._score()
+        return self._observation(), -score.pose6d_symmetric, score.is_tight(), False, self._info(score)
+
+    def render(self) -> UInt8[np.ndarray, "h w 3"] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The table now, from the goal camera, in linear RGB of 8 bits."""
+        if self.render_mode is None:
+            return None
+        self._begun()
+        return self._seen((goal_camera(_FRAME_SIDE),))[0]
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self._world.close()
+
+    # Tasks
+
+    def _tasks(self, seed: int) -> TaskSet:
+        return TaskSet(self._available, self._family, self._count, seed)
+
+    def _drawn(self) -> RearrangementTask:
+        for draw in range(_DRAWS):
+            seed, number = int(self.np_random.integers(_SEEDS)), int(self.np_random.integers(_TURNS))
+            try:
+                return draw_task(self._library, self._tasks(seed), number).task
+            except NoRoom:
+                if draw == _DRAWS - 1:
+                    raise
+        raise AssertionError("the last draw returns or raises")
+
+    def _asked(self, options: dict[str, Any]) -> RearrangementTask:
+        numbers = [options.get(key) for key in ("task_seed", "task_number")]
+        if len(options) != len(numbers) or not all(isinstance(n, int) and 0 <= n < _SEEDS for n in numbers):
+            raise InvalidInput("options", options, "{'task_seed': s, 'task_number': n}, whole numbers from 0 on")
+        return draw_task(self._library, self._tasks(options["task_seed"]), options["task_number"]).task
+
+    # Telling
+
+    def _begun(self) -> RearrangementTask:
+        if self._task is None:
+            raise OsfError("The table is empty; reset the environment first.")
+        return self._task
+
+    def _score(self) -> RearrangementScore:
+        return score_of(self._begun(), self._world.truth(), self._symmetries)
+
+    def _seen(self, cameras: tuple[Camera, ...], *, with_pusher: bool = True) -> UInt8[np.ndarray, "V h w 3"]:
+        return to_uint8(self._world.render(cameras, with_pusher=with_pusher).images)
+
+    def _observation(self) -> dict[str, Any]:
+        state: SceneState = self._world.truth()
+        pixels = None
+        if self._goal_image is not None:
+            pixels = {"table": self._seen(self._cameras), "goal": self._goal_image}
+        return observation_of(state, self._begun().goal, self._available, pixels, self._kind)
+
+    def _info(self, score: RearrangementScore) -> dict[str, Any]:
+        figures = {"moved_mm": score.moved_mm, "moved_deg": score.moved_deg, "others_mm": score.others_mm}
+        names = {"names": list(self._begun().start.names), "moved": list(self._begun().moved)}
+        return {**names, "success": score.is_tight(), **figures}

@@ -1,0 +1,217 @@
+import os
+import re
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+
+import osfcore.environments  # noqa: F401  registers
+from osfcore.environments import registration, tabletop_env
+from osfcore.environments.registration import ACTIONS, TABLETOP_ID
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.geometry.workspace import STEP_S
+from osfcore.metrics.success import RearrangementTask
+from osfcore.world.rearrangement_tasks import DrawnTask, TaskSet, draw_task
+from osfcore.world.scene_request import SceneRequest
+from osfcore.world.tabletop import Tabletop
+
+NAMES = ("005_tomato_soup_can", "009_gelatin_box")
+STAND = np.zeros(2, np.float32)
+
+
+@pytest.fixture(scope="module")
+def folder(library, tmp_path_factory):
+    place = tmp_path_factory.mktemp("env")
+    (place / "objects").symlink_to(library.root)
+    return place
+
+
+@pytest.fixture
+def made(folder):
+    """Makes environments of small scenes, and closes them."""
+    envs = []
+
+    def make(**chosen):
+        envs.append(gymnasium.make(TABLETOP_ID, **{"data_dir": folder, "names": NAMES, "objects": 2, **chosen}))
+        return envs[-1]
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+@pytest.mark.parametrize("obs", ["poses", "both"])
+def test_gymnasium_finds_nothing_wrong(made, obs):
+    env = made(obs=obs, image_side=32, render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+def test_each_kind_of_observation_tells_what_it_says(made):
+    seen = {obs: made(obs=obs, image_side=32).reset(seed=3)[0] for obs in ("poses", "pixels", "both")}
+    assert set(seen["poses"]) == {"pusher", "objects", "poses", "goal"}
+    assert set(seen["pixels"]) == {"pusher", "pixels", "goal"}
+    assert set(seen["both"]) == set(seen["poses"]) | set(seen["pixels"])
+    np.testing.assert_array_equal(seen["both"]["poses"], seen["poses"]["poses"])
+    np.testing.assert_array_equal(seen["both"]["goal"]["pixels"], seen["pixels"]["goal"]["pixels"])
+    assert seen["pixels"]["pixels"].shape == (4, 32, 32, 3)
+    assert seen["pixels"]["goal"]["pixels"].std() > 5
+
+
+def test_the_reward_is_the_negative_mean_distance_of_poses(made):
+    env = made(family="turned")
+    env.reset(seed=1)
+    seen, reward, *_ = env.step(STAND)
+    here, there = seen["poses"], seen["goal"]["poses"]
+    shift = np.linalg.norm(here[:, :3] - there[:, :3], axis=1)
+    turn = np.minimum(*(np.linalg.norm(here[:, 3:] - sign * there[:, 3:], axis=1) for sign in (1, -1)))
+    is_can = seen["objects"] == NAMES.index("005_tomato_soup_can")  # labelled: no symmetry, as the box
+    assert is_can.sum() == 1
+    assert reward == pytest.approx(-np.hypot(shift, turn).mean(), abs=1e-9)
+
+
+def test_a_pusher_that_stands_changes_nothing_until_the_end(made):
+    env = made()
+    first, _ = env.reset(seed=2)
+    for number in range(1, ACTIONS + 1):
+        seen, reward, terminated, truncated, info = env.step(STAND)
+        np.testing.assert_allclose(seen["poses"], first["poses"], atol=2e-3)
+        assert (terminated, truncated, info["success"]) == (False, number == ACTIONS, False)
+        assert reward < 0
+    assert info["others_mm"] < 2
+    assert info["moved_mm"] >= 70
+
+
+@pytest.fixture
+def pushed(library):
+    """A task whose goal is where some pushes lead, and these pushes."""
+    world, actions = Tabletop(library, request=SceneRequest(names=NAMES)), []
+    world.arrange(0)
+    start = world.truth()
+    world.restore(start)  # as the environment does: what physics remembers of contacts is gone
+    while np.linalg.norm((world.truth().poses.position - start.poses.position)[0]) < 0.08:
+        way = (world.truth().poses.position[0] - world.truth().pusher)[:2] / STEP_S
+        actions.append(np.clip(way, -0.2, 0.2).astype(np.float32))
+        world.act(np.array([*actions[-1].astype(float), 0.0]))
+    task = RearrangementTask(0, start, replace(world.truth(), pusher=None), NAMES[:1])
+    world.close()
+    return task, actions
+
+
+def test_an_episode_terminates_when_what_had_to_move_has_arrived(made, pushed, monkeypatch):
+    task, actions = pushed
+    monkeypatch.setattr(tabletop_env, "draw_task", lambda *_: DrawnTask(task, {}))
+    env = made()
+    _, info = env.reset(seed=0)
+    assert info["moved"] == list(NAMES[:1])
+    results = [env.step(action) for action in actions]
+    assert [terminated for _, _, terminated, _, _ in results] == [info["success"] for *_, info in results]
+    assert not results[0][2]
+    assert results[-1][2]
+    assert results[-1][1] == pytest.approx(0, abs=1e-6)
+    assert results[-1][4]["moved_mm"] == pytest.approx(0, abs=1e-3)
+
+
+def test_the_same_seed_is_the_same_episode_and_another_is_not(made):
+    env = made()
+    first, again, other = (env.reset(seed=seed)[0] for seed in (5, 5, 6))
+    assert data_equivalence(first, again, exact=True)
+    assert np.abs(first["poses"] - other["poses"]).max() > 1e-3
+    unseeded, _ = env.reset()
+    assert np.abs(unseeded["poses"] - other["poses"]).max() > 1e-3
+
+
+def test_a_task_of_an_evaluation_can_be_asked_for(made, library):
+    task = draw_task(library, TaskSet(NAMES, "crowded", 2, 4), 1).task
+    seen, info = made(family="crowded").reset(options={"task_seed": 4, "task_number": 1})
+    assert (info["names"], info["moved"]) == (list(task.start.names), list(task.moved))
+    np.testing.assert_array_equal(seen["poses"][:, :3], task.start.poses.position)
+    np.testing.assert_array_equal(seen["goal"]["poses"][:, :3], task.goal.poses.position)
+
+
+def test_frames_show_the_pusher_where_it_goes(made):
+    env = made(render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    env.step(np.array([0.2, 0.2], np.float32))
+    assert before.shape == (256, 256, 3)
+    assert before.dtype == np.uint8
+    assert np.abs(before.astype(int) - env.render()).max() > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_environments_side_by_side_are_those_one_by_one(folder, made, mode):
+    chosen = {"data_dir": folder, "names": NAMES, "objects": 2, "obs": "both", "image_side": 32}
+    envs = gymnasium.make_vec(f"osfcore.environments:{TABLETOP_ID}", num_envs=2, vectorization_mode=mode, **chosen)
+    try:
+        seen, _ = envs.reset(seed=7)
+        later, rewards, *_ = envs.step(np.full((2, 2), 0.1, np.float32))
+    finally:
+        envs.close()
+    for n in range(2):
+        env = made(obs="both", image_side=32)
+        np.testing.assert_array_equal(env.reset(seed=7 + n)[0]["pixels"], seen["pixels"][n])
+        alone, reward, *_ = env.step(np.full(2, 0.1, np.float32))
+        np.testing.assert_array_equal(alone["poses"], later["poses"][n])
+        assert reward == rewards[n]
+
+
+@pytest.mark.slow
+def test_the_program_of_the_docs_runs(folder, tmp_path):
+    guide = (Path(__file__).parents[3] / "docs" / "extending.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", guide, flags=re.DOTALL)
+    environment = {**os.environ, "OSF_DATA_DIR": str(folder)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-500:]
+    assert "shall lie as in (2, 7) (64, 64, 3)" in done.stdout
+    assert "side by side (2, 1, 7)" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        ({"obs": "depth"}, "'depth', but it must be one of poses, pixels, both"),
+        ({"family": "flying"}, "'flying', but it must be one of shifted, turned, crowded, relit"),
+        ({"objects": 3}, "number of objects is 3, but it must be at most 2"),
+        ({"names": ("001_chips_can",)}, "001_chips_can"),
+        ({"image_side": 8}, "between 16 and 1024"),
+        ({"render_mode": "ansi"}, "rgb_array"),
+        ({"data_dir": "nowhere", "names": None}, "osf assets fetch"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence(made, chosen, words):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium's own, of an unknown render mode
+        with pytest.raises(OsfError) as error:
+            made(**chosen)
+    assert words in str(error.value)
+
+
+def test_actions_and_options_outside_their_bounds_are_refused(made):
+    env = made().unwrapped
+    with pytest.raises(OsfError, match="reset the environment first"):
+        env.step(STAND)
+    before, _ = env.reset(seed=0)
+    for action in ([0.31, 0], [np.nan, 0], [0.1, 0.1, 0.1]):
+        with pytest.raises(InvalidInput):
+            env.step(np.array(action))
+    seen, *_ = env.step(STAND)
+    np.testing.assert_allclose(seen["pusher"], before["pusher"], atol=1e-6)
+    with pytest.raises(InvalidInput, match="task_seed"):
+        env.reset(options={"task_seed": -1, "task_number": 0})
+
+
+def test_without_gymnasium_one_sentence_tells_what_to_install(monkeypatch):
+    monkeypatch.setattr(registration, "find_spec", lambda _: None)
+    with pytest.raises(registration.MissingGymnasium, match=r"pip install 'osf-manipulation\[gym\]'"):
+        registration.register()
