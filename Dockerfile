@@ -18,7 +18,7 @@ COPY pyproject.toml README.md LICENSE ./
 COPY osfcore osfcore
 COPY app app
 COPY static static
-RUN pip install -c requirements.lock .
+RUN pip install -c requirements.lock '.[serve]'
 
 RUN useradd --create-home --uid 1000 osf && install -d -o osf /data
 USER osf

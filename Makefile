@@ -28,7 +28,7 @@ $(BIN)/python:
 $(VENV)/.installed: $(BIN)/python pyproject.toml requirements.lock
 	@echo "Installing packages into $(VENV) (a few minutes the first time)"
 	@$(if $(TORCH_INDEX),$(PIP) install -q -c requirements.lock --index-url $(TORCH_INDEX) torch || { $(OFFLINE); exit 1; },:)
-	@$(PIP) install -q -c requirements.lock -e . || { $(OFFLINE); exit 1; }
+	@$(PIP) install -q -c requirements.lock -e '.[serve]' || { $(OFFLINE); exit 1; }
 	@touch $@
 
 $(VENV)/.dev-installed: $(VENV)/.installed

@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 # A module may import from rooms above it in this list (and its own), never from rooms below it.
 ROOMS = (
     "osfcore.errors",
+    "osfcore.extras",
     "osfcore.progress",
     "osfcore.random_streams",
     "osfcore.plugins",

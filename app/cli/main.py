@@ -29,6 +29,7 @@ from app.cli.commands.render import Render
 from app.cli.commands.serve import Serve
 from app.cli.commands.train import Train
 from osfcore.errors import OsfError
+from osfcore.extras import told_of
 
 
 class Command(Protocol):
@@ -83,6 +84,12 @@ def main(arguments: list[str] | None = None) -> int:
         result = command.run()
     except OsfError as error:
         print(f"osf: {error}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        told = told_of(error, "This command")
+        if told is None:
+            raise
+        print(f"osf: {told}", file=sys.stderr)
         return 1
     except BrokenPipeError:  # whoever read our output has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

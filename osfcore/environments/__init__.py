@@ -8,7 +8,7 @@ or in one call `gymnasium.make("osfcore.environments:OSFTabletop-v0")`, which pr
 Gymnasium has no entry points for packages since 1.0: a package registers its environments when it is imported.
 
 Raises:
-    MissingGymnasium: on import, if it is not installed.
+    MissingExtra: on import, if it is not installed.
 """
 
 from osfcore.environments.registration import register

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import io
-from importlib.util import find_spec
 from pathlib import Path
 
 from app.episodes.file_names import REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.trajectory import read_trajectory
 from osfcore.errors import OsfError
+from osfcore.extras import need
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import as_mapping, read_json, write_atomically
 from osfcore.objects.asset_library import AssetLibrary
-
-
-class MissingFoxglove(OsfError):
-    """The library that writes MCAP is not installed."""
-
-    def __init__(self) -> None:
-        super().__init__("MCAP files need foxglove-sdk; install it with: pip install 'osf-manipulation[mcap]'.")
 
 
 class NoEpisode(OsfError):
@@ -40,13 +33,12 @@ def write_mcap(folder: Path, library: AssetLibrary, path: Path) -> float:
         How long the episode is in simulated time [s].
 
     Raises:
-        MissingFoxglove: if that is not installed.
+        MissingExtra: if what writes MCAP is not installed.
         NoEpisode: if there is none.
         CorruptFile, UnknownName, MissingAssets: if something in the folder is damaged, or an object is not here.
         CannotWrite: if the disk refuses.
     """
-    if find_spec("foxglove") is None:
-        raise MissingFoxglove
+    need("mcap", "An MCAP file")
     if not (folder / TRAJECTORY_FILE).is_file() or not (folder / REPORT_FILE).is_file():
         raise NoEpisode(folder)
     trajectory, report = read_trajectory(folder / TRAJECTORY_FILE), read_json(folder / REPORT_FILE, as_mapping)

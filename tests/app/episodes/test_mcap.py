@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from app.cli.main import main
 from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.mcap.export import MissingFoxglove, write_mcap
+from app.episodes.mcap.export import write_mcap
 from app.episodes.trajectory import Round, Trajectory, write_trajectory
 from app.processes.plan_summary import PlanSketch
+from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -154,7 +155,7 @@ def test_the_command_writes_it(folder, library, tmp_path, capsys):
 
 
 def test_without_the_library_one_sentence_tells_what_to_install(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("app.episodes.mcap.export.find_spec", lambda name: None)
-    with pytest.raises(MissingFoxglove, match=r"pip install 'osf-manipulation\[mcap\]'"):
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda _: None)
+    with pytest.raises(MissingExtra, match=r"pip install 'osf-manipulation\[mcap\]'"):
         write_mcap(folder, AssetLibrary(tmp_path), tmp_path / "episode.mcap")
     assert not (tmp_path / "episode.mcap").exists()

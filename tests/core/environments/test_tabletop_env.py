@@ -15,6 +15,7 @@ import osfcore.environments  # noqa: F401  registers
 from osfcore.environments import registration, tabletop_env
 from osfcore.environments.registration import ACTIONS, TABLETOP_ID
 from osfcore.errors import InvalidInput, OsfError
+from osfcore.extras import MissingExtra
 from osfcore.geometry.workspace import STEP_S
 from osfcore.metrics.success import RearrangementTask
 from osfcore.world.rearrangement_tasks import DrawnTask, TaskSet, draw_task
@@ -212,6 +213,6 @@ def test_actions_and_options_outside_their_bounds_are_refused(made):
 
 
 def test_without_gymnasium_one_sentence_tells_what_to_install(monkeypatch):
-    monkeypatch.setattr(registration, "find_spec", lambda _: None)
-    with pytest.raises(registration.MissingGymnasium, match=r"pip install 'osf-manipulation\[gym\]'"):
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda _: None)
+    with pytest.raises(MissingExtra, match=r"pip install 'osf-manipulation\[gym\]'"):
         registration.register()
