@@ -13,10 +13,7 @@ from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import SceneState
 from osfcore.io.json_codec import Entry, decode
 from osfcore.io.scene_file import CameraJson, ObjectJson, scene_from_json
-from osfcore.io.state_file import estimated_from_json
-
-Status = Literal["queued", "running", "paused", "done", "failed", "cancelled"]
-_OVER = ("done", "failed", "cancelled")
+from osfcore.io.state_file import EstimateJson
 
 
 class Health(Entry):
@@ -112,90 +109,65 @@ class EpisodeStep(Entry):
     seconds: dict[str, float]
 
 
-class Episode(Entry):
-    """An episode as it is now.
+class _Running(Entry):
+    """Work of the service as it is now.
 
     Attributes:
         id: names it.
-        name: for people.
-        scene: its table.
         status: of its job.
-        stage: what it does: "first", "goal", "plan", "act", "next", "search".
-        done: actions executed.
-        total: actions at most.
+        stage: what it does, such as "first", "goal", "plan", "act" in an episode.
+        done: units of work, or actions of an episode, that are done.
+        total: in all, at most; 0 before it is known.
         note: what happens now, for people.
         eta_s: estimated time left [s].
-        outcome: "reached", "out of steps" or "refused" once it has ended by itself.
-        text: the outcome in a sentence.
         error: why it failed, if it did.
-        steps: all so far.
-        files: that `Client.download` brings.
     """
 
     id: str
-    name: str
-    scene: str
-    status: Status
+    status: Literal["queued", "running", "paused", "done", "failed", "cancelled"]
     stage: str | None
     done: int
     total: int
     note: str
     eta_s: float | None
+    error: str | None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more comes."""
+        return self.status in ("done", "failed", "cancelled")
+
+
+class Episode(_Running):
+    """An episode as it is now.
+
+    Attributes:
+        name: for people.
+        scene: its table.
+        outcome: "reached", "out of steps" or "refused" once it has ended by itself.
+        text: the outcome in a sentence.
+        steps: all so far.
+        files: that `Client.download` brings.
+    """
+
+    name: str
+    scene: str
     outcome: str | None
     text: str | None
-    error: str | None
     steps: list[EpisodeStep]
     files: list[str]
 
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing more comes."""
-        return self.status in _OVER
 
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Estimate:
+class Estimate(_Running):
     """An estimate of poses and light as it is now.
 
     Attributes:
-        id: names it.
-        status: of its job.
-        stage: what it does.
-        done: units of work that are done, of `total`.
-        total: units in all; 0 before it is known.
-        note: what happens now, for people.
-        error: why it failed, if it did.
-        estimated: the result; None before it is there.
+        estimate: the result as in state.json; None before it is there.
     """
 
-    id: str
-    status: Status
-    stage: str | None
-    done: int
-    total: int
-    note: str
-    error: str | None
-    estimated: EstimatedState | None
+    estimate: EstimateJson | None
 
     @property
-    def is_over(self) -> bool:
-        """Whether nothing more comes."""
-        return self.status in _OVER
-
-    @staticmethod
-    def of(data: dict[str, Any]) -> Estimate:
-        """From what the service answers."""
-        facts = decode(_EstimateFacts, data, "estimate")
-        result = data.get("estimate")
-        estimated = None if result is None else estimated_from_json(result)
-        return Estimate(**dict(facts), estimated=estimated)
-
-
-class _EstimateFacts(Entry):
-    id: str
-    status: Status
-    stage: str | None
-    done: int
-    total: int
-    note: str
-    error: str | None
+    def estimated(self) -> EstimatedState | None:
+        """The result; None before it is there."""
+        return None if self.estimate is None else self.estimate.estimate()

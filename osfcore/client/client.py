@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
@@ -209,7 +209,7 @@ class Client:
         else:
             query = {"mode": mode, "prior": prior, "seed": seed}
             data = self._service.send("POST", "/api/estimates", _zipped(Path(observation)), "application/zip", **query)
-        return self._followed("/api/estimates", data, Estimate.of)
+        return self._followed("/api/estimates", data, Estimate)
 
     def predict(self, actions: Float[np.ndarray, "K T 3"], state: SceneState | None = None) -> Rollouts:
         """What sequences of pusher velocities would do.
@@ -245,11 +245,11 @@ class Client:
         """
         to = {"goal": goal.id} if isinstance(goal, Goal) else {"poses": _poses(goal)}
         data = self._service.json("POST", "/api/episodes", {"scene": scene, "seed": seed, "settings": settings, **to})
-        return self._followed("/api/episodes", data, _episode)
+        return self._followed("/api/episodes", data, Episode)
 
     def episodes(self) -> tuple[Episode, ...]:
         """The latest episodes, newest first, without their steps."""
-        return tuple(_episode(one) for one in self._service.json("GET", "/api/episodes")["episodes"])
+        return tuple(decode(Episode, one, "episode") for one in self._service.json("GET", "/api/episodes")["episodes"])
 
     def cancel(self, running: Episode | Estimate) -> None:
         """End an episode or an estimate; what an episode has done is kept.
@@ -279,20 +279,16 @@ class Client:
             raise InvalidInput("table", "none", "one that is shown; make one first, with new_scene")
         return current
 
-    def _followed(self, place: str, data: dict[str, Any], of: Callable[[dict[str, Any]], T]) -> Iterator[T]:
+    def _followed(self, place: str, data: dict[str, Any], kind: type[T]) -> Iterator[T]:
         """How a job is now whenever it changes."""
         path = f"{place}/{data['id']}"
 
         def states() -> Iterator[T]:
-            yield of(data)
+            yield decode(kind, data, place)
             for _ in self._service.follow(f"{path}/events"):
-                yield of(self._service.json("GET", path))
+                yield decode(kind, self._service.json("GET", path), path)
 
         return states()
-
-
-def _episode(data: object) -> Episode:
-    return decode(Episode, data, "episode")
 
 
 def _light(light: Light | None) -> dict[str, Any] | None:
