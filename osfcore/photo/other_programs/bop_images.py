@@ -74,7 +74,7 @@ class BopChoice:
 
     Attributes:
         images: their numbers; None for all, spread evenly if there are more than an observation holds.
-            encoding: of the pictures.
+        encoding: of the pictures.
         models: folder with models_info.json; None for BOP's YCB-V.
     """
 
