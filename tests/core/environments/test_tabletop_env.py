@@ -198,6 +198,7 @@ def test_mistakes_are_told_in_a_sentence(made, chosen, words):
     assert words in str(error.value)
 
 
+@pytest.mark.wrong_arrays
 def test_actions_and_options_outside_their_bounds_are_refused(made):
     env = made().unwrapped
     with pytest.raises(OsfError, match="reset the environment first"):
