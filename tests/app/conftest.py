@@ -113,7 +113,13 @@ class Live:
         self.app = app
         self._server = uvicorn.Server(
             uvicorn.Config(
-                app, port=0, log_level="warning", lifespan="on", ws_max_size=64 << 20, ws_per_message_deflate=False
+                app,
+                port=0,
+                log_level="warning",
+                lifespan="on",
+                ws_max_size=64 << 20,
+                ws_per_message_deflate=False,
+                timeout_graceful_shutdown=2,  # as 'osf serve' has it
             )
         )
         self._listener = socket.create_server(("127.0.0.1", 0))
