@@ -51,7 +51,7 @@ def estimate_goal_image(
     goal: GoalImage,
     prior: SceneState,
     config: GoalImageConfig | None = None,
-    allowed: Mapping[str, float] | None = None,
+    shares: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
     """The goal image as the scene's cameras would take it and, should that be doubtful, as fields were made for.
 
@@ -61,12 +61,12 @@ def estimate_goal_image(
         goal: one view.
         prior: how the objects lie now.
         config: how much work to do.
-        allowed: by object, residuals that the first frame has as well.
+        shares: by object, its residual in the first frame as a share of its level, see `goal_allowance`.
     """
-    best = yield from all_but_last(_estimated(scene, goal, prior, config, allowed))
+    best = yield from all_but_last(_estimated(scene, goal, prior, config, shares))
     if scene.image_model is not None and not _is_trusted(best):
         yield replace(best, estimate=None)
-        other = yield from all_but_last(_estimated(usual, goal, prior, config, allowed))
+        other = yield from all_but_last(_estimated(usual, goal, prior, config, shares))
         best = other if _is_trusted(other) else best
     yield best
 
@@ -76,10 +76,10 @@ def _estimated(
     goal: GoalImage,
     prior: SceneState,
     config: GoalImageConfig | None,
-    allowed: Mapping[str, float] | None,
+    shares: Mapping[str, float] | None,
 ) -> Iterator[EstimateStep]:
     seen = fitting.normalized_goal(goal).observed(prior.names)
-    for step in estimate_goal(fitting.models, seen, prior, config, allowed):
+    for step in estimate_goal(fitting.models, seen, prior, config, shares):
         yield step if step.estimate is None else replace(step, image_model=fitting.image_model)
 
 

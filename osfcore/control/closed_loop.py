@@ -40,7 +40,7 @@ from osfcore.control.stage_timer import StageTimer
 from osfcore.control.world_protocol import World
 from osfcore.errors import InvalidInput
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.uncertainty import allowed_residuals, expected_residuals
+from osfcore.estimation.uncertainty import expected_fit, object_residuals, relative_residuals
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -149,7 +149,9 @@ class Episode:
         else:
             self._estimate = self._start
         self._estimate = self._estimate.with_pusher(observation.pusher)
-        self._usual = expected_residuals(self._scene.models, observation, self._estimate.state)
+        fit = expected_fit(self._scene.models, observation, self._estimate.state)
+        self._usual = object_residuals(fit)
+        self._shares = dict(zip(observation.names, relative_residuals(fit).tolist(), strict=True))
         self._weak = frozenset(self._estimate.doubted)
         if not self._estimate.trusted:
             yield self._noticed("lost", f"The first estimate is doubtful: {self._estimate.reason}.")
@@ -247,9 +249,8 @@ class Episode:
     def _find_goal(self) -> Iterator[Event]:  # returns whether to go on
         target, state, estimate, doubts, photo = self._target, self._estimate.state, None, "", None
         if isinstance(target, GoalImage):
-            allowed = dict(zip(state.names, allowed_residuals(self._usual), strict=True))
-            allowed = {name: most for name, most in allowed.items() if name not in self._weak}
-            steps = estimate_goal_image(self._usual_models, self._scene, target, state, self._how.goal, allowed)
+            shares = {name: share for name, share in self._shares.items() if name not in self._weak}
+            steps = estimate_goal_image(self._usual_models, self._scene, target, state, self._how.goal, shares)
             found = yield from self._look("goal", target.observed(state.names), steps)
             self._of_goal = self._usual_models if found.image_model is None else self._scene
             shown = self._of_goal.normalized_goal(target)

@@ -49,7 +49,7 @@ def estimate_goal(
     observation: Observation,
     prior: SceneState,
     config: GoalImageConfig | None = None,
-    allowed: Mapping[str, float] | None = None,
+    shares: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
     """Find poses and light of a goal image; the last step holds the estimate.
 
@@ -58,7 +58,7 @@ def estimate_goal(
         observation: one view without the pusher; masks play no part.
         prior: the scene now, or any other guess: how objects lie matters most; places and light save time if right.
         config: how much work to do.
-        allowed: by object, the residual below which its images are not doubted, see `allowed_residuals`.
+        shares: by object, its residual in the scene now as a share of its level, see `goal_allowance`.
 
     Raises:
         InvalidInput: if there is more than one view, or the prior is of other objects.
@@ -69,7 +69,7 @@ def estimate_goal(
         raise InvalidInput("number of views of a goal", len(observation.cameras), "1")
     if set(prior.names) != set(observation.names):
         raise InvalidInput("objects of the prior", ", ".join(prior.names), ", ".join(observation.names))
-    yield from _GoalImageEstimator(models, observation, prior, config or GoalImageConfig(), allowed or {}).steps()
+    yield from _GoalImageEstimator(models, observation, prior, config or GoalImageConfig(), shares or {}).steps()
 
 
 class _GoalImageEstimator:
@@ -81,9 +81,9 @@ class _GoalImageEstimator:
         observation: Observation,
         prior: SceneState,
         config: GoalImageConfig,
-        allowed: Mapping[str, float],
+        shares: Mapping[str, float],
     ) -> None:
-        self._refinement = GoalRefinement(models, observation, config, allowed)
+        self._refinement = GoalRefinement(models, observation, config, shares)
         self._models, self._config, self._prior = models, config, prior
         self._names = observation.names
         self._everything = range(len(observation.names))

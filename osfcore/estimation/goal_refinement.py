@@ -15,7 +15,7 @@ from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.search.gauss_newton import PLANAR_PARAMETERS, GaussNewtonState, gauss_newton
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit, misfits
+from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit, goal_allowance, misfits
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import Observation
@@ -51,17 +51,17 @@ class GoalRefinement:
         models: fields of the objects and the table.
         observation: one view.
         config: how much work to do.
-        allowed: by object, the residual below which its images are not doubted.
+        usual: by object, what is usual for its residual, see `goal_allowance`; what is left out is not known.
     """
 
     def __init__(
-        self, models: ObjectModels, observation: Observation, config: GoalImageConfig, allowed: Mapping[str, float]
+        self, models: ObjectModels, observation: Observation, config: GoalImageConfig, usual: Mapping[str, float]
     ) -> None:
         self.models = models
         self.fine = views_of(observation, FINE_SIDE, samples=2)
         self.middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self.rivals: dict[int, float] = {}
-        self._allowed = np.array([allowed.get(name, 0.0) for name in observation.names])
+        self._usual = np.array([usual.get(name, np.nan) for name in observation.names])
         self._names, self._config = observation.names, config
         self._is_held = config.held_light is not None
         self._light_views = None if self._is_held else self.middle  # in which the light is refined
@@ -127,7 +127,8 @@ class GoalRefinement:
 
     def misfits(self, params: SceneParameters) -> list[int]:
         """Numbers of the objects that the image does not show where a guess has them."""
-        return misfits(evaluate_fit(self.models, self.fine, params), self._allowed)
+        fit = evaluate_fit(self.models, self.fine, params)
+        return misfits(fit, goal_allowance(fit, self._usual))
 
     def estimate(self, at: GaussNewtonState, rivals: Mapping[int, float]) -> EstimatedState:
         """The estimate with its uncertainty; heights are checked, since one view hardly shows depth.
@@ -138,6 +139,7 @@ class GoalRefinement:
         """
         fit, poses = evaluate_fit(self.models, self.fine, at.params), at.params.state().poses
         lowest = np.array([self.models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
+        allowed = goal_allowance(fit, self._usual)
         return estimate_with_uncertainty(
-            at.params, at.normals, fit, rivals, lowest=lowest, light_held=self._is_held, allowed=self._allowed
+            at.params, at.normals, fit, rivals, lowest=lowest, light_held=self._is_held, allowed=allowed
         )

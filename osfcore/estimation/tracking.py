@@ -43,6 +43,7 @@ from osfcore.estimation.search.light_search import light_loss_ratio, search_ligh
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
 from osfcore.estimation.uncertainty import (
+    MAX_RESIDUAL,
     FitQuality,
     allowed_residuals,
     estimate_with_uncertainty,
@@ -322,7 +323,7 @@ class _Tracker:
         return at
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        fit, allowed = self._fit_finely(at.params), self._allowed
+        fit, allowed = self._fit_finely(at.params), np.maximum(MAX_RESIDUAL, self._allowed)
         estimate = estimate_with_uncertainty(at.params, at.normals, fit, self._rivals, light_held=True, allowed=allowed)
         return self._reporter.finish(at, estimate)
 

@@ -24,9 +24,11 @@ from osfcore.render.types import SceneBatch
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
-_MAX_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
+MAX_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
 _RELATIVE_RESIDUAL = 0.5  # of the object's contrast, where masks bear out the pose; wrong ones were at 0.66 and more
 _ALLOWANCE, _MOST_USUAL = 1.25, 0.1  # times what is usual, which is no more than this [radiance]
+# Of a goal image: times what is usual where the objects are now, both as shares of the level; and the least allowed.
+_SHARE_ALLOWANCE, _MOST_USUAL_SHARE, _LEAST_SHARE, _LEAST_RESIDUAL = 2.0, 0.3, 0.08, 0.02
 _MIN_OVERLAP = 0.75  # of silhouette and mask
 _MIN_PIXELS = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
@@ -43,6 +45,7 @@ class FitQuality:
         residuals: root of mean square error over the pixels of each object in each view; 0 where it shows in none.
         pixels: of each object in each view, by its rendered opacity.
         contrast: standard deviation of the image over the pixels of each object in all views [radiance].
+        level: root of mean square of the image over the same pixels [radiance].
         overlap: of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
         surroundings: root of mean square error over all other pixels.
         spread: estimated variance of a pixel's error.
@@ -51,6 +54,7 @@ class FitQuality:
     residuals: Float[np.ndarray, "V N"]
     pixels: Float[np.ndarray, "V N"]
     contrast: Float[np.ndarray, "N"]
+    level: Float[np.ndarray, "N"]
     overlap: Float[np.ndarray, "N"]
     surroundings: float
     spread: float
@@ -79,20 +83,22 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
         overlap = both / np.maximum(either, 1e-6)
     surroundings = float(np.sqrt((elsewhere * squares).sum() / max(elsewhere.sum(), 1e-6)))
     spread = float(squares.mean())
-    return FitQuality(
-        residuals * (pixels > 0), pixels, _contrasts(opacity, views.images), overlap, surroundings, spread
-    )
+    contrast, level = _brightness(opacity, views.images)
+    return FitQuality(residuals * (pixels > 0), pixels, contrast, level, overlap, surroundings, spread)
 
 
-def _contrasts(opacity: Float[np.ndarray, "V N h w"], images: Float32[np.ndarray, "V h w 3"]) -> Float[np.ndarray, "N"]:
+def _brightness(
+    opacity: Float[np.ndarray, "V N h w"], images: Float32[np.ndarray, "V h w 3"]
+) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Contrast and level of each object."""
     total = np.maximum(opacity.sum(axis=(0, 2, 3)), 1e-6)[:, None]
     first, second = (np.einsum("vnhw,vhwc->nc", opacity, images**power) / total for power in (1, 2))
-    return np.sqrt(np.maximum(second - first**2, 0).mean(axis=-1))
+    return np.sqrt(np.maximum(second - first**2, 0).mean(axis=-1)), np.sqrt(second.mean(axis=-1))
 
 
 def relative_allowance(fit: FitQuality) -> Float[np.ndarray, "N"]:
     """Residuals that may be of a right pose, of each object, where masks bear it out: a share of its contrast."""
-    return _RELATIVE_RESIDUAL * fit.contrast
+    return np.maximum(MAX_RESIDUAL, _RELATIVE_RESIDUAL * fit.contrast)
 
 
 def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
@@ -101,17 +107,39 @@ def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
     return np.sqrt((fit.pixels * fit.residuals**2).sum(axis=0) / total)
 
 
-def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
-    """RMS residual of each object where it stands [radiance]: fields err; what is normal here tells later what is not.
+def relative_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
+    """Residuals of the objects as shares of their level: how bright the light is plays no part."""
+    return object_residuals(fit) / np.maximum(fit.level, 1e-6)
+
+
+def expected_fit(models: ObjectModels, observation: Observation, state: SceneState) -> FitQuality:
+    """How well objects fit where they stand: fields err; what is normal here tells later what is not.
 
     Args:
         models: fields of the objects and the table.
         observation: one or more views; masks play no part.
         state: what to render, an estimate from this observation; the pusher is the observation's.
     """
-    return object_residuals(
-        evaluate_fit(models, views_of(observation, FINE_SIDE, samples=2), SceneParameters.of(state, observation.pusher))
-    )
+    views = views_of(observation, FINE_SIDE, samples=2)
+    return evaluate_fit(models, views, SceneParameters.of(state, observation.pusher))
+
+
+def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
+    """RMS residual of each object where it stands [radiance], see `expected_fit`."""
+    return object_residuals(expected_fit(models, observation, state))
+
+
+def goal_allowance(fit: FitQuality, usual: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+    """Residuals beyond which an object is not what a goal image shows there [radiance].
+
+    With shares of the level, the light of the goal may be brighter or dimmer than the scene's.
+
+    Args:
+        fit: of a guess of the goal image.
+        usual: `relative_residuals` where the objects are now, to the same cameras; not a number where not known.
+    """
+    shares = np.maximum(_LEAST_SHARE, _SHARE_ALLOWANCE * np.minimum(usual, _MOST_USUAL_SHARE))
+    return np.where(np.isnan(usual), MAX_RESIDUAL, np.maximum(_LEAST_RESIDUAL, shares * fit.level))
 
 
 def allowed_residuals(usual: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
@@ -138,7 +166,7 @@ def estimate_with_uncertainty(
         rivals: by object, the best loss of a different orientation over the loss of the one chosen.
         light_held: the light was given, not searched.
         lowest: height of each object's lowest point [m], if objects can only stand on the table.
-        allowed: residuals below which an object's images are not doubted, should these be more than is usual.
+        allowed: residuals up to which an object's images are not doubted; `MAX_RESIDUAL` by default.
 
     Returns:
         The estimate.
@@ -150,7 +178,7 @@ def estimate_with_uncertainty(
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
     light = 0.0 if light_held else _LIGHT_FACTOR * float(np.sqrt((deviations[-LIGHT:] ** 2).mean()))
     heights = np.zeros(count) if lowest is None else lowest
-    most = np.maximum(_MAX_RESIDUAL, 0.0 if allowed is None else allowed) * np.ones(count)
+    most = np.full(count, MAX_RESIDUAL) if allowed is None else allowed
     doubts = tuple(
         _reason_for_doubt(fit, n, most[n], position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
         for n in range(count)
@@ -198,10 +226,9 @@ def misfits(fit: FitQuality, allowed: Float[np.ndarray, "N"]) -> list[int]:
 
     Args:
         fit: of the guess.
-        allowed: residuals below which an object's images are not doubted, should these be more than is usual.
+        allowed: residuals up to which an object's images are not doubted.
     """
-    most = np.maximum(_MAX_RESIDUAL, allowed)
-    return [n for n in range(len(most)) if _misfit(fit, n, most[n])]
+    return [n for n in range(len(allowed)) if _misfit(fit, n, allowed[n])]
 
 
 def _height_doubt(height: float) -> str:

@@ -11,7 +11,10 @@ from osfcore.estimation.uncertainty import (
     allowed_residuals,
     estimate_with_uncertainty,
     evaluate_fit,
+    goal_allowance,
+    misfits,
     object_residuals,
+    relative_residuals,
 )
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOX, own_views, params_of
@@ -31,10 +34,8 @@ def end(models, truth, views):
 
 
 def fit_of(count=1, **change) -> FitQuality:
-    plain = FitQuality(
-        np.full((2, count), 0.01), np.full((2, count), 50.0), np.full(count, 0.1), np.ones(count), 0.01, 1e-4
-    )
-    return replace(plain, **change)
+    residuals, pixels, each = np.full((2, count), 0.01), np.full((2, count), 50.0), np.ones(count)
+    return replace(FitQuality(residuals, pixels, 0.1 * each, 0.3 * each, each, 0.01, 1e-4), **change)
 
 
 def params(count=1) -> SceneParameters:
@@ -190,3 +191,29 @@ def test_residuals_that_are_allowed_are_not_doubted(allowed, is_doubted):
 
 def test_what_is_usual_is_allowed_up_to_a_bound():
     np.testing.assert_allclose(allowed_residuals(np.array([0.0, 0.04, 0.1, 0.5])), [0.0, 0.05, 0.125, 0.125])
+
+
+def test_the_level_is_of_what_an_object_shows(models, views, truth):
+    plain, twice = (
+        evaluate_fit(models, replace(views, images=images), params_of(truth)).level
+        for images in (views.images, 2 * views.images)
+    )
+    np.testing.assert_allclose(twice, 2 * plain, rtol=1e-5)
+    grey = evaluate_fit(models, replace(views, images=np.full_like(views.images, 0.3)), params_of(truth))
+    np.testing.assert_allclose(grey.level, 0.3, rtol=1e-5)
+    np.testing.assert_allclose(grey.contrast, 0, atol=1e-3)
+
+
+def test_a_goal_may_be_brighter_or_dimmer_than_the_scene():
+    """What is off by the same share in another light is nothing new, however much that is in radiance."""
+    usual = relative_residuals(fit_of(residuals=np.full((2, 1), 0.03)))
+    np.testing.assert_allclose(usual, 0.1)
+    for brighter in (0.5, 1.0, 3.0):
+        for times, is_misfit in ((1.9, False), (2.1, True)):
+            fit = fit_of(residuals=np.full((2, 1), 0.03 * brighter * times), level=np.array([0.3 * brighter]))
+            assert misfits(fit, goal_allowance(fit, usual)) == [0] * is_misfit
+
+
+def test_a_goal_is_not_doubted_for_what_all_fields_err_by_nor_believed_where_everything_is_off():
+    fit = fit_of(4, level=np.array([0.5, 0.1, 0.3, 0.3]))
+    np.testing.assert_allclose(goal_allowance(fit, np.array([0.0, 0.0, 2.0, np.nan])), [0.04, 0.02, 0.18, 0.04])
