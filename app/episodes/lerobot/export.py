@@ -21,6 +21,7 @@ from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.export.lerobot.conventions import GOAL_IMAGE, environment_state, image_name, instruction
 from osfcore.export.lerobot.dataset import DatasetSize, LeRobotEpisode, write_dataset
 from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.states import pose_rows
 from osfcore.io.files import reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
@@ -99,7 +100,8 @@ def _episodes(
             images = _images(episode, meshes, image_side)
         environment = None
         if obs != "pixels" and course.goal is not None:
-            environment = np.array([environment_state(state.poses, course.goal) for state in course.states[:-1]])
+            goal = pose_rows(course.goal)
+            environment = np.array([environment_state(pose_rows(state.poses), goal) for state in course.states[:-1]])
         task = instruction(course.names, episode.report.get("moved"))
         yield LeRobotEpisode(task, _actions(episode), _pusher(course), environment, images)
 

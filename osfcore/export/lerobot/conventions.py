@@ -18,9 +18,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import pose_rows
-
 ACTION, STATE, ENVIRONMENT, IMAGES = (
     "action",
     "observation.state",
@@ -32,9 +29,9 @@ GOAL_IMAGE = "goal"
 _POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
-def environment_state(poses: Pose, goal: Pose) -> Float[np.ndarray, "D"]:
-    """Poses of N objects and of their goals in one row of D = 14 N numbers."""
-    return np.concatenate([pose_rows(poses), pose_rows(goal)]).reshape(-1)
+def environment_state(poses: Float[np.ndarray, "N 7"], goal: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "D"]:
+    """Rows of poses (`pose_rows`) of N objects and of their goals as one of D = 14 N numbers."""
+    return np.concatenate([poses, goal]).reshape(-1)
 
 
 def environment_names(objects: int) -> tuple[str, ...]:
@@ -53,10 +50,10 @@ def instruction(names: Sequence[str], moved: Sequence[str] | None) -> str:
 
     Args:
         names: of the objects, such as "009_gelatin_box".
-        moved: those that shall lie elsewhere; None if nobody knows.
+        moved: those that shall lie elsewhere; none, or None, if nobody knows.
     """
-    if moved is None:
-        return f"Push {_listed(names)} to where the goal shows them."
+    if not moved:
+        return f"Push {_listed(names)} to where the goal shows {'it' if len(names) == 1 else 'them'}."
     still = [name for name in names if name not in moved]
     told = f"Push {_listed(moved)} to {'its goal' if len(moved) == 1 else 'their goals'}"
     if still:
