@@ -19,7 +19,8 @@ from app.episodes.finished import FinishedEpisode, read_episode
 from app.episodes.trajectory import Trajectory
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.export.lerobot.conventions import GOAL_IMAGE, environment_state, image_name, instruction
-from osfcore.export.lerobot.dataset import DatasetSize, LeRobotEpisode, write_dataset
+from osfcore.export.lerobot.dataset import write_dataset
+from osfcore.export.lerobot.episode import DatasetSize, LeRobotEpisode
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import pose_rows
 from osfcore.io.files import reading_png

@@ -10,7 +10,7 @@ import numpy as np
 
 from osfcore.errors import InvalidInput
 from osfcore.export.lerobot.conventions import ACTION, ACTION_NAMES, IMAGES, STATE, STATE_NAMES, environment_names
-from osfcore.export.lerobot.dataset import DatasetSize, LeRobotEpisode
+from osfcore.export.lerobot.episode import DatasetSize, LeRobotEpisode
 from osfcore.export.lerobot.statistics import Statistics, image_statistics, pooled, statistics_of
 from osfcore.export.lerobot.tables import episodes_table, frames_table, parquet, tasks_table
 from osfcore.export.lerobot.video import FPS, video_info, write_video

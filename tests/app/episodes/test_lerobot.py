@@ -16,7 +16,7 @@ from app.episodes.finished import NoEpisode
 from app.episodes.lerobot.export import NothingPushed, write_lerobot
 from app.episodes.trajectory import Trajectory, write_trajectory
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.export.lerobot.dataset import DatasetSize
+from osfcore.export.lerobot.episode import DatasetSize
 from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light

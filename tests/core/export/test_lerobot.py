@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 
 from osfcore.errors import InvalidInput
 from osfcore.export.lerobot.conventions import environment_names, environment_state, instruction
-from osfcore.export.lerobot.dataset import DatasetSize, LeRobotEpisode, write_dataset
+from osfcore.export.lerobot.dataset import write_dataset
+from osfcore.export.lerobot.episode import DatasetSize, LeRobotEpisode
 from osfcore.export.lerobot.statistics import image_statistics, pooled, statistics_of
 
 VALUES = st.floats(-10, 10, width=32)
