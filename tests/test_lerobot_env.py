@@ -5,8 +5,11 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
+import sys
 import warnings
+from importlib.metadata import distributions
 from pathlib import Path
 
 import gymnasium
@@ -86,6 +89,17 @@ def test_actions_that_are_too_fast_are_slowed_down(made):
         env.reset(seed=2)
         ends.append(env.step(np.array([fast, -fast], np.float32))[0]["agent_pos"])
     np.testing.assert_allclose(*ends, atol=1e-6)
+
+
+def test_pip_installs_it_under_a_name_that_lerobot_looks_for(tmp_path):
+    shutil.copytree(PACKAGE, tmp_path / "source")
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--no-deps")
+    place = tmp_path / "site"
+    subprocess.run([*pip, "--no-build-isolation", "--target", place, tmp_path / "source"], check=True)
+    (found,) = distributions(path=[str(place)])
+    name = found.metadata["Name"]
+    assert name.startswith("lerobot_env_")
+    assert (place / name / "__init__.py").exists()  # what it imports by that name
 
 
 # Through LeRobot
