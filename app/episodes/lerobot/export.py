@@ -16,7 +16,6 @@ from PIL import Image, ImageOps
 
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE
 from app.episodes.finished import FinishedEpisode, read_episode
-from app.episodes.trajectory import Trajectory
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.export.lerobot.conventions import GOAL_IMAGE, environment_state, image_name, instruction
 from osfcore.export.lerobot.dataset import write_dataset
@@ -77,6 +76,8 @@ def _check(episode: FinishedEpisode, first: FinishedEpisode, obs: Kind) -> None:
     course = episode.trajectory
     if len(course.states) < 2:
         raise NothingPushed(episode.folder)
+    if any(state.pusher is None for state in course.states):
+        raise InvalidInput(f"the pusher of {episode.folder}", "nowhere", "at a known place before each action")
     if obs == "pixels":
         return
     if course.goal is None:
@@ -103,8 +104,14 @@ def _episodes(
         if obs != "pixels" and course.goal is not None:
             goal = pose_rows(course.goal)
             environment = np.array([environment_state(pose_rows(state.poses), goal) for state in course.states[:-1]])
-        task = instruction(course.names, episode.report.get("moved"))
-        yield LeRobotEpisode(task, _actions(episode), _pusher(course), environment, images)
+        pusher = np.array([state.pusher[:2] for state in course.states[:-1] if state.pusher is not None])
+        task = instruction(course.names, _moved(episode.report.get("moved")))
+        yield LeRobotEpisode(task, _actions(episode), pusher, environment, images)
+
+
+def _moved(told: object) -> tuple[str, ...]:
+    """Objects that a report says had to move; none if it does not know."""
+    return tuple(map(str, told)) if isinstance(told, list) else ()
 
 
 def _actions(episode: FinishedEpisode) -> Float[np.ndarray, "T 2"]:
@@ -116,10 +123,6 @@ def _actions(episode: FinishedEpisode) -> Float[np.ndarray, "T 2"]:
     if actions.shape != expected:
         raise CorruptFile(episode.folder / REPORT_FILE, f"it does not tell the {expected[0]} actions of the episode")
     return actions[:, :2]
-
-
-def _pusher(course: Trajectory) -> Float[np.ndarray, "T 2"]:
-    return np.array([np.zeros(2) if state.pusher is None else state.pusher[:2] for state in course.states[:-1]])
 
 
 def _images(

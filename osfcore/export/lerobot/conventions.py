@@ -45,12 +45,12 @@ def image_name(camera: str) -> str:
     return f"camera_{camera}"
 
 
-def instruction(names: Sequence[str], moved: Sequence[str] | None) -> str:
+def instruction(names: Sequence[str], moved: Sequence[str]) -> str:
     """A task in words, such as "Push the gelatin box to its goal and leave the mug where it is.".
 
     Args:
         names: of the objects, such as "009_gelatin_box".
-        moved: those that shall lie elsewhere; none, or None, if nobody knows.
+        moved: those that shall lie elsewhere; none if nobody knows.
     """
     if not moved:
         return f"Push {_listed(names)} to where the goal shows {'it' if len(names) == 1 else 'them'}."

@@ -20,8 +20,11 @@ def parquet(table: pa.Table) -> bytes:
     return data.getvalue()
 
 
-def frames_table(vectors: Mapping[str, Float[np.ndarray, "T D"]], numbers: Mapping[str, Int[np.ndarray, "T"]],
-                 times_s: Float[np.ndarray, "T"]) -> pa.Table:  # fmt: skip
+def frames_table(
+    vectors: Mapping[str, Float[np.ndarray, "T _"]],
+    numbers: Mapping[str, Int[np.ndarray, "T"]],
+    times_s: Float[np.ndarray, "T"],
+) -> pa.Table:
     """A row for each action.
 
     Args:

@@ -160,6 +160,9 @@ def test_folders_that_cannot_be_learned_from_are_refused_by_name(library, tmp_pa
         write_lerobot([tmp_path / "nowhere"], library, tmp_path / "set")
     with pytest.raises(NothingPushed, match="still has pushed nothing"):
         write_lerobot([leave(tmp_path / "still", course(0))], library, tmp_path / "set")
+    blind = replace(course(1), states=tuple(replace(one, pusher=None) for one in course(1).states))
+    with pytest.raises(InvalidInput, match="pusher of .*blind is nowhere"):
+        write_lerobot([leave(tmp_path / "blind", blind)], library, tmp_path / "set")
     with pytest.raises(CorruptFile, match="does not tell the 2 actions"):
         write_lerobot([leave(tmp_path / "torn", course(2), actions=[[0, 0, 0]])], library, tmp_path / "set")
     assert not (tmp_path / "set").exists()

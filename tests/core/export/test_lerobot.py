@@ -46,7 +46,7 @@ def test_statistics_of_images_are_those_of_their_colours():
 
 
 def test_each_number_of_an_environment_state_has_its_name():
-    told = environment_state(np.arange(14).reshape(2, 7), 100 + np.arange(14).reshape(2, 7))
+    told = environment_state(np.arange(14.0).reshape(2, 7), np.arange(100.0, 114).reshape(2, 7))
     by_name = dict(zip(environment_names(2), told, strict=True))
     assert by_name["object_0_x"] == 0
     assert by_name["object_1_qw"] == 10
@@ -63,7 +63,7 @@ def test_each_number_of_an_environment_state_has_its_name():
             (BOX, MUG),
             "Push the gelatin box and the mug to their goals and leave the tomato soup can where it is.",
         ),
-        ((BOX, MUG, CAN), None, "Push the gelatin box, the mug and the tomato soup can to where the goal shows them."),
+        ((BOX, MUG, CAN), (), "Push the gelatin box, the mug and the tomato soup can to where the goal shows them."),
         ((BOX,), (), "Push the gelatin box to where the goal shows it."),
     ],
 )
