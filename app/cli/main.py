@@ -23,6 +23,7 @@ from app.cli.commands.exchange.import_scene import Import
 from app.cli.commands.photo import Photo
 from app.cli.commands.predict import Predict
 from app.cli.commands.recordings.clip import Clip
+from app.cli.commands.recordings.lerobot import LeRobot
 from app.cli.commands.recordings.mcap import Mcap
 from app.cli.commands.recordings.record import Record
 from app.cli.commands.render import Render
@@ -57,6 +58,7 @@ Commands = Annotated[
     | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
     | Annotated[Clip, tyro.conf.subcommand("clip", description="Make a clip of an episode.")]
     | Annotated[Mcap, tyro.conf.subcommand("mcap", description="Write an episode for Foxglove.")]
+    | Annotated[LeRobot, tyro.conf.subcommand("lerobot", description="Write episodes as a LeRobot data set.")]
     | Annotated[Record, tyro.conf.subcommand("record", description="Make the stories that the page plays.")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval", description="Measure how good trained parts are.")]
     | Annotated[

@@ -7,9 +7,9 @@ from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import SceneState, pose_rows
 from osfcore.geometry.workspace import PUSHER_REACH_M, TABLE_SIDE_M
 
 Kind = Literal["poses", "pixels", "both"]
@@ -39,17 +39,6 @@ def space_of(kind: Kind, objects: int, available: int, views: int, side: int) ->
     return gymnasium.spaces.Dict({**spaces, "goal": gymnasium.spaces.Dict(goal)})
 
 
-def poses_of(state: SceneState) -> Float[np.ndarray, "N 7"]:
-    """Position [m] and quaternion (w, x, y, z) of each object.
-
-    q and -q are one rotation, told with w >= 0; what has fallen off the table is told within 1.2 m of its centre.
-    """
-    quaternions = state.poses.quaternion
-    signs = np.where(quaternions[:, :1] < 0, -1.0, 1.0)
-    positions = state.poses.position.clip(-TABLE_SIDE_M, TABLE_SIDE_M)
-    return np.concatenate([positions, (signs * quaternions).clip(-1, 1)], axis=1)
-
-
 def observation_of(
     state: SceneState,
     goal: SceneState,
@@ -71,7 +60,7 @@ def observation_of(
     aim: dict[str, Any] = {}
     if kind != "pixels":
         told["objects"] = np.array([available.index(name) for name in state.names])
-        told["poses"], aim["poses"] = poses_of(state), poses_of(goal)
+        told["poses"], aim["poses"] = pose_rows(state.poses), pose_rows(goal.poses)
     if pixels is not None:
         told["pixels"], aim["pixels"] = pixels["table"].copy(), pixels["goal"].copy()
     return {**told, "goal": aim}

@@ -15,6 +15,7 @@ from osfcore.errors import InvalidInput, UnknownName, finite_vector
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
+from osfcore.geometry.workspace import TABLE_SIDE_M
 
 MAX_OBJECTS = 8
 
@@ -98,3 +99,13 @@ class Observation:
     masks: Bool[np.ndarray, "V N h w"] | None
     pusher: Float[np.ndarray, "3"] | None
     time_s: float
+
+
+def pose_rows(poses: Pose) -> Float[np.ndarray, "N 7"]:
+    """Position [m] and quaternion (w, x, y, z) of each object, as programs that learn are told them.
+
+    q and -q are one rotation, told with w >= 0; what has fallen off the table is told within 1.2 m of its centre.
+    """
+    signs = np.where(poses.quaternion[:, :1] < 0, -1.0, 1.0)
+    positions = poses.position.clip(-TABLE_SIDE_M, TABLE_SIDE_M)
+    return np.concatenate([positions, (signs * poses.quaternion).clip(-1, 1)], axis=1)

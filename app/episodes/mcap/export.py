@@ -5,20 +5,11 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-from app.episodes.file_names import REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.trajectory import read_trajectory
-from osfcore.errors import OsfError
+from app.episodes.finished import read_episode
 from osfcore.extras import need
 from osfcore.geometry.workspace import STEP_S
-from osfcore.io.files import as_mapping, read_json, write_atomically
+from osfcore.io.files import write_atomically
 from osfcore.objects.asset_library import AssetLibrary
-
-
-class NoEpisode(OsfError):
-    """A folder that holds no episode."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(f"{folder} holds no episode: give a folder that 'osf episode' has left.")
 
 
 def write_mcap(folder: Path, library: AssetLibrary, path: Path) -> float:
@@ -39,9 +30,8 @@ def write_mcap(folder: Path, library: AssetLibrary, path: Path) -> float:
         CannotWrite: if the disk refuses.
     """
     need("mcap", "An MCAP file")
-    if not (folder / TRAJECTORY_FILE).is_file() or not (folder / REPORT_FILE).is_file():
-        raise NoEpisode(folder)
-    trajectory, report = read_trajectory(folder / TRAJECTORY_FILE), read_json(folder / REPORT_FILE, as_mapping)
+    episode = read_episode(folder)
+    trajectory = episode.trajectory
     meshes = {name: library.load(name).mesh for name in trajectory.names}
     import foxglove
 
@@ -54,6 +44,6 @@ def write_mcap(folder: Path, library: AssetLibrary, path: Path) -> float:
         contents.log_transforms(log, trajectory)
         contents.log_plans(log, trajectory.rounds)
         contents.log_images(log, folder, trajectory.rounds)
-        contents.log_words(log, report)
+        contents.log_words(log, episode.report)
     write_atomically(path, data.getvalue())
     return STEP_S * (len(trajectory.states) - 1)
