@@ -13,6 +13,7 @@ PACKAGES = {
               "itsdangerous", "pydantic_settings"),
     "gym": ("gymnasium",),
     "mcap": ("foxglove",),
+    "ros": ("websockets",),
 }  # fmt: skip
 _LATEST_FOR_PYBULLET = (3, 11)
 

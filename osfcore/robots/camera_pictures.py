@@ -14,6 +14,7 @@ from osfcore.estimation.photometry.camera_response import linear_from_encoded
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
+from osfcore.photo.read_photograph import KEPT_SIDE as MOST_SIDE
 from osfcore.photo.read_photograph import read_photograph
 
 KEPT_SIDE = 640  # larger pictures are reduced to this; estimates look at less
@@ -45,8 +46,9 @@ class SentCamera:
         Raises:
             InvalidInput: if its values are out of range.
         """
-        if not min(self.width, self.height) > 0:
-            raise InvalidInput(f"picture of camera {shown(self.name)} [px]", f"{self.width} x {self.height}", "not empty")
+        if not 0 < min(self.width, self.height) <= max(self.width, self.height) <= MOST_SIDE:
+            what = f"picture of camera {shown(self.name)} [px]"
+            raise InvalidInput(what, f"{self.width} x {self.height}", f"between 1 and {MOST_SIDE} a side")
         scale = min(1.0, KEPT_SIDE / max(self.width, self.height))
         width, height = round(scale * self.width), round(scale * self.height)
         ratio = np.array([[width / self.width], [height / self.height], [1.0]])
