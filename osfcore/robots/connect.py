@@ -33,7 +33,7 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
-        host, port = None, None
+        raise InvalidInput("address of the robot", url, FORMS) from None
     if not host or parts.scheme not in ("http", "https", "ros"):
         raise InvalidInput("address of the robot", url, FORMS)
     if parts.scheme != "ros":

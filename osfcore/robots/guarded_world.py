@@ -104,7 +104,7 @@ class GuardedWorld:
         """Do what the limits leave of an action.
 
         Raises:
-            InvalidInput: if the action is none, or the pusher's place is unknown or well outside the box; nothing moves.
+            InvalidInput: if it is no action, or the pusher's place is unknown or well outside the box; nothing moves.
             RobotStopped: if the robot was stopped, before or meanwhile, or may not move.
         """
         wanted = check_action(action)[:2] * STEP_S

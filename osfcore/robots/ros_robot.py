@@ -1,4 +1,4 @@
-"""A robot under ROS 2, through rosbridge: compressed images, camera_info and tf in, twists out. No ROS is needed here."""
+"""A robot under ROS 2, through rosbridge, without ROS here: compressed images, camera_info, tf in, twists out."""
 
 from __future__ import annotations
 

@@ -49,8 +49,10 @@ class Rosbridge:
         self._url = url
         try:
             # A robot is beside the computer: no proxy. Pings tell in time that it has gone.
-            self._socket = connect(url, open_timeout=timeout_s, close_timeout=timeout_s, max_size=_MOST_BYTES,
-                                   ping_interval=timeout_s, ping_timeout=timeout_s, proxy=None, compression=None)  # fmt: skip
+            self._socket = connect(
+                url, proxy=None, compression=None, max_size=_MOST_BYTES, open_timeout=timeout_s,
+                close_timeout=timeout_s, ping_interval=timeout_s, ping_timeout=timeout_s,
+            )  # fmt: skip
         except (OSError, TimeoutError, WebSocketException, InvalidURI) as error:
             raise ConnectionLost(url, str(error) or type(error).__name__) from error
         self._news = threading.Condition()

@@ -75,7 +75,7 @@ class SafetyLimits:
         return np.clip(travel, least, most)
 
     def slow_parts(self, travel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "3"]]:
-        """Velocities (vx, vy, 0) [m/s] no faster than allowed, each held for `STEP_S`, that cover a travel [m] together.
+        """Velocities (vx, vy, 0) [m/s] that are allowed, each held for `STEP_S`, and cover a travel [m] together.
 
         Slower for longer: pushes are so slow that only the way counts, so predictions of the action still hold.
         """
