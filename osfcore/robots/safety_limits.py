@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput, check_ranges, finite_vector
-from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
+from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 
-MIN_SPEED_M_S = 0.005
-TOP_SPEED_M_S = MAX_SPEED_M_S * 2**0.5  # of an action, whose limits hold for each axis
+MIN_SPEED_M_S, TOP_SPEED_M_S = 0.005, 5.0  # a robot may be able to do more than any action asks
 _BOX = "x0, y0, x1, y1, finite, with x0 < x1 and y0 < y1"
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,14 @@ class Marble:
 
     def close(self):
         self.told.append("close")
+
+
+def until(holds, timeout_s=20.0):
+    """Wait for something."""
+    end = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < end, "it did not come about"
+        time.sleep(0.002)
 
 
 def example():

@@ -226,7 +226,7 @@ def test_a_world_without_motors_is_guarded_alike():
         ((0.1, 0.0, -0.1, 0.1), 0.1, "x0 < x1"),
         ((0.0, 0.0, float("nan"), 0.1), 0.1, "finite"),
         (BOX, 0.0, "top speed"),
-        (BOX, 0.5, "top speed"),
+        (BOX, 50.0, "top speed"),
     ],
 )
 def test_limits_that_are_none_are_refused(box, speed, words):
