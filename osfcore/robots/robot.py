@@ -35,7 +35,7 @@ class ConnectionLost(OsfError):
 
     def __init__(self, url: str, reason: str) -> None:
         told = f"The robot at {url} does not answer ({reason.rstrip('.')})"
-        super().__init__(f"{told}; it halts by itself. See whether it runs and is on the network, and begin anew.")
+        super().__init__(f"{told}; if it moved, it halts by itself. See whether it runs and is on the network.")
 
 
 class RobotRefused(OsfError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ from osfcore.random_streams import Stream, stream_rng
 from osfcore.robots.connect import connect
 from osfcore.robots.guarded_world import GuardedWorld
 from osfcore.robots.outlined_world import CameraBoxes, OutlinedWorld
+from osfcore.robots.robot import RobotDescription
 from osfcore.robots.safety_limits import SafetyLimits
 
 _RADIUS_DIFFERS_M = 0.001  # more is said
@@ -67,6 +69,8 @@ class DriveOrder:
 class RobotDrive:
     """One robot on its way to a goal. Whoever drives it closes it, which stops the robot.
 
+    `limits` are those that hold, `doubts` sentences that a person should read before the robot moves.
+
     Args:
         order: what is wanted.
         permit: asked once, before the first motion.
@@ -82,20 +86,16 @@ class RobotDrive:
         for name in order.names:
             fields.info(name)
         robot = connect(order.url, order.names, order.limits)
-        self._guard = GuardedWorld(robot, order.limits, permit)  # until the robot's own limits are known
-        try:
+        with contextlib.ExitStack() as opened:
+            opened.callback(robot.close)
             self.limits = order.limits.within(robot.description.limits)
-            self._guard = GuardedWorld(robot, self.limits, permit)
-            self._goal = read_goal_photo(order, robot.description.cameras)
+            goal = read_goal_photo(order, robot.description.cameras)
             models = load_scene_models(order.names, fields, assets, order.data_dir, order.device)
-            world = OutlinedWorld(self._guard, order.boxes)
-            rng = stream_rng(order.seed, Stream.EPISODE)
-            self._episode = Episode(world, models, self._goal, order.settings, rng)
-        except BaseException:
-            self._guard.close()
-            raise
-        radius = robot.description.pusher_radius_m
-        self.doubts = _doubts(radius)
+            opened.pop_all()
+        self.doubts = doubts_about(robot.description)
+        self._guard = GuardedWorld(robot, self.limits, permit)
+        world, rng = OutlinedWorld(self._guard, order.boxes), stream_rng(order.seed, Stream.EPISODE)
+        self._episode = Episode(world, models, goal, order.settings, rng)
         self._record = RobotRecord(order.out, _about(order, self.limits), self._guard)
 
     def stop(self, reason: str) -> None:
@@ -153,7 +153,9 @@ def read_goal_photo(order: DriveOrder, cameras: tuple[Camera, ...]) -> GoalImage
     return GoalImage(camera.resized(width, height), image)
 
 
-def _doubts(radius_m: float) -> tuple[str, ...]:
+def doubts_about(robot: RobotDescription) -> tuple[str, ...]:
+    """What a person should know of a robot before it moves."""
+    radius_m = robot.pusher_radius_m
     if abs(radius_m - PUSHER_RADIUS_M) <= _RADIUS_DIFFERS_M:
         return ()
     told = f"The robot's pusher has a radius of {1000 * radius_m:.0f} mm"

@@ -92,12 +92,12 @@ class RobotRecord:
     def _step_entry(self, event: Stepped) -> dict[str, Any]:
         """A step; lengths in mm, angles in degrees, all of them as estimated; None for what is not known."""
         names = event.estimate.state.names
-        assert self._goal is not None or not event.offsets_m.size
+        assert self._goal is not None
         return {
             "step": event.number,
             "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
             "image_cost": event.image_cost,
-            "ssim": None if self._goal is None else round(ssim(self._goal.image, event.rendered), 4),
+            "ssim": round(ssim(self._goal.image, event.rendered), 4),
             "to_goal_mm": by_name(names, 1000 * event.offsets_m) if event.offsets_m.size else None,
             "to_goal_deg": by_name(names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
             "estimate": estimated_to_json(event.estimate),

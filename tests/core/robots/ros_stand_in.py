@@ -1,4 +1,4 @@
-"""A stand-in for rosbridge with a robot behind it: speaks JSON over a websocket, moves a point, draws plain pictures."""
+"""A stand-in for rosbridge with a robot behind it: JSON over a websocket, a point that moves, plain pictures."""
 
 import base64
 import contextlib
