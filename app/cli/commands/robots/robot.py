@@ -79,7 +79,7 @@ class RobotDriveCommand:
     """CAMERA:NAME:LEFT,TOP,RIGHT,BOTTOM [px] as the table lies now, where the robot delivers no masks; of each object
     in at least one camera, in the pictures of `osf robot check`."""
     box: tuple[float, float, float, float] | None = None
-    """x0 y0 x1 y1 [m]: where the pusher's centre may be, besides the robot's own limits; 0.35 m to each side without it."""
+    """x0 y0 x1 y1 [m] that the pusher's centre stays in, besides the robot's own; 0.35 m to each side without it."""
     top_speed: float = 0.1
     """Of the pusher [m/s]; actions take longer where it is low."""
     yes: bool = False
@@ -211,9 +211,7 @@ def _show_check(
     height, width = seen.images.shape[1:3]
     x0, y0, x1, y1 = about.limits.box
     x, y, _ = seen.pusher
-    print(
-        f"The robot at {url} has {len(seen.cameras)} cameras ({names}; {width} x {height}); a look takes {look_s:.2f} s."
-    )
+    print(f"The robot at {url} has {len(seen.cameras)} cameras ({names}; {width} x {height}); a look: {look_s:.2f} s.")
     print(f"Its pusher is at x {x:.3f}, y {y:.3f} m and stays within x {x0:g} to {x1:g}, y {y0:g} to {y1:g} m,")
     print(f"no faster than {about.limits.top_speed_m_s:g} m/s; without a command it halts after {about.deadman_s:g} s.")
     for doubt in doubts:
