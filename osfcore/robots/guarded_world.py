@@ -107,7 +107,8 @@ class GuardedWorld:
             InvalidInput: if it is no action, or the pusher's place is unknown or well outside the box; nothing moves.
             RobotStopped: if the robot was stopped, before or meanwhile, or may not move.
         """
-        wanted = check_action(action)[:2] * STEP_S
+        action = check_action(action)
+        wanted = action[:2] * STEP_S
         self.check()
         where = self._checked_place()
         travel = self._limits.allowed_travel(wanted, where)

@@ -195,6 +195,13 @@ def test_a_goal_of_another_shape_is_told(robot, tmp_path, capsys):
     assert "size of 0.png [px] is 80 x 64, but it must be in proportion 64:64" in capsys.readouterr().err
 
 
+def test_the_program_of_the_guide_works(server):
+    (program,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), flags=re.DOTALL)
+    before = server[1].truth()
+    exec(program.replace("http://127.0.0.1:8080", server[0]), {})
+    np.testing.assert_allclose(server[1].truth().pusher - before.pusher, [0.02, 0, 0], atol=2e-3)
+
+
 @pytest.mark.slow
 def test_the_commands_of_the_guide_work(library, tmp_path, monkeypatch, capsys):
     """With a real first look, at a table that has changed since the goal was photographed."""
