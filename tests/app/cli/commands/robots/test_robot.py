@@ -209,7 +209,7 @@ def test_the_commands_of_the_guide_work(library, tmp_path, monkeypatch, capsys):
     (block,) = re.findall(r"```console\n(.*?)```", GUIDE.read_text(), flags=re.DOTALL)
     server, *commands = block.splitlines()
     assert server == "python examples/robot_server.py"
-    with contextlib.closing(simulated(library, 128)) as table, serving(example().robot(table)) as url:
+    with contextlib.closing(simulated(library, 256)) as table, serving(example().robot(table)) as url:
         start = table.truth()
         table.load(replace(toward_middle(start), pusher=np.array([-0.35, -0.35, start.pusher[2]])))
         for command in commands:
