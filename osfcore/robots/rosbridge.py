@@ -72,7 +72,7 @@ class Rosbridge:
             kept: how many of the last messages are kept.
         """
         self._kept[topic] = kept
-        # A queue of one (0 in their counting means none, which drops what comes in between) holds what is newest.
+        # A queue of one holds the newest of what comes between two messages; without one (0) nothing is held.
         queue = 0 if kept > 1 else 1
         self._send(op="subscribe", topic=topic, type=kind, throttle_rate=every_ms, queue_length=queue)
 
