@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Response
 
@@ -66,7 +67,7 @@ def robot(table: Tabletop) -> FastAPI:
         if not 0 < seconds <= DEADMAN_S or x**2 + y**2 > TOP_SPEED_M_S**2:
             raise HTTPException(422, f"A motion takes {DEADMAN_S} s at most, no faster than {TOP_SPEED_M_S} m/s.")
         with moving:  # when the time is over the pusher stands, whoever has gone meanwhile
-            slices = table.act_steps((x, y, 0.0), SLICES_HZ)
+            slices = table.act_steps(np.array([x, y, 0.0]), SLICES_HZ)
             while not stopped.is_set():
                 if next(slices, None) is None:
                     return pusher()
