@@ -2,7 +2,7 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
@@ -25,6 +25,7 @@ def guarded(world, limits=LIMITS, **more):
     return guard
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # on a busy machine drawing takes its time
 @given(
     st.lists(st.tuples(velocities, st.booleans()), max_size=12),
     st.lists(shares, max_size=40),
