@@ -14,6 +14,7 @@ A map of the rooms, each importing only from those above it:
     dynamics     what a push does: contact graph and propagation network
     planning     MPPI, costs, push primitives, path planning
     control      Algorithm 1 of the paper as a generator of events over a `World`
+    robots       robots over HTTP and ROS 2 as worlds; limits and a stop around any world
     paper        the paper's dynamics model as published, to compare ours with
     world        the simulated tabletop (PyBullet) and data collection
     export       scenes and fields as files that other programs open: binary glTF, Gaussian splats

@@ -14,6 +14,7 @@ PACKAGES = {
     "gym": ("gymnasium",),
     "mcap": ("foxglove",),
     "lerobot": ("pyarrow", "imageio_ffmpeg"),
+    "ros": ("websockets",),
 }  # fmt: skip
 _LATEST_FOR_PYBULLET = (3, 11)
 

@@ -27,6 +27,7 @@ from app.cli.commands.recordings.lerobot import LeRobot
 from app.cli.commands.recordings.mcap import Mcap
 from app.cli.commands.recordings.record import Record
 from app.cli.commands.render import Render
+from app.cli.commands.robots.robot import RobotCommand
 from app.cli.commands.serve import Serve
 from app.cli.commands.train import Train
 from osfcore.errors import OsfError
@@ -56,6 +57,7 @@ Commands = Annotated[
     | Annotated[Photo, tyro.conf.subcommand("photo", description="Find objects and lamp in a photograph.")]
     | Annotated[Predict, tyro.conf.subcommand("predict", description="Predict what pushes would do.")]
     | Annotated[RunEpisode, tyro.conf.subcommand("episode", description="Push until the table looks like a photo.")]
+    | Annotated[RobotCommand, tyro.conf.subcommand("robot", description="Look at a robot, and drive it.")]
     | Annotated[Clip, tyro.conf.subcommand("clip", description="Make a clip of an episode.")]
     | Annotated[Mcap, tyro.conf.subcommand("mcap", description="Write an episode for Foxglove.")]
     | Annotated[LeRobot, tyro.conf.subcommand("lerobot", description="Write episodes as a LeRobot data set.")]

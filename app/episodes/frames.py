@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -102,6 +101,8 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]]) -> Non
     Raises:
         CannotWrite: if it cannot be encoded or written.
     """
+    import imageio_ffmpeg  # here: frames are drawn without it
+
     partial = path.with_name(f".{path.name}.part.mp4")
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{WIDTH}x{HEIGHT}", "-r", f"{1 / STEP_S:g}", "-i", "-", "-an", "-vcodec", "libx264"]

@@ -6,23 +6,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from app.episodes.event_notes import note_of
 from app.episodes.file_names import RECORDING_FILE
 from app.episodes.part_names import parts_of
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import EpisodeOrder, SimulatedTable, given
 from osfcore.control.closed_loop import Episode
-from osfcore.control.events import ActionExecuted, Event, GoalFound, Looking, Noticed, Planning, Stepped
+from osfcore.control.events import ActionExecuted, Event
 from osfcore.control.scene_models import load_scene_models
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
-
-_FOUND = {
-    "first": "Knows where everything is",
-    "goal": "Comparing the goal image with the table",
-    "next": "Knows where everything is now",
-    "search": "Knows where everything is now",
-}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,36 +69,3 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         yield EpisodeStep(done, total, str(report["text"]), report=report)
     finally:
         begin.world.close()
-
-
-def note_of(event: Event) -> str | None:
-    """What is being done, for a person; None if this event changes nothing about it."""
-    match event:
-        case Looking():
-            if event.step.estimate is not None:
-                return _FOUND[event.look]
-            where = {"first": "first frame", "goal": "goal image", "next": "table", "search": "lost objects"}
-            return f"Looking at the {where[event.look]}: {event.step.progress.note}"
-        case GoalFound():
-            return "Knows where everything should be"
-        case Stepped() | Planning():
-            return "Planning pushes"
-        case ActionExecuted():
-            return "Pushing"
-        case Noticed():
-            return event.text
-        case _:
-            return None
-
-
-def stage_of(event: Event) -> str | None:
-    """Which part of the loop an event belongs to; None if it says nothing about that."""
-    match event:
-        case Looking():
-            return event.look
-        case Stepped() | Planning():
-            return "plan"
-        case ActionExecuted():
-            return "act"
-        case _:
-            return None

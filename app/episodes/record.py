@@ -163,15 +163,15 @@ class EpisodeRecord:
             "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
             "image_cost": event.image_cost,
             "ssim": round(ssim(self._image.image, event.rendered), 4),
-            "to_goal_mm": _by_name(truth.names, 1000 * event.offsets_m) if event.offsets_m.size else None,
-            "to_goal_deg": _by_name(truth.names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
-            "estimate_off_mm": _by_name(truth.names, 1000 * off),
+            "to_goal_mm": by_name(truth.names, 1000 * event.offsets_m) if event.offsets_m.size else None,
+            "to_goal_deg": by_name(truth.names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
+            "estimate_off_mm": by_name(truth.names, 1000 * off),
             "light_off_deg": round(float(np.rad2deg(estimate.state.light.angle_to(truth.light))), 3),
             "estimate": estimated_to_json(estimate),
             "truth": state_to_json(truth),
         }
         if self._about.goal is not None:
-            entry["truly_to_goal_mm"] = _by_name(truth.names, 1000 * _shift(truth, self._about.goal))
+            entry["truly_to_goal_mm"] = by_name(truth.names, 1000 * _shift(truth, self._about.goal))
         return entry
 
     def _draw(self, event: Stepped) -> None:
@@ -210,7 +210,7 @@ class EpisodeRecord:
             "objects": list(self._start.names),
             "method": about.method,
             "settings": asdict(about.settings),
-            "goal": None if self._goal is None else _goal_to_json(self._goal),
+            "goal": None if self._goal is None else goal_to_json(self._goal),
             "noticed": self._notices,
             "actions": self._actions,
             "step_s": [round(at_s, 3) for at_s in ReplayClock(self._course.trajectory).step_s],
@@ -227,7 +227,8 @@ class EpisodeRecord:
         return report
 
 
-def _by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+def by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+    """Values of objects as reports have them."""
     return {name: round(float(value), 3) for name, value in zip(names, values, strict=True)}
 
 
@@ -236,7 +237,8 @@ def _shift(state: SceneState, goal: SceneState) -> Float[np.ndarray, "N"]:
     return np.linalg.norm(state.poses.position - there, axis=1)
 
 
-def _goal_to_json(goal: GoalFound) -> dict[str, Any]:
+def goal_to_json(goal: GoalFound) -> dict[str, Any]:
+    """A goal as reports have it."""
     objects = [encode(ObjectJson.of(name, goal.goal.poses[n])) for n, name in enumerate(goal.goal.names)]
     estimate = None if goal.estimate is None else estimated_to_json(goal.estimate)
     return {"objects": objects, "estimate": estimate}

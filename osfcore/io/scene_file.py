@@ -83,13 +83,23 @@ class CameraJson(Entry):
         Raises:
             InvalidInput: if a value is out of range.
         """
-        T_world_camera = np.array(self.T_world_camera)
-        R = T_world_camera[:3, :3]
-        is_rigid = np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) > 0
-        if not is_rigid or not np.allclose(T_world_camera[3], (0, 0, 0, 1)):
-            what = f"T_world_camera of camera {shown(self.name)}"
-            raise InvalidInput(what, self.T_world_camera, "a rotation and a translation, 4 x 4")
-        return Camera(self.name, Pose.from_matrix(T_world_camera), np.array(self.K), self.width, self.height)
+        pose = rigid_pose(self.T_world_camera, self.name)
+        return Camera(self.name, pose, np.array(self.K), self.width, self.height)
+
+
+def rigid_pose(matrix: list[list[float]], camera: str) -> Pose:
+    """`T_world_camera` of a camera, as a matrix in a file.
+
+    Raises:
+        InvalidInput: if it is no rotation and translation.
+    """
+    T_world_camera = np.array(matrix)
+    R = T_world_camera[:3, :3]
+    is_rigid = np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) > 0
+    if not is_rigid or not np.allclose(T_world_camera[3], (0, 0, 0, 1)):
+        what = f"T_world_camera of camera {shown(camera)}"
+        raise InvalidInput(what, matrix, "a rotation and a translation, 4 x 4")
+    return Pose.from_matrix(T_world_camera)
 
 
 class StateJson(Entry):

@@ -188,7 +188,7 @@ def use_one_thread() -> None:
 
 def _progress_after(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
     """How far an episode is after an event."""
-    from app.episodes.headless import note_of, stage_of
+    from app.episodes.event_notes import note_of, stage_of
     from app.processes.plan_summary import sketch_of
     from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed, Planning, Stepped
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from app.episodes import headless as run
+from app.episodes.event_notes import stage_of
 from app.episodes.file_names import RECORDING_FILE, REPORT_FILE
-from app.episodes.headless import run_episode, stage_of
+from app.episodes.headless import run_episode
 from app.episodes.request import EpisodeOrder
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Observed, Planning, Stepped

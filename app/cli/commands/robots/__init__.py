@@ -1,0 +1,1 @@
+"""`osf robot`: look at a robot, and drive it."""

@@ -1,0 +1,228 @@
+"""`osf robot`: see whether a robot's cameras are where it says, and drive it toward a goal photo."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from app.storage.paths import default_data_dir
+from osfcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from app.episodes.robots.robot_drive import RobotDrive
+    from osfcore.geometry.states import Observation
+    from osfcore.robots.outlined_world import CameraBoxes
+    from osfcore.robots.robot import Robot, RobotDescription
+    from osfcore.robots.safety_limits import SafetyLimits
+
+_LOOKS = 3
+_FORM = "CAMERA:NAME:LEFT,TOP,RIGHT,BOTTOM, such as left:025_mug:120,80,260,210"
+
+
+@dataclass(frozen=True)
+class RobotCheck:
+    """Look through a robot's cameras without moving it: do the table's axes lie where they should?"""
+
+    url: tyro.conf.Positional[str]
+    """http://HOST:PORT, or ros://HOST:9090?cameras=NAME,NAME for rosbridge."""
+    out: Path | None = None
+    """Folder for overlay.png, with the axes drawn into all pictures, and a picture of each camera, CAMERA.png."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Look some times; the result tells cameras, limits and how long a look takes."""
+        from app.episodes.robots.robot_drive import doubts_about
+        from osfcore.io.output_paths import check_place
+        from osfcore.robots.connect import connect
+
+        if self.out is not None:
+            check_place(self.out / "overlay.png")
+        with contextlib.closing(connect(self.url)) as robot:
+            looks = [_timed_look(robot) for _ in range(_LOOKS)]
+        seen, seconds = looks[-1][0], [look[1] for look in looks]
+        about, doubts = robot.description, doubts_about(robot.description)
+        if self.out is not None:
+            _write_pictures(self.out, seen)
+        if not self.json:
+            _show_check(self.url, about, seen, min(seconds), doubts, self.out)
+        assert seen.pusher is not None
+        return {
+            "robot": self.url, "cameras": [camera.name for camera in seen.cameras], "limits": asdict(about.limits),
+            "pusher": seen.pusher.tolist(), "pusher_radius_m": about.pusher_radius_m, "deadman_s": about.deadman_s,
+            "look_s": [round(each, 4) for each in seconds], "doubts": list(doubts),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RobotDriveCommand:
+    """Push objects on a robot's table until it looks like a photo. It asks before it moves; any key stops it."""
+
+    url: tyro.conf.Positional[str]
+    """http://HOST:PORT, or ros://HOST:9090?cameras=NAME,NAME for rosbridge."""
+    goal: Path
+    """Photo of how the table should look, by one of the robot's cameras, without the pusher."""
+    names: tuple[str, ...]
+    """Objects on the table."""
+    out: Path
+    """Folder for report.json, goal.png, frames/ and video.mp4."""
+    goal_camera: str | None = None
+    """The camera that took the goal; that by whose name the file is called without it."""
+    goal_encoding: Literal["srgb", "linear"] = "srgb"
+    """Of the goal: as cameras write, or radiance as it is."""
+    boxes: tuple[str, ...] = ()
+    """CAMERA:NAME:LEFT,TOP,RIGHT,BOTTOM [px] as the table lies now, where the robot delivers no masks; of each object
+    in at least one camera, in the pictures of `osf robot check`."""
+    box: tuple[float, float, float, float] | None = None
+    """x0 y0 x1 y1 [m] that the pusher's centre stays in, besides the robot's own; 0.35 m to each side without it."""
+    top_speed: float = 0.1
+    """Of the pusher [m/s]; actions take longer where it is low."""
+    yes: bool = False
+    """Do not ask before the first motion."""
+    steps: int = 30
+    """Actions at most."""
+    samples: int = 160
+    """Sequences of actions in each of a plan's two rounds."""
+    horizon: int = 30
+    """Actions in each."""
+    seed: int = 0
+    """Of the searches."""
+    despite_doubts: bool = False
+    """Go on with a goal photo that is not explained well."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Where fields and networks trained on this machine are."""
+    json: bool = False
+    """Print the report, but for its single steps, as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Drive; the result is report.json without the single steps."""
+        from app.cli.commands.robots.stop_key import stop_on_key
+        from app.episodes.event_notes import note_of
+        from app.episodes.robots.robot_drive import RobotDrive
+
+        order = self._order()
+        with contextlib.ExitStack() as opened:
+
+            def permit() -> bool:
+                allowed = self.yes or _asked(drive, self.url)
+                if allowed and opened.enter_context(stop_on_key(drive.stop)):
+                    self._say("It moves. Any key stops it.")
+                return allowed
+
+            drive = opened.enter_context(contextlib.closing(RobotDrive(order, permit)))
+            said = ""
+            for event in drive.run():
+                note = (note_of(event) or said).partition(": ")[0]  # what follows counts up
+                if note != said:
+                    self._say(note)
+                said = note
+        report = drive.finish()
+        self._say(f"{report['text']} {report['steps_done']} actions, {report['seconds']:.0f} s. Report: {self.out}")
+        return {key: value for key, value in report.items() if key not in ("steps", "actions", "goal")}
+
+    def _order(self) -> Any:  # noqa: ANN401  a DriveOrder, whose module is heavy
+        from app.episodes.file_names import REPORT_FILE
+        from app.episodes.robots.robot_drive import DriveOrder
+        from osfcore.control.episode_settings import EpisodeSettings
+        from osfcore.errors import check_seed
+        from osfcore.fields.devices import pick_device
+        from osfcore.io.output_paths import check_place
+        from osfcore.planning.mppi import PlanSettings
+
+        plan = PlanSettings(self.samples, self.horizon)
+        settings = EpisodeSettings(self.steps, plan=plan, despite_doubts=self.despite_doubts)
+        check_place(self.out / REPORT_FILE)
+        return DriveOrder(
+            self.url, self.names, self.goal, self.out, self.data_dir, self.goal_camera, self.goal_encoding,
+            read_boxes(self.boxes), self._limits(), check_seed(self.seed), settings, str(pick_device(self.device)),
+        )  # fmt: skip
+
+    def _limits(self) -> SafetyLimits:
+        from osfcore.robots.safety_limits import SafetyLimits
+
+        return SafetyLimits(top_speed_m_s=self.top_speed, **({} if self.box is None else {"box": self.box}))
+
+    def _say(self, sentence: str) -> None:
+        if not self.json:
+            print(sentence, flush=True)
+
+
+def _timed_look(robot: Robot) -> tuple[Observation, float]:
+    begin = time.perf_counter()
+    return robot.observe(), time.perf_counter() - begin
+
+
+def read_boxes(texts: tuple[str, ...]) -> CameraBoxes:
+    """Boxes as people write them.
+
+    Raises:
+        InvalidInput: if one is not of the form.
+    """
+    boxes: dict[str, dict[str, tuple[float, float, float, float]]] = {}
+    for text in texts:
+        camera, _, rest = text.partition(":")
+        name, _, numbers = rest.partition(":")
+        try:
+            left, top, right, bottom = (float(number) for number in numbers.split(","))
+        except ValueError:
+            raise InvalidInput("box", text, _FORM) from None
+        boxes.setdefault(camera, {})[name] = (left, top, right, bottom)
+    return boxes
+
+
+def _asked(drive: RobotDrive, url: str) -> bool:
+    """Whether a person says yes; no where there is none."""
+    x0, y0, x1, y1 = drive.limits.box
+    print(
+        f"It stays within x {x0:g} to {x1:g}, y {y0:g} to {y1:g} m, no faster than {drive.limits.top_speed_m_s:g} m/s."
+    )
+    for doubt in drive.doubts:
+        print(doubt)
+    try:
+        return input(f"Move the robot at {url}? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
+
+
+def _write_pictures(folder: Path, seen: Observation) -> None:
+    """All cameras with the table's axes, and what each sees as cameras encode it."""
+    from osfcore.errors import shown
+    from osfcore.estimation.photometry.camera_response import srgb_of_linear
+    from osfcore.inspection.observation_overlay import observation_sheet
+    from osfcore.io.image_file import to_uint8, write_png
+
+    write_png(folder / "overlay.png", observation_sheet(seen)[..., ::-1])
+    for camera, image in zip(seen.cameras, seen.images, strict=True):
+        write_png(folder / f"{shown(camera.name).replace('/', '_')}.png", to_uint8(srgb_of_linear(image)))
+
+
+def _show_check(
+    url: str, about: RobotDescription, seen: Observation, look_s: float, doubts: tuple[str, ...], out: Path | None
+) -> None:
+    assert seen.pusher is not None
+    names = ", ".join(camera.name for camera in seen.cameras)
+    height, width = seen.images.shape[1:3]
+    x0, y0, x1, y1 = about.limits.box
+    x, y, _ = seen.pusher
+    print(f"The robot at {url} has {len(seen.cameras)} cameras ({names}; {width} x {height}); a look: {look_s:.2f} s.")
+    print(f"Its pusher is at x {x:.3f}, y {y:.3f} m and stays within x {x0:g} to {x1:g}, y {y0:g} to {y1:g} m,")
+    print(f"no faster than {about.limits.top_speed_m_s:g} m/s; without a command it halts after {about.deadman_s:g} s.")
+    for doubt in doubts:
+        print(doubt)
+    if out is not None:
+        print(
+            f"{out / 'overlay.png'}: the axes must stand in the middle of the table, the yellow stroke in the pusher."
+        )
+
+
+RobotCommand = Annotated[
+    Annotated[RobotCheck, tyro.conf.subcommand("check")] | Annotated[RobotDriveCommand, tyro.conf.subcommand("drive")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

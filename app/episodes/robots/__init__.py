@@ -1,0 +1,1 @@
+"""Episodes with a robot, of which nobody knows the truth."""

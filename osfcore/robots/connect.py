@@ -1,0 +1,50 @@
+"""Robots by address."""
+
+from __future__ import annotations
+
+from urllib.parse import parse_qsl, urlsplit
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.extras import need
+from osfcore.robots.http_robot import HttpRobot
+from osfcore.robots.robot import Robot
+from osfcore.robots.safety_limits import SafetyLimits
+
+FORMS = "http://HOST:PORT, https://HOST:PORT or ros://HOST:9090?cameras=NAME,NAME"
+_ROS_PORT = 9090
+_ROS_NAMES = ("cameras", "image", "info", "twist", "table", "pusher")
+
+
+def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None = None) -> Robot:
+    """The robot at an address.
+
+    Args:
+        url: of one that speaks HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
+        names: of the objects on the table.
+        limits: of one under ROS, which tells none; the usual ones if None.
+
+    Raises:
+        InvalidInput, UnknownName: if it is no such address.
+        MissingExtra: if a package for ROS is not installed.
+        ConnectionLost: if nobody answers.
+        RobotRefused: if what answers is no robot.
+    """
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        raise InvalidInput("address of the robot", url, FORMS) from None
+    if not host or parts.scheme not in ("http", "https", "ros"):
+        raise InvalidInput("address of the robot", url, FORMS)
+    if parts.scheme != "ros":
+        return HttpRobot(url, names)
+    need("ros", "A robot under ROS")
+    from osfcore.robots.ros_robot import RosNames, RosRobot
+
+    asked = dict(parse_qsl(parts.query))
+    for name in asked:
+        if name not in _ROS_NAMES:
+            raise UnknownName("part of a robot's address", name, _ROS_NAMES)
+    cameras = tuple(filter(None, asked.pop("cameras", "").split(",")))
+    address = f"ws://{f'[{host}]' if ':' in host else host}:{port or _ROS_PORT}"
+    return RosRobot(address, RosNames(cameras, **asked), names, limits or SafetyLimits())

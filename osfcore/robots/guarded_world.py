@@ -1,0 +1,172 @@
+"""A world whose pusher keeps within limits, asks before it moves for the first time, and can be stopped at any time."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.world_protocol import World
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.geometry.states import Observation
+from osfcore.geometry.workspace import STEP_S, check_action
+from osfcore.robots.robot import RobotStopped, Stoppable
+from osfcore.robots.safety_limits import SafetyLimits, Whereabouts
+
+_OVERSHOT_M = 0.01  # so far outside the box the pusher may have come by itself, and returns
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class HeldBack:
+    """An action that a wall of the box cut short.
+
+    Attributes:
+        action: as it was wanted [m/s].
+        done: what was done of it, as a velocity held for as long [m/s].
+    """
+
+    action: Float[np.ndarray, "3"]
+    done: Float[np.ndarray, "3"]
+
+
+class GuardedWorld:
+    """Wraps any `World`.
+
+    What exceeds the top speed is done slower, for longer: the way stays the same. What leads out of the box ends at its
+    wall. Between two looks the pusher is taken to be anywhere that its actions can have brought it, and no such place
+    is outside.
+
+    The robot is told to stop by `stop`, by `close`, and by whatever goes wrong while it looks or moves. After that
+    `act` only raises `RobotStopped`.
+
+    Args:
+        world: that is moved; told to start and stop if it is `Stoppable`.
+        limits: for the pusher.
+        permit: asked once, before the first motion; nothing moves unless it says yes.
+    """
+
+    def __init__(self, world: World, limits: SafetyLimits, permit: Callable[[], bool] | None = None) -> None:
+        self._world, self._limits, self._permit = world, limits, permit
+        self._where: Whereabouts | None = None
+        self._reason = ""
+        self._stopped = threading.Event()
+        self._lock = threading.Lock()
+        self._is_started = False
+        self._held_back: list[HeldBack] = []
+
+    @property
+    def held_back(self) -> tuple[HeldBack, ...]:
+        """Actions that were cut short so far."""
+        return tuple(self._held_back)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether nothing will move any more."""
+        return self._stopped.is_set()
+
+    def check(self) -> None:
+        """Let a stop be known.
+
+        Raises:
+            RobotStopped: if it was stopped.
+        """
+        if self._stopped.is_set():
+            raise RobotStopped(self._reason)
+
+    def stop(self, reason: str) -> None:
+        """Stop the robot for good; from any thread, and as often as one likes.
+
+        Args:
+            reason: why, as the end of the sentence "The robot was stopped: ...".
+        """
+        with self._lock:
+            self._reason = self._reason or reason
+        self._stopped.set()  # before the robot is told: whoever is about to send an action sees it
+        self._tell_to_stop()
+
+    # The World protocol
+
+    def reset(self, seed: int) -> Observation:
+        """As the wrapped world does it."""
+        with self._halted_by_errors():
+            return self._seen(self._world.reset(seed))
+
+    def observe(self, *, masks: bool = False) -> Observation:
+        """As the wrapped world sees it; also after a stop."""
+        with self._halted_by_errors():
+            return self._seen(self._world.observe(masks=masks))
+
+    def act(self, action: Float[np.ndarray, "3"]) -> None:
+        """Do what the limits leave of an action.
+
+        Raises:
+            InvalidInput: if it is no action, or the pusher's place is unknown or well outside the box; nothing moves.
+            RobotStopped: if the robot was stopped, before or meanwhile, or may not move.
+        """
+        action = check_action(action)
+        wanted = action[:2] * STEP_S
+        self.check()
+        where = self._checked_place()
+        travel = self._limits.allowed_travel(wanted, where)
+        if not np.allclose(travel, wanted, atol=1e-6):
+            self._held_back.append(HeldBack(action, np.array([*(travel / STEP_S), 0.0])))
+        self._begin()
+        self._where = where.after(travel)
+        for velocity in self._limits.slow_parts(travel):
+            self.check()
+            with self._halted_by_errors():
+                self._world.act(velocity)
+        self.check()
+
+    def close(self) -> None:
+        """Stop the robot and release what the wrapped world holds."""
+        if self._is_started:
+            self.stop("it was let go")
+        self._world.close()
+
+    def _seen(self, observation: Observation) -> Observation:
+        self._where = None if observation.pusher is None else Whereabouts.at(observation.pusher)
+        return observation
+
+    def _checked_place(self) -> Whereabouts:
+        if self._where is None:
+            raise InvalidInput("place of the pusher", "unknown", "told by the robot before it is moved")
+        if self._limits.outside_m(self._where) > _OVERSHOT_M:
+            allowed = f"within {self._limits.box}, the safety box; move it there by hand, or allow a larger box"
+            raise InvalidInput("place of the pusher [m]", np.round(self._where.low, 3).tolist(), allowed)
+        return self._where
+
+    def _begin(self) -> None:
+        if self._is_started:
+            return
+        if self._permit is not None and not self._permit():
+            self.stop("nobody allowed it to move")
+        self.check()
+        self._is_started = True
+        if isinstance(self._world, Stoppable):
+            with self._halted_by_errors():
+                self._world.start()
+            if self._stopped.is_set():  # meanwhile, and the start came after it
+                self._tell_to_stop()
+
+    @contextlib.contextmanager
+    def _halted_by_errors(self) -> Iterator[None]:
+        """Whatever goes wrong, an interruption by the keyboard included, stops what may be moving."""
+        try:
+            yield
+        except BaseException as error:
+            was_stopped = self._stopped.is_set()
+            if self._is_started:
+                self.stop(str(error) or "it was interrupted")
+            if was_stopped and isinstance(error, OsfError):  # it refuses what came too late
+                raise RobotStopped(self._reason) from error
+            raise
+
+    def _tell_to_stop(self) -> None:
+        if isinstance(self._world, Stoppable):
+            with contextlib.suppress(OsfError):  # one that cannot be reached halts by itself
+                self._world.stop()

@@ -1,0 +1,153 @@
+"""A robot that speaks HTTP: JSON and picture files, as docs/robots.md describes."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+from urllib.parse import quote
+
+import httpx2
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, FiniteFloat
+
+from osfcore.errors import OsfError
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import Observation
+from osfcore.geometry.workspace import PUSHER_RADIUS_M, STEP_S, check_action
+from osfcore.io.json_codec import Entry, Vector4, decode
+from osfcore.io.scene_file import CameraJson, PointJson, rigid_pose
+from osfcore.robots.camera_pictures import SentCamera, observation_of
+from osfcore.robots.robot import ConnectionLost, RobotDescription, RobotRefused
+from osfcore.robots.safety_limits import SafetyLimits
+
+
+class LimitsJson(Entry):
+    """Limits that a robot keeps itself."""
+
+    box: Vector4 = Field(description="x0, y0, x1, y1 of the pusher's centre [m].")
+    top_speed_m_s: FiniteFloat
+
+
+class RobotJson(Entry):
+    """What GET /robot answers."""
+
+    cameras: list[CameraJson] = Field(min_length=1)
+    limits: LimitsJson
+    pusher_radius_m: FiniteFloat = PUSHER_RADIUS_M
+    deadman_s: FiniteFloat = STEP_S
+    masks: list[str] = Field(default=[], description="Objects whose masks it delivers.")
+
+
+class HttpRobot:
+    """One robot; a `Robot`.
+
+    Args:
+        url: where it is, such as http://192.168.0.7:8080.
+        names: of the objects on the table, which a person tells.
+        timeout_s: how long an answer may take beyond the time that a motion takes [s].
+
+    Raises:
+        ConnectionLost: if nobody answers.
+        RobotRefused: if something else than a robot answers.
+        InvalidInput: if what it says of itself is out of range.
+    """
+
+    def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = 2.0) -> None:
+        self._url, self._names = url.rstrip("/"), names
+        # Names of proxies in the environment are not for a robot beside the computer.
+        self._http = httpx2.Client(timeout=timeout_s, trust_env=False)
+        try:
+            told = decode(RobotJson, self._json("GET", "robot"), f"answer of {self._url}/robot")
+            self._cameras = tuple(_camera(entry) for entry in told.cameras)
+            limits = SafetyLimits((*told.limits.box,), told.limits.top_speed_m_s)  # pyright: ignore[reportArgumentType]
+            cameras = tuple(camera.kept() for camera in self._cameras)
+            self._description = RobotDescription(cameras, limits, told.pusher_radius_m, told.deadman_s)
+        except OsfError:
+            self.close()
+            raise
+        self._masked = frozenset(told.masks)
+        self._began = time.monotonic()
+
+    @property
+    def description(self) -> RobotDescription:
+        """What the robot says of itself."""
+        return self._description
+
+    def reset(self, seed: int) -> Observation:
+        """Only look: what lies on the table is a person's business."""
+        return self.observe()
+
+    def observe(self, *, masks: bool = False) -> Observation:
+        """A picture of every camera; masks of all objects if the robot has them.
+
+        Raises:
+            ConnectionLost: if nobody answers.
+            RobotRefused: if it does not want to.
+            CorruptFile, InvalidInput: if what it sends is not what it should be.
+        """
+        pusher = decode(PointJson, self._json("GET", "pusher"), f"answer of {self._url}/pusher").position
+        pictures = [self._bytes(f"images/{quote(camera.name, safe='')}") for camera in self._cameras]
+        sent = self._masks() if masks and self._masked.issuperset(self._names) else None
+        seconds = time.monotonic() - self._began
+        return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
+
+    def act(self, action: Float[np.ndarray, "3"]) -> None:
+        """Hold a velocity for 0.2 s; the robot answers when that is over.
+
+        Raises:
+            InvalidInput: if it is no action.
+            ConnectionLost: if nobody answers.
+            RobotRefused: if it does not want to, such as after a stop.
+        """
+        velocity = check_action(action)[:2].tolist()
+        self._json("POST", "act", {"velocity": velocity, "duration_s": STEP_S})
+
+    def start(self) -> None:
+        """Make ready to move."""
+        self._json("POST", "start")
+
+    def stop(self) -> None:
+        """Halt at once; from any thread, for a client has as many connections as it needs."""
+        self._json("POST", "stop")
+
+    def close(self) -> None:
+        """Release the sockets."""
+        self._http.close()
+
+    def _masks(self) -> dict[tuple[str, str], bytes]:
+        keys = [(camera.name, name) for camera in self._cameras for name in self._names]
+        return {key: self._bytes("masks/" + "/".join(quote(part, safe="") for part in key)) for key in keys}
+
+    def _json(self, method: str, path: str, body: object = None) -> Any:  # noqa: ANN401
+        content = self._answer(method, path, body)
+        try:
+            return json.loads(content or b"null")
+        except ValueError:
+            raise RobotRefused(self._url, f"something that is no JSON to {method} /{path}") from None
+
+    def _bytes(self, path: str) -> bytes:
+        return self._answer("GET", path)
+
+    def _answer(self, method: str, path: str, body: object = None) -> bytes:
+        try:
+            answer = self._http.request(method, f"{self._url}/{path}", json=body)
+        except (httpx2.TransportError, httpx2.InvalidURL, RuntimeError) as error:  # RuntimeError once it is closed
+            raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
+        if not answer.is_success:
+            raise RobotRefused(self._url, _detail(answer) or f"{answer.status_code} to {method} /{path}")
+        return answer.content
+
+
+def _camera(entry: CameraJson) -> SentCamera:
+    pose: Pose = rigid_pose(entry.T_world_camera, entry.name)
+    return SentCamera(entry.name, pose, np.array(entry.K), entry.width, entry.height)
+
+
+def _detail(answer: httpx2.Response) -> str:
+    try:
+        detail = answer.json()["detail"]
+    except (ValueError, KeyError, TypeError):
+        return ""
+    return detail if isinstance(detail, str) else ""

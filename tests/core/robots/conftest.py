@@ -1,0 +1,12 @@
+import contextlib
+
+import pytest
+
+from tests.core.robots.robots import example, serving, simulated
+
+
+@pytest.fixture(scope="package")
+def server(library):
+    """Address and table of the example's robot."""
+    with contextlib.closing(simulated(library)) as table, serving(example().robot(table)) as url:
+        yield url, table

@@ -1,0 +1,242 @@
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from osfcore.errors import InvalidInput
+from osfcore.geometry.workspace import STEP_S
+from osfcore.robots.guarded_world import GuardedWorld
+from osfcore.robots.robot import ConnectionLost, RobotStopped
+from osfcore.robots.safety_limits import SafetyLimits
+from tests.core.robots.robots import Marble
+
+BOX = (-0.1, -0.05, 0.12, 0.2)
+LIMITS = SafetyLimits(BOX, 0.1)
+RIGHT = np.array([0.3, 0.0, 0.0])
+velocities = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)).map(lambda v: np.array([*v, 0.0]))
+shares = st.floats(0.0, 1.0)
+
+
+def guarded(world, limits=LIMITS, **more):
+    guard = GuardedWorld(world, limits, **more)
+    guard.observe()
+    return guard
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow])  # on a busy machine drawing takes its time
+@given(
+    st.lists(st.tuples(velocities, st.booleans()), max_size=12),
+    st.lists(shares, max_size=40),
+    st.tuples(st.floats(BOX[0], BOX[2]), st.floats(BOX[1], BOX[3])),
+    st.floats(0.02, 0.42),
+)
+def test_no_actions_lead_out_of_the_box_or_go_too_fast_whatever_holds_the_pusher(actions, done, begin, speed):
+    world = Marble(begin, done)
+    guard = guarded(world, SafetyLimits(BOX, speed))
+    for action, looks in actions:
+        guard.act(action)
+        if looks:
+            guard.observe()
+    way = np.array(world.way)
+    assert np.all(way >= np.array(BOX[:2]) - 1e-9)
+    assert np.all(way <= np.array(BOX[2:]) + 1e-9)
+    assert all(np.linalg.norm(velocity) <= speed + 1e-9 for velocity in world.velocities)
+
+
+@given(velocities)
+def test_a_slow_robot_goes_the_same_way(action):
+    world = Marble()
+    guarded(world, SafetyLimits(top_speed_m_s=0.05)).act(action)
+    np.testing.assert_allclose(world.place, STEP_S * action[:2], atol=1e-12)
+
+
+def test_what_is_allowed_reaches_the_world_as_it_is():
+    world = Marble()
+    guard = guarded(world, SafetyLimits(top_speed_m_s=0.42))
+    guard.act(RIGHT)
+    np.testing.assert_allclose(world.velocities, [RIGHT])
+    assert guard.held_back == ()
+
+
+def test_a_way_ends_at_the_wall_and_goes_on_along_it_and_that_is_told():
+    world = Marble((0.1, 0.0))
+    guard = guarded(world)
+    guard.act(np.array([0.3, 0.3, 0.0]))
+    np.testing.assert_allclose(world.place, [0.12, 0.06], atol=1e-9)
+    (one,) = guard.held_back
+    np.testing.assert_allclose(one.done, [0.1, 0.3, 0.0], atol=1e-9)
+
+
+def test_a_pusher_slightly_outside_returns_and_one_far_outside_is_not_moved():
+    near = Marble((0.125, 0.0))
+    guard = guarded(near)
+    guard.act(RIGHT)
+    np.testing.assert_allclose(near.place, [0.125, 0.0])
+    guard.act(-RIGHT)
+    assert near.place[0] < 0.12
+    far = Marble((0.3, 0.0))
+    with pytest.raises(InvalidInput, match="move it there by hand"):
+        guarded(far).act(-RIGHT)
+    assert far.velocities == far.told == []
+
+
+def test_nothing_moves_before_its_place_is_known():
+    with pytest.raises(InvalidInput, match="place of the pusher is unknown"):
+        GuardedWorld(Marble(), LIMITS).act(RIGHT)
+
+
+def test_no_action_of_ours_is_refused_and_changes_nothing():
+    world = Marble()
+    guard = guarded(world)
+    with pytest.raises(InvalidInput, match="action"):
+        guard.act(np.array([0.5, 0.0, 0.0]))
+    assert world.told == []
+    assert not guard.is_stopped
+
+
+def test_it_asks_once_before_the_first_motion():
+    asked = []
+    world = Marble()
+    guard = guarded(world, permit=lambda: not asked.append(world.told.copy()))
+    guard.act(RIGHT)
+    guard.act(-RIGHT)
+    assert asked == [[]]
+    assert world.told == ["start"]
+
+
+def test_nothing_moves_if_nobody_allows_it():
+    world = Marble()
+    guard = guarded(world, permit=lambda: False)
+    with pytest.raises(RobotStopped, match="nobody allowed it to move"):
+        guard.act(RIGHT)
+    assert world.velocities == []
+    assert "start" not in world.told
+
+
+def test_after_a_stop_every_action_is_refused_with_the_first_reason():
+    world = Marble()
+    guard = guarded(world)
+    guard.act(RIGHT)
+    guard.stop("a key was pressed")
+    guard.stop("for another reason")
+    for _ in range(2):
+        with pytest.raises(RobotStopped, match=r"^The robot was stopped: a key was pressed\.$"):
+            guard.act(RIGHT)
+    assert world.told == ["start", "stop", "stop"]
+
+
+def test_a_stop_from_another_thread_ends_a_motion_that_is_under_way():
+    begun, told = threading.Event(), threading.Event()
+
+    class Slow(Marble):
+        def act(self, action):
+            super().act(action)
+            begun.set()
+            assert told.wait(10)
+
+        def stop(self):
+            super().stop()
+            told.set()
+
+    world = Slow()
+    guard = guarded(world, SafetyLimits(top_speed_m_s=0.1))
+    other = threading.Thread(target=lambda: begun.wait(10) and guard.stop("somebody wanted it"))
+    other.start()
+    with pytest.raises(RobotStopped, match="somebody wanted it"):
+        guard.act(RIGHT)
+    other.join()
+    assert len(world.velocities) == 1  # of three
+    assert guard.is_stopped
+
+
+@pytest.mark.parametrize("error", [ConnectionLost("http://robot", "cut"), RuntimeError("broken"), KeyboardInterrupt()])
+def test_whatever_goes_wrong_on_the_way_stops_the_robot(error):
+    class Broken(Marble):
+        def act(self, action):
+            raise error
+
+    world = Broken()
+    guard = guarded(world)
+    with pytest.raises(type(error)):
+        guard.act(RIGHT)
+    assert world.told == ["start", "stop"]
+    with pytest.raises(RobotStopped):
+        guard.act(RIGHT)
+
+
+def test_a_robot_that_cannot_be_told_to_stop_is_no_other_error():
+    class Gone(Marble):
+        def stop(self):
+            raise ConnectionLost("http://robot", "cut")
+
+    guard = guarded(Gone())
+    guard.act(RIGHT)
+    guard.stop("a key was pressed")
+    with pytest.raises(RobotStopped, match="a key"):
+        guard.act(RIGHT)
+    assert guard.observe().pusher is not None
+
+
+def test_a_connection_that_is_lost_while_looking_stops_the_robot():
+    class Blind(Marble):
+        is_blind = False
+
+        def observe(self, *, masks=False):
+            if self.is_blind:
+                raise ConnectionLost("http://robot", "cut")
+            return super().observe()
+
+    world = Blind()
+    guard = guarded(world)
+    guard.act(RIGHT)
+    world.is_blind = True
+    with pytest.raises(ConnectionLost):
+        guard.observe()
+    assert world.told[-1] == "stop"
+
+
+def test_closing_stops_and_releases():
+    world = Marble()
+    guard = guarded(world)
+    guard.act(RIGHT)
+    guard.close()
+    assert world.told == ["start", "stop", "close"]
+
+
+def test_a_world_without_motors_is_guarded_alike():
+    class Plain:
+        def __init__(self):
+            self.world = Marble()
+            self.observe, self.act, self.reset, self.close = (
+                self.world.observe, self.world.act, self.world.reset, self.world.close)  # fmt: skip
+
+    plain = Plain()
+    guard = guarded(plain)
+    guard.act(RIGHT)
+    guard.stop("enough")
+    with pytest.raises(RobotStopped):
+        guard.act(RIGHT)
+    assert plain.world.told == []
+
+
+@pytest.mark.parametrize(
+    ("box", "speed", "words"),
+    [
+        ((0.1, 0.0, -0.1, 0.1), 0.1, "x0 < x1"),
+        ((0.0, 0.0, float("nan"), 0.1), 0.1, "finite"),
+        (BOX, 0.0, "top speed"),
+        (BOX, 50.0, "top speed"),
+    ],
+)
+def test_limits_that_are_none_are_refused(box, speed, words):
+    with pytest.raises(InvalidInput, match=words):
+        SafetyLimits(box, speed)
+
+
+def test_two_limits_hold_together():
+    both = LIMITS.within(SafetyLimits((0.0, 0.0, 0.3, 0.3), 0.05))
+    assert (both.box, both.top_speed_m_s) == ((0.0, 0.0, 0.12, 0.2), 0.05)
+    with pytest.raises(InvalidInput, match="partly inside"):
+        LIMITS.within(SafetyLimits((0.2, 0.2, 0.3, 0.3)))

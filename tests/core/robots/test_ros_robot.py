@@ -1,0 +1,159 @@
+import contextlib
+import threading
+
+import numpy as np
+import pytest
+
+from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.estimation.photometry.camera_response import linear_of_srgb
+from osfcore.robots.connect import connect
+from osfcore.robots.guarded_world import GuardedWorld
+from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped
+from osfcore.robots.ros_robot import RosNames, RosRobot
+from osfcore.robots.safety_limits import SafetyLimits
+from tests.core.robots.robots import until
+from tests.core.robots.ros_stand_in import CAMERAS, StandIn
+from tests.live import free_port
+
+FAST = SafetyLimits(top_speed_m_s=0.42)
+LEFT = np.array([-0.3, 0.1, 0.0])
+
+
+@pytest.fixture
+def stand_in():
+    robot = StandIn()
+    with robot.running() as url:
+        robot.url = url
+        yield robot
+
+
+@pytest.fixture
+def robot(stand_in):
+    with contextlib.closing(connect(stand_in.url, ("025_mug",), FAST)) as robot:
+        yield robot
+
+
+def short(stand_in, cameras=("left", "right"), timeout_s=0.4):
+    address = stand_in.url.replace("ros://", "ws://").partition("?")[0]
+    return RosRobot(address, RosNames(cameras), (), FAST, timeout_s)
+
+
+def test_cameras_are_where_the_transforms_put_them(robot):
+    for camera in robot.description.cameras:
+        true = CAMERAS[camera.name]
+        np.testing.assert_allclose(camera.T_world_camera.matrix(), true.T_world_camera.matrix(), atol=1e-9)
+        np.testing.assert_allclose(camera.intrinsics, true.intrinsics)
+    assert robot.description.limits == FAST
+
+
+def test_pictures_and_pusher_come(robot, stand_in):
+    stand_in.place = np.array([0.05, -0.1])
+    seen = robot.observe(masks=True)
+    np.testing.assert_allclose(seen.images, linear_of_srgb(np.array(100 / 255)), atol=0.01)
+    np.testing.assert_allclose(seen.pusher, [0.05, -0.1, 0.06])
+    assert (seen.masks, seen.names) == (None, ("025_mug",))
+
+
+def test_pictures_are_newer_than_the_question(robot, stand_in):
+    topic = "/left/image_raw/compressed"
+    stand_in.silent.add(topic)
+    old = threading.Timer(0.1, stand_in.silent.clear)
+    old.start()
+    assert robot.observe().images.shape[0] == 2  # it waited
+    old.join()
+    assert not stand_in.silent
+
+
+def test_velocities_are_sent_in_the_frame_of_the_table_until_they_are_over(robot, stand_in):
+    robot.start()
+    robot.act(LEFT)
+    until(lambda: stand_in.twists and not stand_in.twists[-1].any())
+    assert set(stand_in.frames) == {"table"}
+    assert len(stand_in.twists) >= 3
+    np.testing.assert_allclose(stand_in.twists[0], LEFT[:2])
+    assert stand_in.place[0] < -0.02
+
+
+def test_nothing_moves_before_it_is_started(robot, stand_in):
+    with pytest.raises(RobotRefused, match="stopped, or not started"):
+        robot.act(LEFT)
+    assert stand_in.twists == []
+
+
+def test_nothing_follows_the_zero_of_a_stop_from_another_thread(robot, stand_in):
+    guard = GuardedWorld(robot, FAST)
+    guard.observe()
+    other = threading.Thread(target=lambda: (until(lambda: stand_in.twists), guard.stop("a key was pressed")))
+    other.start()
+    with pytest.raises(RobotStopped, match="a key was pressed"):
+        guard.act(LEFT)
+    other.join()
+    until(lambda: not stand_in.twists[-1].any())
+    with pytest.raises(RobotStopped):
+        guard.act(LEFT)
+    moving = [bool(twist.any()) for twist in stand_in.twists]
+    assert moving == sorted(moving, reverse=True)
+
+
+def test_a_robot_that_is_cut_off_stands_and_that_is_told(robot, stand_in):
+    guard = GuardedWorld(robot, FAST)
+    guard.observe()
+    other = threading.Thread(target=lambda: (until(lambda: stand_in.twists), stand_in.cut()))
+    other.start()
+    with pytest.raises(ConnectionLost, match="halts by itself"):
+        guard.act(LEFT)
+    other.join()
+    with pytest.raises(RobotStopped, match="does not answer"):
+        guard.act(LEFT)
+    until(lambda: not stand_in.velocity.any())
+    assert np.linalg.norm(stand_in.place) < 0.3 * 1.2 * (0.2 + 0.15) + 0.05
+    guard.close()
+
+
+def test_looking_at_a_robot_that_is_cut_off_is_told(robot, stand_in):
+    stand_in.cut()
+    with pytest.raises(ConnectionLost):
+        robot.observe()
+
+
+@pytest.mark.parametrize(
+    ("topic", "words"), [("/left/camera_info", "nothing on /left/camera_info"), ("/tf_static", "left_optical")]
+)
+def test_what_is_not_published_is_named(stand_in, topic, words):
+    stand_in.silent.add(topic)
+    with pytest.raises((RobotRefused, UnknownName), match=words):
+        short(stand_in)
+
+
+def test_pictures_that_do_not_come_are_told(stand_in):
+    with contextlib.closing(short(stand_in)) as robot:
+        stand_in.silent.add("/right/image_raw/compressed")
+        with pytest.raises(RobotRefused, match="nothing on /right/image_raw/compressed for 0.4 s"):
+            robot.observe()
+
+
+@pytest.mark.parametrize("data", ["no base64", "QUJD"])
+def test_pictures_that_are_none_are_told(robot, stand_in, data):
+    stand_in.extra["/left/image_raw/compressed"] = {"data": data}
+    with pytest.raises(CorruptFile):
+        robot.observe()
+
+
+def test_a_camera_that_is_not_calibrated_is_told(stand_in):
+    info = stand_in.messages()["/left/camera_info"]
+    stand_in.extra["/left/camera_info"] = info | {"k": [0.0] * 9}
+    with pytest.raises(InvalidInput, match="K of camera left"):
+        short(stand_in)
+
+
+@pytest.mark.parametrize(
+    ("query", "words"), [("", "cameras of the robot"), ("?cameras=a&colour=red", "part of a robot's address")]
+)
+def test_names_of_ros_come_with_the_address(query, words):
+    with pytest.raises((InvalidInput, UnknownName), match=words):
+        connect(f"ros://127.0.0.1:9090{query}")
+
+
+def test_nobody_there_is_told():
+    with pytest.raises(ConnectionLost, match="does not answer"):
+        connect(f"ros://127.0.0.1:{free_port()}?cameras=a")
