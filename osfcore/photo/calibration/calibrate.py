@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, shown
-from osfcore.geometry.poses import Pose
+from osfcore.errors import CorruptFile, InvalidInput, OsfError, check_ranges, shown
+from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import Board
 from osfcore.photo.calibration.camera_fit import CameraFit, PoseVector, fit_camera, pose_of, px_scale
 from osfcore.photo.calibration.information import (
@@ -68,12 +69,34 @@ class Calibration:
     missing: str
 
 
+def board_place(x_m: float, y_m: float, turn_deg: float) -> Pose:
+    """`T_world_board` of a board that lies on the table.
+
+    Args:
+        x_m: of its centre [m].
+        y_m: of its centre [m].
+        turn_deg: of its top edge from the x axis, counter-clockwise seen from above [deg].
+
+    Raises:
+        InvalidInput: if it does not lie on the table.
+    """
+    half = TABLE_SIDE_M / 2
+    check_ranges(
+        ("x of the board [m]", x_m, -half, half), ("y of the board [m]", y_m, -half, half),
+        ("turn of the board [deg]", turn_deg, -360.0, 360.0),
+    )  # fmt: skip
+    return Pose(np.array([x_m, y_m, 0.0]), quaternion_exp(np.array([0.0, 0.0, np.deg2rad(turn_deg)])))
+
+
 class TooLittleSeen(OsfError):
     """Photographs of the board that do not suffice to calibrate a camera."""
 
 
 def calibrated_camera(
-    views: Sequence[Sighting], table: Sighting | None = None, T_world_board: Pose = AT_ORIGIN, board: Board | None = None
+    views: Sequence[Sighting],
+    table: Sighting | None = None,
+    T_world_board: Pose = AT_ORIGIN,
+    board: Board | None = None,
 ) -> Calibration:
     """The camera; arguments and errors as of `assess`.
 
@@ -87,7 +110,10 @@ def calibrated_camera(
 
 
 def assess(
-    views: Sequence[Sighting], table: Sighting | None = None, T_world_board: Pose = AT_ORIGIN, board: Board | None = None
+    views: Sequence[Sighting],
+    table: Sighting | None = None,
+    T_world_board: Pose = AT_ORIGIN,
+    board: Board | None = None,
 ) -> Calibration:
     """What photographs tell so far, whether or not they suffice.
 
@@ -106,7 +132,8 @@ def assess(
     fit = fit_camera(every)
     _check_agreement(every, fit)
     known = [normal_matrix(fit.theta, pose, v.points_m) for v, pose in zip(every, fit.poses, strict=True)]
-    on_table, board = _OnTable.of(fit, every[0].size, known, None if table is None else T_world_board, board or Board()), board or Board()
+    board, place = board or Board(), None if table is None else T_world_board
+    on_table = _OnTable.of(fit, every[0].size, known, place, board)
     told = on_table.error()
     distance = float(np.median(np.linalg.norm(fit.poses[:, 3:], axis=1)))
     advice = best_next(fit.theta, every[0].size, distance, board, lambda more: on_table.error(more).mean_m)
@@ -147,7 +174,11 @@ class _OnTable:
 
     @staticmethod
     def of(
-        fit: CameraFit, size: tuple[int, int], normals: Sequence[Float[np.ndarray, "10 10"]], place: Pose | None, board: Board
+        fit: CameraFit,
+        size: tuple[int, int],
+        normals: Sequence[Float[np.ndarray, "10 10"]],
+        place: Pose | None,
+        board: Board,
     ) -> _OnTable:
         """The last photograph shows the board on the table in its place; a usual one does if there is no place."""
         if place is not None:
@@ -196,7 +227,9 @@ def _check_photos(every: Sequence[Sighting]) -> None:
             raise CorruptFile(shown(view.name), f"{given}; take all with one camera held the same way up, uncropped")
     for one, other in itertools.combinations(every, 2):
         if len(one.points_px) == len(other.points_px) and np.abs(one.points_px - other.points_px).max() < _SAME_PX:
-            raise CorruptFile(shown(other.name), f"it shows the same as {shown(one.name)}; move the board or the camera")
+            raise CorruptFile(
+                shown(other.name), f"it shows the same as {shown(one.name)}; move the board or the camera"
+            )
 
 
 def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
@@ -216,4 +249,6 @@ def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
             raise CorruptFile(shown(every[best].name), reason)
     if rms > MOST_RMS_PX * scale:
         allowed = f"at most {MOST_RMS_PX * scale:.1f}: take all photos with one camera and one zoom, and the sheet flat"
-        raise InvalidInput("mean distance of the board's corners from where one camera shows them [px]", round(rms, 1), allowed)
+        raise InvalidInput(
+            "mean distance of the board's corners from where one camera shows them [px]", round(rms, 1), allowed
+        )

@@ -128,6 +128,10 @@ def _checked(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 def _rigid(matrix: Float[np.ndarray, "4 4"]) -> Pose:
     R = matrix[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+    if (
+        not np.allclose(R @ R.T, np.eye(3), atol=1e-4)
+        or np.linalg.det(R) < 0
+        or not np.allclose(matrix[3], (0, 0, 0, 1))
+    ):
         raise InvalidInput("T_world_camera of the camera", matrix.tolist(), "a rotation and a translation, 4 x 4")
     return Pose.from_matrix(matrix)

@@ -41,8 +41,8 @@ class CameraFit:
         theta: log f, cx, cy [px] and k1.
         poses: of the board in the camera's frame, view by view: rotation vector [rad] and translation [m].
         rms_px: root mean square distance of the corners from where they should appear, view by view [px].
-        noise_px: standard deviation of a corner along each axis, from the residuals' variance; at least what corners
-            of good photographs scatter by [px].
+        noise_px: standard deviation of a corner along each axis, from the residuals' variance, but at least what is to
+            be expected of real lenses and sheets, whose errors corners share [px].
     """
 
     theta: Theta
@@ -95,8 +95,8 @@ def vector_of(T_camera_board: Pose) -> PoseVector:
 def fit_camera(views: Sequence[Sighting]) -> CameraFit:
     """The camera that minimises the squared distances of all corners from where they should appear.
 
-    A plane seen from afar fits two poses almost equally well, and which is right may turn out only once the focal length
-    is known: poses are begun anew from the first solution, and the better of the two solutions is taken.
+    A plane seen from afar fits two poses almost equally well, and which is right may turn out only once the focal
+    length is known: poses are begun anew from the first solution, and the better of the two solutions is taken.
 
     Args:
         views: of the board by one camera with one zoom, at least one.
@@ -116,7 +116,7 @@ def fit_camera(views: Sequence[Sighting]) -> CameraFit:
     squares = np.square(best.fun[:-INTRINSICS].reshape(-1, 2)).sum(axis=1)
     rms = np.array([np.sqrt(part.mean()) for part in np.split(squares, ends[:-1])])
     variance = squares.sum() / max(2 * len(squares) - best.x.size, 1)
-    return CameraFit(theta, poses, rms, max(float(np.sqrt(variance)), FINE_PX * px_scale(size)))
+    return CameraFit(theta, poses, rms, max(float(np.sqrt(variance)), ACCURACY_PX * px_scale(size)))
 
 
 def _first_focal(views: Sequence[Sighting]) -> float:

@@ -1,8 +1,8 @@
 """How well photographs of the board tell a camera, and what that means in millimetres on the table.
 
 The normal matrix J^T J of a photograph is over (theta, pose); with corners that scatter by s, J^T J / s^2 is the
-information that it brings. Poses of other photographs are eliminated (Schur complement), so that any number of them adds
-a 4 x 4 matrix over theta.
+information that it brings. Poses of other photographs are eliminated (Schur complement), so that any number of them
+adds a 4 x 4 matrix over theta.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Information = Float[np.ndarray, "P P"]
 
 @dataclass(frozen=True, slots=True)
 class TableError:
-    """How far from its place a table point may be located, given its pixel: sqrt(E |error|^2), over the workspace's grid.
+    """How far from its place a table point may be located by its pixel: sqrt(E |error|^2), over the workspace's grid.
 
     Attributes:
         mean_m: of the points that the camera sees [m].

@@ -59,7 +59,9 @@ _IDEAS = (
     _Idea(f"show the board {_TILT} towards you or away", (_TILT_RAD, 0.0, 0.0)),
     _Idea(f"come nearer, with the board {_TILT}", (_TILT_RAD, 0.0, 0.0), (0.0, 0.0), _NEAR),
     *(
-        _Idea(f"show the board, {_TILT}, in the {name} corner of the picture", (_TILT_RAD * x, _TILT_RAD * y, 0.0), place)
+        _Idea(
+            f"show the board, {_TILT}, in the {name} corner of the picture", (_TILT_RAD * x, _TILT_RAD * y, 0.0), place
+        )
         for name, place, (x, y) in (
             ("upper left", (-_CORNER, -_CORNER), (0.7, -0.7)),
             ("upper right", (_CORNER, -_CORNER), (0.7, 0.7)),
