@@ -15,7 +15,15 @@ import numpy as np
 
 from app.jobs.job import Job
 from app.jobs.kinds.photos import FOUND, inputs_of
-from app.processes.messages.photo_messages import FindMask, Mark, MaskFound, PhotoRead, ReadPhoto
+from app.processes.messages.photo_messages import (
+    FindMask,
+    Mark,
+    MaskFound,
+    PhotoAnswer,
+    PhotoOrder,
+    PhotoRead,
+    ReadPhoto,
+)
 from app.processes.pictures.photo_process import PhotoRefused, photo_main
 from app.processes.process_client import ProcessClient, ProcessHangs
 from app.services.fields import FieldCatalogue
@@ -26,6 +34,7 @@ from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
+from osfcore.photo.calibration.camera_file import KnownCamera
 from osfcore.photo.found_scene import FoundScene
 
 KIND = "photo"
@@ -120,14 +129,14 @@ class TablePhotos:
         self._store.keep(photo, data, read.jpeg, read.straight)
         return self._told(photo)
 
-    def set_focal(self, photo: str, focal_px: float | None) -> TablePhoto:
-        """Look at a photograph with another focal length, in pixels of the photo as it was sent.
+    def set_camera(self, photo: str, focal_px: float | None, camera: KnownCamera | None = None) -> TablePhoto:
+        """Look at a photograph with another focal length, in pixels of the photo as it was sent, or calibrated camera.
 
         Raises:
             UnknownName: if there is none.
-            InvalidInput: if the focal length makes no sense.
+            InvalidInput: if the focal length makes no sense, or the camera took photographs of another shape.
         """
-        read = self._read(self.read(self._store.sent(photo), photo), focal_px)
+        read = self._read(self.read(self._store.sent(photo), photo), focal_px, camera)
         facts = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
         files = {PICTURE: read.jpeg, STRAIGHT: read.straight}
         return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
@@ -160,7 +169,7 @@ class TablePhotos:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
         others = tuple(point for each in before.objects if each.name != name for point in each.mark.on)
         told = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
-        found = self._ask(FindMask(self.read(self.picture(photo), photo), told))
+        found = self.ask(FindMask(self.read(self.picture(photo), photo), told))
         assert isinstance(found, MaskFound)
         entry = MarkedObject(name, mark, found.outline)
         return self._outdated(photo, lambda latest: latest.with_object(entry), {mask_file(name): found.png})
@@ -314,12 +323,17 @@ class TablePhotos:
         except OSError as error:
             raise CannotStore(folder, error.strerror or str(error)) from error
 
-    def _read(self, data: bytes, focal_px: float | None) -> PhotoRead:
-        read = self._ask(ReadPhoto(data, focal_px))
+    def _read(self, data: bytes, focal_px: float | None, camera: KnownCamera | None = None) -> PhotoRead:
+        read = self.ask(ReadPhoto(data, focal_px, camera))
         assert isinstance(read, PhotoRead)
         return read
 
-    def _ask(self, order: ReadPhoto | FindMask) -> PhotoRead | MaskFound:
+    def ask(self, order: PhotoOrder) -> PhotoAnswer:
+        """Let the process that looks at photos carry out an order.
+
+        Raises:
+            OsfError: as `carry_out` of that process; if it died.
+        """
         try:
             with self._one_at_a_time:
                 return self._process.call(order)

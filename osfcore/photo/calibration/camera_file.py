@@ -25,6 +25,7 @@ from osfcore.photo.calibration.calibrate import Calibration
 from osfcore.photo.lens import Lens
 
 _MOST_RADIAL = 2.0
+_FOCAL_RANGE = 0.2, 50.0  # per longest side
 _SHAPE = 0.005  # by which the ratio of a photograph's sides may differ: reduced photographs have whole pixels
 
 
@@ -81,7 +82,8 @@ class KnownCamera:
 def calibration_to_json(found: Calibration, name: str) -> dict[str, Any]:
     """A calibration as plain lists and numbers."""
     pose = None if found.T_world_camera is None else found.T_world_camera.matrix().tolist()
-    error = ExpectedError(mean=1e3 * found.table.mean_m, worst=1e3 * found.table.worst_m)
+    is_seen = found.table.seen_share > 0
+    error = ExpectedError(mean=1e3 * found.table.mean_m, worst=1e3 * found.table.worst_m) if is_seen else None
     return encode(
         CalibrationJson(
             name=name,
@@ -106,7 +108,7 @@ def known_camera(data: object) -> KnownCamera:
     """
     entry = decode(CalibrationJson, data, "camera")
     check_ranges(("radial of the camera", entry.radial, -_MOST_RADIAL, _MOST_RADIAL))
-    K = _checked(np.array(entry.K))
+    K = _checked(np.array(entry.K), max(entry.width, entry.height))
     pose = None if entry.T_world_camera is None else _rigid(np.array(entry.T_world_camera))
     return KnownCamera((entry.width, entry.height), Lens(K, entry.radial), pose)
 
@@ -120,9 +122,13 @@ def read_camera(path: Path) -> KnownCamera:
     return read_json(path, known_camera)
 
 
-def _checked(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    if not min(K[0, 0], K[1, 1]) > 0 or not np.array_equal(K[2], (0, 0, 1)):
-        raise InvalidInput("K of the camera", K.tolist(), "3 x 3 with positive focal lengths and last row 0, 0, 1")
+def _checked(K: Float[np.ndarray, "3 3"], side: int) -> Float[np.ndarray, "3 3"]:
+    if not np.array_equal(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
+        raise InvalidInput("K of the camera", K.tolist(), "[[f, 0, x], [0, f, y], [0, 0, 1]]")
+    low, high = np.multiply(_FOCAL_RANGE, side).tolist()
+    for number in (0, 1):
+        check_ranges(("focal length of the camera [px]", K[number, number], low, high))
+        check_ranges(("principal point of the camera [px]", K[number, 2], -side, 2 * side))
     return K
 
 

@@ -95,7 +95,7 @@ def best_next(
         shown = corners[in_picture(theta, pose, on_board(corners), size)]
         if len(shown) >= _LEAST_CORNERS and (idea.nearness == 1 or len(shown) == len(corners)):
             told.append(Advice(idea.words, expected_m(about_camera(normal_matrix(theta, pose, shown)))))
-    return min(told, key=lambda advice: advice.mean_m, default=None)
+    return min((each for each in told if np.isfinite(each.mean_m)), key=lambda each: each.mean_m, default=None)
 
 
 def _view(idea: _Idea, theta: Theta, size: tuple[int, int], distance_m: float) -> PoseVector:

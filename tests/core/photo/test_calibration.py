@@ -8,7 +8,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.photo.calibration.calibrate import TooLittleSeen, assess, board_place, calibrated_camera
-from tests.core.photo.seen_boards import K, RADIAL, VARIED, on_table, project, sighting, sightings
+from tests.core.photo.seen_boards import RADIAL, VARIED, K, on_table, project, sighting, sightings
 
 TABLE_CAMERA = Camera.look_at("table", (0.0, -0.5, 0.65), (0.0, 0.0, 0.0)).T_world_camera
 PLACE = board_place(0.05, -0.03, 20.0)
