@@ -79,8 +79,8 @@ _DESCRIPTION = (
 )
 
 _ROUTES = (
-    status, objects, fields, scenes, presets, goals, photos, calibration, episodes, neural, estimates, predictions, jobs,
-    driver, views, stories, storage, events,
+    status, objects, fields, scenes, presets, goals, photos, calibration, episodes, neural, estimates, predictions,
+    jobs, driver, views, stories, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (objects.UPLOAD_PATH, fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
@@ -159,9 +159,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
         services = Services(
             settings, store, runner, viewer, objects, fields, neural, estimate_service, prediction_service,
-            goal_service, checks, table_photos, photo_tables, BoardPhotos(table_photos.ask),
-            Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish, GRACE_S), OwnObjects(runner), thumbnails, Outliner(runner.library),
-            Disturber(runner, np.random.default_rng()),
+            goal_service, checks, table_photos, photo_tables, BoardPhotos(table_photos.looker.ask),
+            Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish, GRACE_S), OwnObjects(runner),
+            thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()),
         )  # fmt: skip
         app.state.services = services
         app.state.metrics.watch(runner)

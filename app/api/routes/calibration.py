@@ -29,7 +29,7 @@ async def sight(
     return SightingOut.of(*await run_in_threadpool(services.board_photos.add, data, name))
 
 
-@router.post("", responses=problems(404, 503))
+@router.post("", responses=problems(503))
 @slow
 def assess(services: ServicesDep, body: CalibrateIn) -> CalibrationOut:
     """Tell what photos of the board tell of the camera so far, what is missing and what helps most."""

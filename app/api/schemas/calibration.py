@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from app.api.schemas.common import Input
 from app.api.schemas.limits import BOARD_PHOTOS, BOARD_PLACE_M, BOARD_TURN_DEG, FOCAL, GOAL_NAME, NAME, sized, within
@@ -15,10 +15,10 @@ from osfcore.photo.calibration.sighting import Sighting
 Identifier = Annotated[str, Field(**sized(NAME))]
 
 
-class CameraIn(Input):
+class CameraIn(BaseModel):
     """A calibrated camera, as a calibration tells it; what it says of its accuracy does not matter."""
 
-    model_config = {**Input.model_config, "extra": "ignore"}
+    model_config = ConfigDict(extra="ignore", strict=True)
 
     name: str = Field(**sized(GOAL_NAME))
     T_world_camera: list[list[FiniteFloat]] | None = None
@@ -57,10 +57,8 @@ class CalibrateIn(Input):
     """Photos of the board by one camera."""
 
     photos: list[Identifier] = Field(**sized(BOARD_PHOTOS))
-    table: Identifier | None = Field(
-        None, description="One of the board lying on the table; tells where the camera stands."
-    )
-    place: PlaceIn = PlaceIn()
+    table: Identifier | None = Field(None, description="The board lying on the table; tells where the camera stands.")
+    place: PlaceIn = Field(default_factory=lambda: PlaceIn(x_m=0.0, y_m=0.0, turn_deg=0.0))
     name: str = Field("camera", **sized(GOAL_NAME), description="Of the camera.")
 
 
@@ -76,9 +74,7 @@ class CalibrationOut(BaseModel):
 
     missing: str = Field(description="Why they do not suffice, a sentence; empty where they do.")
     next: AdviceOut | None = Field(description="Null if nothing helps.")
-    camera: CalibrationJson = Field(
-        description="What `osf photo estimate --camera` takes as a file, if nothing is missing."
-    )
+    camera: CalibrationJson = Field(description="As `osf photo estimate --camera` takes it, if nothing is missing.")
 
     @staticmethod
     def of(found: Calibration, name: str) -> CalibrationOut:

@@ -87,7 +87,7 @@ def test_corners_are_told_in_pixels_of_the_photograph_as_it_was_sent(raw):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        ({"K": [[0, 0, 1], [0, 1, 1], [0, 0, 1]]}, "K of the camera"),
+        ({"K": [[560, 5, 1], [0, 560, 1], [0, 0, 1]]}, "K of the camera"),
         ({"K": [[1.0, 0, 320], [0, 560, 240], [0, 0, 1]]}, "focal length of the camera"),
         ({"K": [[560, 0, 9999], [0, 560, 240], [0, 0, 1]]}, "principal point"),
         ({"radial": 9.0}, "radial of the camera"),
