@@ -1,0 +1,110 @@
+// A camera from photos of the board: sent one by one, each told at once whether the board is seen and what is missing.
+import { post, upload } from "./api.js";
+import { byId, el } from "./dom.js";
+import { mayDrive } from "./driver.js";
+import { set } from "./state.js";
+import { act, tellFailure } from "./toasts.js";
+
+const NAME_MAX = 100;
+const KEPT = "osf-camera"; // the camera that was saved, for photos of later visits
+const MOST_TOLD_MM = 100; // more is no figure that helps
+let photos = []; // {id, name}
+let table = null;
+let camera = null;
+let asked = 0; // the newest question; answers to older ones do not count
+
+const inMm = (value) => (value < MOST_TOLD_MM ? `${value.toFixed(value < 10 ? 1 : 0)} mm` : "more than 10 cm");
+
+function entry(photo, told) {
+  const rms = told?.camera.reprojection_px[photo.name];
+  const drop = el("button", { type: "button", className: "plain danger", textContent: "Remove", attributes: { "aria-label": `Remove: ${photo.name}` } });
+  drop.addEventListener("click", () => act(drop, async () => {
+    photos = photos.filter((each) => each !== photo);
+    if (table === photo) table = null;
+    await assess();
+  }));
+  const words = `${photo === table ? "On the table: " : ""}board seen${rms === undefined ? "" : `, corners ${rms.toFixed(2)} px off`}`;
+  return el("li", {}, el("div", { className: "marked" }, el("span", { className: "title", textContent: photo.name }), drop), el("span", { className: "hint", textContent: words }));
+}
+
+function show(told) {
+  const all = table ? [...photos, table] : photos;
+  byId("board-photos").replaceChildren(...all.map((photo) => entry(photo, told)));
+  byId("calibration-result").hidden = !told;
+  camera = told && !told.missing ? told.camera : null;
+  byId("save-camera").disabled = !camera;
+  byId("camera-saved").hidden = true;
+  if (!told) return;
+  const error = told.camera.expected_error_mm;
+  byId("calibration-meter").value = error?.mean ?? Infinity;
+  byId("calibration-error").textContent = error ? `${inMm(error.mean)}, at worst ${inMm(error.worst)}` : "not known yet";
+  byId("calibration-missing").hidden = !told.missing;
+  byId("calibration-missing").textContent = told.missing;
+  const helps = !told.missing && told.next && told.next.expected_error_mm < error.mean;
+  byId("calibration-next").hidden = !helps;
+  if (helps) byId("calibration-next").textContent = `With one more it would be ${inMm(told.next.expected_error_mm)}: ${told.next.words}.`;
+}
+
+/** Asks what all photos tell; where they contradict each other, that is told, and one can be removed. */
+async function assess() {
+  asked += 1;
+  const mine = asked;
+  show(null);
+  if (!photos.length && !table) return;
+  const told = await post("calibration", { photos: photos.map(({ id }) => id), table: table?.id ?? null });
+  if (mine === asked) show(told);
+}
+
+async function send(file) {
+  const bar = byId("calibration-bar");
+  const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
+  bar.hidden = false;
+  try {
+    return await upload(`calibration/photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
+  } finally {
+    bar.hidden = true;
+  }
+}
+
+async function add(files, isTable) {
+  const button = byId(isTable ? "add-table-view" : "add-board-photos");
+  for (const file of files) {
+    await act(button, async () => { // one that shows no board is told, and the next one is sent all the same
+      const sent = await send(file);
+      if (isTable) table = sent;
+      else photos.push(sent);
+    });
+  }
+  await tellFailure(assess, byId("calibration-bar"));
+}
+
+function save() {
+  const text = JSON.stringify(camera, null, 1);
+  localStorage.setItem(KEPT, text);
+  set("camera", camera);
+  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "camera.json" });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  byId("camera-saved").hidden = false;
+}
+
+function kept() {
+  try {
+    return JSON.parse(localStorage.getItem(KEPT));
+  } catch {
+    return null;
+  }
+}
+
+export function setUpCalibrate() {
+  set("camera", kept());
+  for (const [button, input, isTable] of [["add-board-photos", "board-photo-files", false], ["add-table-view", "table-view-file", true]]) {
+    byId(button).addEventListener("click", () => byId(input).click());
+    byId(input).addEventListener("change", async ({ target }) => {
+      const files = [...target.files];
+      target.value = "";
+      if (mayDrive()) await add(files, isTable);
+    });
+  }
+  byId("save-camera").addEventListener("click", save);
+}
