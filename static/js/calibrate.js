@@ -3,12 +3,12 @@ import { post, upload } from "./api.js";
 import { byId, el } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { set } from "./state.js";
-import { act, tellFailure } from "./toasts.js";
+import { act } from "./toasts.js";
 
 const NAME_MAX = 100;
 const KEPT = "osf-camera"; // the camera that was saved, for photos of later visits
 const MOST_TOLD_MM = 100; // more is no figure that helps
-let photos = []; // {id, name}
+let photos = []; // {id, name}, or {name, refused: why}
 let table = null;
 let camera = null;
 let asked = 0; // the newest question; answers to older ones do not count
@@ -24,7 +24,8 @@ function entry(photo, told) {
     await assess();
   }));
   const words = `${photo === table ? "On the table: " : ""}board seen${rms === undefined ? "" : `, corners ${rms.toFixed(2)} px off`}`;
-  return el("li", {}, el("div", { className: "marked" }, el("span", { className: "title", textContent: photo.name }), drop), el("span", { className: "hint", textContent: words }));
+  const found = el("span", { className: photo.refused ? "missing" : "hint", textContent: photo.refused ?? words });
+  return el("li", {}, el("div", { className: "marked" }, el("span", { className: "title", textContent: photo.name }), drop), found);
 }
 
 function show(told) {
@@ -50,32 +51,34 @@ async function assess() {
   asked += 1;
   const mine = asked;
   show(null);
-  if (!photos.length && !table) return;
-  const told = await post("calibration", { photos: photos.map(({ id }) => id), table: table?.id ?? null });
+  const seen = photos.filter(({ refused }) => !refused).map(({ id }) => id);
+  if (!seen.length && !table) return;
+  const told = await post("calibration", { photos: seen, table: table?.id ?? null });
   if (mine === asked) show(told);
 }
 
+/** The board in a photo, or why it cannot be used; the next photo is sent all the same. */
 async function send(file) {
   const bar = byId("calibration-bar");
   const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
   bar.hidden = false;
   try {
     return await upload(`calibration/photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
+  } catch (error) {
+    return { name: file.name, refused: error.message };
   } finally {
     bar.hidden = true;
   }
 }
 
 async function add(files, isTable) {
-  const button = byId(isTable ? "add-table-view" : "add-board-photos");
   for (const file of files) {
-    await act(button, async () => { // one that shows no board is told, and the next one is sent all the same
-      const sent = await send(file);
-      if (isTable) table = sent;
-      else photos.push(sent);
-    });
+    const sent = await send(file);
+    if (isTable && !sent.refused) table = sent;
+    else photos.push(sent);
+    show(null);
   }
-  await tellFailure(assess, byId("calibration-bar"));
+  await assess();
 }
 
 function save() {
@@ -103,7 +106,7 @@ export function setUpCalibrate() {
     byId(input).addEventListener("change", async ({ target }) => {
       const files = [...target.files];
       target.value = "";
-      if (mayDrive()) await add(files, isTable);
+      if (mayDrive()) await act(byId(button), () => add(files, isTable));
     });
   }
   byId("save-camera").addEventListener("click", save);
