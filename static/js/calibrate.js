@@ -8,7 +8,7 @@ import { act } from "./toasts.js";
 const NAME_MAX = 100;
 const KEPT = "osf-camera"; // the camera that was saved, for photos of later visits
 const MOST_TOLD_MM = 100; // more is no figure that helps
-let photos = []; // {id, name}, or {name, refused: why}
+let photos = []; // {id, name, file}, or {name, file, refused: why}
 let table = null;
 let camera = null;
 let asked = 0; // the newest question; answers to older ones do not count
@@ -60,12 +60,15 @@ async function assess() {
 /** The board in a photo, or why it cannot be used; the next photo is sent all the same. */
 async function send(file) {
   const bar = byId("calibration-bar");
-  const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
+  const twins = [...photos, table].filter((each) => each?.file === file.name).length; // many phones call each photo image.jpg
+  const name = `${file.name.slice(-NAME_MAX + 6)}${twins ? ` (${twins + 1})` : ""}`;
+  const query = new URLSearchParams({ name });
   bar.hidden = false;
   try {
-    return await upload(`calibration/photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
+    const sent = await upload(`calibration/photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
+    return { ...sent, file: file.name };
   } catch (error) {
-    return { name: file.name, refused: error.message };
+    return { name, file: file.name, refused: error.message };
   } finally {
     bar.hidden = true;
   }

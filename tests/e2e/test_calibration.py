@@ -8,7 +8,7 @@ import pytest
 from tests.app.api.routes.test_calibration import ON_TABLE, TILTS, png_of
 from tests.app.api.routes.test_table_photos import gray
 from tests.core.photo.seen_boards import K, tilted
-from tests.e2e.conftest import ARTIFACTS, watch_errors
+from tests.e2e.conftest import watch_errors
 from tests.live import call, free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
@@ -49,7 +49,6 @@ def test_a_camera_is_calibrated_saved_and_used(page, port):
     page.set_input_files("#board-photo-files", {"name": "wall.png", "mimeType": "image/png", "buffer": gray(640, 480)})
     page.wait_for_selector("#board-photos .missing")
     assert "wall.png cannot be used" in page.inner_text("#board-photos .missing")
-    page.screenshot(path=ARTIFACTS / "calibration-1.png")
     page.click('[aria-label="Remove: wall.png"]')
     send(page, "#board-photo-files", *boards[1:])
     page.wait_for_selector("#save-camera:not([disabled])")
@@ -58,8 +57,6 @@ def test_a_camera_is_calibrated_saved_and_used(page, port):
     table = png_of(ON_TABLE, 9)
     send(page, "#table-view-file", ("table.png", table))
     assert page.locator("#board-photos li").count() == len(boards) + 1
-    ARTIFACTS.mkdir(exist_ok=True)
-    page.screenshot(path=ARTIFACTS / "calibration.png")
     with page.expect_download() as download:
         page.click("#save-camera")
     camera = json.loads(download.value.path().read_text())

@@ -26,6 +26,7 @@ from osfcore.photo.calibration.information import (
     padded,
     table_error,
     total,
+    with_later_pose,
     workspace_grid,
 )
 from osfcore.photo.calibration.next_view import Advice, best_next, usual_table_view
@@ -144,7 +145,7 @@ def assess(
         fit.lens,
         focal_std * float(np.exp(fit.theta[0])),
         fit.noise_px,
-        {view.name: float(rms) for view, rms in zip(every, fit.rms_px, strict=True)},
+        dict(zip(_different([view.name for view in every]), fit.rms_px.tolist(), strict=True)),
         None if table is None else T_world_board @ pose_of(fit.poses[-1]).inverse(),
         told,
         advice,
@@ -159,10 +160,11 @@ class _OnTable:
     Attributes:
         fit: the camera.
         size: of its picture [px].
-        about_camera: normal matrix of all photographs but that of the table, over theta.
+        about_camera: normal matrix over theta, of all photographs but that of the table.
         about_table: of the photograph of the table, over theta and pose.
         pose: of the board in that photograph.
         grid: the workspace in the board's frame [m].
+        is_later: whether that photograph is not one of the calibration's, so that its pose alone follows from it.
     """
 
     fit: CameraFit
@@ -171,6 +173,7 @@ class _OnTable:
     about_table: Float[np.ndarray, "10 10"]
     pose: PoseVector
     grid: Float[np.ndarray, "G 3"]
+    is_later: bool
 
     @staticmethod
     def of(
@@ -180,17 +183,21 @@ class _OnTable:
         place: Pose | None,
         board: Board,
     ) -> _OnTable:
-        """The last photograph shows the board on the table in its place; a usual one does if there is no place."""
+        """The last photograph shows the board on the table in its place; a usual one will if there is no place."""
         if place is not None:
             known, there = total(map(about_camera, normals[:-1])), place.inverse().apply(workspace_grid())
-            return _OnTable(fit, size, known, normals[-1], fit.poses[-1], there)
+            return _OnTable(fit, size, known, normals[-1], fit.poses[-1], there, False)
         pose = usual_table_view(fit.theta, size)
         seen = normal_matrix(fit.theta, pose, board.corners_m())
-        return _OnTable(fit, size, total(map(about_camera, normals)), seen, pose, workspace_grid())
+        return _OnTable(fit, size, total(map(about_camera, normals)), seen, pose, workspace_grid(), True)
 
     def error(self, more: Float[np.ndarray, "4 4"] | float = 0.0) -> TableError:
         """To expect if `more` is known of the camera."""
-        spread = self.fit.noise_px**2 * covariance(self.about_table + padded(self.about_camera + more))
+        noise, known = self.fit.noise_px, self.about_camera + more
+        if self.is_later:
+            spread = with_later_pose(noise**2 * covariance(known), self.about_table, noise)
+        else:
+            spread = noise**2 * covariance(self.about_table + padded(known))
         return table_error(self.fit.theta, self.pose, spread, self.grid, self.size)
 
 
@@ -215,6 +222,11 @@ def _missing(count: int, focal_share: float, table: TableError, advice: Advice |
         what, allowed = "part of the workspace in the photo of the table", "larger: check the place of the board"
         return str(InvalidInput(what, "none", allowed))
     return ""
+
+
+def _different(names: Sequence[str]) -> list[str]:
+    """Names with a number behind those that were there before: many phones call each photograph image.jpg."""
+    return [f"{name} ({names[:k].count(name) + 1})" if name in names[:k] else name for k, name in enumerate(names)]
 
 
 def _check_photos(every: Sequence[Sighting]) -> None:

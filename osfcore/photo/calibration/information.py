@@ -108,6 +108,25 @@ def table_error(
     return TableError(float(errors.mean()), float(errors.max()), float(inside.mean()))
 
 
+def with_later_pose(
+    spread: Float[np.ndarray, "4 4"], normal: Float[np.ndarray, "10 10"], noise_px: float
+) -> Float[np.ndarray, "10 10"]:
+    """Covariance of theta and of a pose that is found with theta held fixed, in a photograph taken afterwards.
+
+        d pose = -A_pp^-1 A_pt d theta + e,   Cov e = noise^2 A_pp^-1
+
+    Args:
+        spread: covariance of theta.
+        normal: A, J^T J of that photograph.
+        noise_px: of its corners along each axis [px].
+    """
+    own = np.linalg.inv(normal[INTRINSICS:, INTRINSICS:])
+    follows = np.vstack([np.eye(INTRINSICS), -own @ normal[INTRINSICS:, :INTRINSICS]])
+    whole = follows @ spread @ follows.T
+    whole[INTRINSICS:, INTRINSICS:] += noise_px**2 * own
+    return whole
+
+
 def padded(information: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "10 10"]:
     """What is known of theta, over theta and a pose of which nothing is known."""
     return np.pad(information, (0, POSE))

@@ -1,5 +1,8 @@
 """A camera from several sightings of the board: exact without noise, as far off as predicted with it, or refused."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
@@ -8,6 +11,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.photo.calibration.calibrate import TooLittleSeen, assess, board_place, calibrated_camera
+from osfcore.photo.planar_pose import planar_pose
 from tests.core.photo.seen_boards import RADIAL, VARIED, K, on_table, project, sighting, sightings
 
 TABLE_CAMERA = Camera.look_at("table", (0.0, -0.5, 0.65), (0.0, 0.0, 0.0)).T_world_camera
@@ -49,6 +53,26 @@ def test_predicted_errors_are_those_of_many_noisy_calibrations(noise):
     assert np.mean(focal) == pytest.approx(K[0, 0], abs=3 * np.std(focal) / np.sqrt(len(runs)))
     assert np.mean([run.noise_px for run in runs]) == pytest.approx(noise, rel=0.1)
     assert runs[0].table.seen_share == inside.mean()
+
+
+@pytest.mark.parametrize("tilts", [VARIED, VARIED[1:4]])
+def test_without_a_photo_of_the_table_errors_are_those_of_a_later_one(tilts):
+    rng, points, noise = np.random.default_rng(3), grid(), 0.1
+    later = Camera.look_at("later", (0.0, -0.58, 0.69), (0.0, 0.0, 0.0)).T_world_camera  # shows all of the workspace
+    seen = project(later.inverse(), points)
+    assert np.all((seen > 0) & (seen < (640, 480)))
+    off, told = [], []
+    for _ in range(40):
+        run = calibrated_camera(sightings(tilts, noise, rng))
+        told.append(run.table.mean_m)
+        board = sighting("later.jpg", later.inverse(), noise, rng)
+        straight = cv2.undistortPoints(
+            board.points_px[:, None], run.lens.intrinsics, np.array([run.lens.radial, 0, 0, 0]), P=run.lens.intrinsics
+        )[:, 0]
+        pose, _ = planar_pose(board.points_m, straight, run.lens.intrinsics)
+        off.append(on_table(replace(run, T_world_camera=pose), seen) - points)
+    true = np.sqrt(np.square(off).sum(axis=2).mean(axis=0)).mean()
+    assert np.mean(told) == pytest.approx(true, rel=0.3)
 
 
 def test_errors_grow_with_the_noise_and_shrink_with_photos():
@@ -100,6 +124,11 @@ def test_a_photo_with_another_zoom_is_named():
 def test_photos_that_nobody_could_have_taken_with_one_camera_are_refused():
     with pytest.raises(InvalidInput, match="mean distance of the board's corners"):
         assess(sightings(VARIED, 3.0, np.random.default_rng(1)))
+
+
+def test_photos_of_one_name_are_told_apart():
+    views = [replace(view, name="image.jpg") for view in sightings()]
+    assert list(assess(views).rms_px)[:2] == ["image.jpg", "image.jpg (2)"]
 
 
 def test_a_photo_of_another_size_or_sent_twice_is_named():
