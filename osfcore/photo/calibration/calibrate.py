@@ -38,6 +38,8 @@ MOST_FOCAL_STD = 0.01  # of the focal length
 MOST_RMS_PX = 1.0  # of the corners, in photographs of usual size
 _ODD_RMS_PX = 0.1  # below which photographs agree
 _ODD_GAIN = 2.0  # factor on the residuals' variance that one photograph is to blame for
+_ODD_RATIO = 1.4  # of its distances to the usual ones; from noise alone they hardly reach it
+_SUSPECTS = 3  # photographs that may be to blame: those with the largest distances
 _SAME_PX = 1e-3
 AT_ORIGIN = Pose.identity()
 
@@ -250,9 +252,10 @@ def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
     rms = float(np.sqrt(2) * fit.noise_px)
     if rms < _ODD_RMS_PX * scale:
         return
-    if len(every) > LEAST_PHOTOS:
-        without = [fit_camera([view for view in every if view is not odd]).noise_px for odd in every]
-        best = int(np.argmin(without))
+    if len(every) > LEAST_PHOTOS and fit.rms_px.max() > _ODD_RATIO * np.median(fit.rms_px):
+        suspects = np.argsort(-fit.rms_px)[:_SUSPECTS].tolist()
+        without = {k: fit_camera([view for n, view in enumerate(every) if n != k]).noise_px for k in suspects}
+        best = min(suspects, key=without.__getitem__)
         if _ODD_GAIN * without[best] ** 2 < fit.noise_px**2:
             reason = (
                 f"the board's corners in it lie {fit.rms_px[best]:.2g} px from where the other photos put them; "

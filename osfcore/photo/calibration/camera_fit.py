@@ -26,7 +26,9 @@ INTRINSICS, POSE = 4, 6  # numbers of parameters
 _USUAL_SIDE = 1920  # [px]; in larger photographs corners scatter by more pixels
 _TOLD = 0.2  # relative deviation of a focal length to begin with
 _MOST_STEPS = 200
+_SETTLED = 1e-12  # relative change at which descent ends
 _FARTHEST = 3.0  # of log f from where it began
+_SAME_POSE = 0.01  # [rad, m]
 _LOOSE = (1.0, 0.5, 0.5, 1.0)  # deviations of log f, of the principal point in longer sides, of k1; see `_descend`
 
 Theta = Float[np.ndarray, "4"]
@@ -108,9 +110,10 @@ def fit_camera(views: Sequence[Sighting]) -> CameraFit:
     focal = _first_focal(views)
     theta = np.array([np.log(focal), size[0] / 2, size[1] / 2, 0.0])
     first = _descend(views, theta, _poses(views, theta))
-    theta = _split(first.x)[0]
-    again = _descend(views, theta, _poses(views, theta))
-    best = min(first, again, key=lambda fit: fit.cost)
+    theta, poses = _split(first.x)
+    others, best = _poses(views, theta), first
+    if not np.allclose(others, poses, atol=_SAME_POSE):
+        best = min(first, _descend(views, theta, others), key=lambda fit: fit.cost)
     theta, poses = _split(best.x)
     ends = np.cumsum([len(view.points_m) for view in views])
     squares = np.square(best.fun[:-INTRINSICS].reshape(-1, 2)).sum(axis=1)
@@ -176,5 +179,5 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
         return whole
 
     start = np.concatenate([theta, poses.ravel()])
-    options = {"jac": jacobian, "method": "lm", "x_scale": "jac", "max_nfev": _MOST_STEPS}
+    options = {"jac": jacobian, "method": "lm", "x_scale": "jac", "max_nfev": _MOST_STEPS, "ftol": _SETTLED, "xtol": _SETTLED}
     return least_squares(residuals, start, **options)
