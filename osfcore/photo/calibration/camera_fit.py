@@ -179,5 +179,5 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
         return whole
 
     start = np.concatenate([theta, poses.ravel()])
-    options = {"jac": jacobian, "method": "lm", "x_scale": "jac", "max_nfev": _MOST_STEPS, "ftol": _SETTLED, "xtol": _SETTLED}
-    return least_squares(residuals, start, **options)
+    until = {"max_nfev": _MOST_STEPS, "ftol": _SETTLED, "xtol": _SETTLED}
+    return least_squares(residuals, start, **{"jac": jacobian}, method="lm", x_scale="jac", **until)
