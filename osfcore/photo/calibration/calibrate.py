@@ -249,14 +249,14 @@ def _check_photos(every: Sequence[Sighting]) -> None:
 def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
     """Refuse the photograph without which the others agree, or all of them if nobody is to blame."""
     scale = px_scale(every[0].size)
-    rms = float(np.sqrt(2) * fit.noise_px)
+    rms = float(np.sqrt(2) * fit.scatter_px)
     if rms < _ODD_RMS_PX * scale:
         return
     if len(every) > LEAST_PHOTOS and fit.rms_px.max() > _ODD_RATIO * np.median(fit.rms_px):
         suspects = np.argsort(-fit.rms_px)[:_SUSPECTS].tolist()
-        without = {k: fit_camera([view for n, view in enumerate(every) if n != k]).noise_px for k in suspects}
+        without = {k: fit_camera([view for n, view in enumerate(every) if n != k]).scatter_px for k in suspects}
         best = min(suspects, key=without.__getitem__)
-        if _ODD_GAIN * without[best] ** 2 < fit.noise_px**2:
+        if _ODD_GAIN * without[best] ** 2 < fit.scatter_px**2:
             reason = (
                 f"the board's corners in it lie {fit.rms_px[best]:.2g} px from where the other photos put them; "
                 "take it anew with the same zoom and a flat sheet, or leave it out"

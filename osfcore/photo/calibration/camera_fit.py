@@ -23,6 +23,8 @@ from osfcore.photo.lens import FINE_PX, Lens
 from osfcore.photo.planar_pose import calibrated, planar_pose
 
 INTRINSICS, POSE = 4, 6  # numbers of parameters
+# Corners are off by 0.05 px, but alike in all of a photograph: on the table that counts as much as independent 0.1 px.
+LEAST_NOISE_PX = 0.1
 _USUAL_SIDE = 1920  # [px]; in larger photographs corners scatter by more pixels
 _TOLD = 0.2  # relative deviation of a focal length to begin with
 _MOST_STEPS = 200
@@ -43,13 +45,14 @@ class CameraFit:
         theta: log f, cx, cy [px] and k1.
         poses: of the board in the camera's frame, view by view: rotation vector [rad] and translation [m].
         rms_px: root mean square distance of the corners from where they should appear, view by view [px].
-        noise_px: standard deviation of a corner along each axis, from the residuals' variance, but at least what is to
-            be expected of real lenses and sheets, whose errors corners share [px].
+        scatter_px: standard deviation of a corner along each axis, from the residuals' variance [px].
+        noise_px: the same, but at least what is to be expected of real lenses, sheets and edges [px].
     """
 
     theta: Theta
     poses: Float[np.ndarray, "V 6"]
     rms_px: Float[np.ndarray, "V"]
+    scatter_px: float
     noise_px: float
 
     @property
@@ -119,7 +122,8 @@ def fit_camera(views: Sequence[Sighting]) -> CameraFit:
     squares = np.square(best.fun[:-INTRINSICS].reshape(-1, 2)).sum(axis=1)
     rms = np.array([np.sqrt(part.mean()) for part in np.split(squares, ends[:-1])])
     variance = squares.sum() / max(2 * len(squares) - best.x.size, 1)
-    return CameraFit(theta, poses, rms, max(float(np.sqrt(variance)), ACCURACY_PX * px_scale(size)))
+    scatter = float(np.sqrt(variance))
+    return CameraFit(theta, poses, rms, scatter, max(scatter, LEAST_NOISE_PX * px_scale(size)))
 
 
 def _first_focal(views: Sequence[Sighting]) -> float:

@@ -39,7 +39,7 @@ def test_without_noise_the_camera_is_found_exactly():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.05, 0.2])
+@pytest.mark.parametrize("noise", [0.15, 0.4])
 def test_predicted_errors_are_those_of_many_noisy_calibrations(noise):
     rng, points = np.random.default_rng(2), grid()
     seen = project(TABLE_CAMERA.inverse(), points)
@@ -58,7 +58,7 @@ def test_predicted_errors_are_those_of_many_noisy_calibrations(noise):
 
 @pytest.mark.parametrize("tilts", [VARIED[1:4], pytest.param(VARIED, marks=pytest.mark.slow)])
 def test_without_a_photo_of_the_table_errors_are_those_of_a_later_one(tilts):
-    rng, points, noise = np.random.default_rng(3), grid(), 0.1
+    rng, points, noise = np.random.default_rng(3), grid(), 0.15
     later = Camera.look_at("later", (0.0, -0.58, 0.69), (0.0, 0.0, 0.0)).T_world_camera  # shows all of the workspace
     seen = project(later.inverse(), points)
     assert np.all((seen > 0) & (seen < (640, 480)))
@@ -81,9 +81,9 @@ def test_errors_grow_with_the_noise_and_shrink_with_photos():
         tilts = VARIED * (count // len(VARIED))
         return assess(sightings(tilts, noise, np.random.default_rng(0)))
 
-    assert told(6, 0.4).table.mean_m == pytest.approx(4 * told(6, 0.1).table.mean_m, rel=0.2)
-    assert told(24, 0.1).table.mean_m < told(6, 0.1).table.mean_m
-    assert told(24, 0.1).focal_std_px == pytest.approx(told(6, 0.1).focal_std_px / 2, rel=0.2)
+    assert told(6, 0.8).table.mean_m == pytest.approx(4 * told(6, 0.2).table.mean_m, rel=0.2)
+    assert told(24, 0.2).table.mean_m < told(6, 0.2).table.mean_m
+    assert told(24, 0.2).focal_std_px == pytest.approx(told(6, 0.2).focal_std_px / 2, rel=0.2)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
