@@ -156,7 +156,7 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
     """Levenberg and Marquardt's method.
 
     What the corners do not tell stays near where it began: each parameter of the camera has a prior so loose that it
-    moves none that they do tell (by less than 1e-8 of its value), and is not counted as information.
+    moves none that they do tell (by less than 1e-6 of its value), and is not counted as information.
     """
     points, centre, count = [on_board(view.points_m) for view in views], theta[0], len(poses) * POSE + INTRINSICS
     side = max(views[0].size)
