@@ -28,7 +28,6 @@ LEAST_NOISE_PX = 0.1
 _USUAL_SIDE = 1920  # [px]; in larger photographs corners scatter by more pixels
 _TOLD = 0.2  # relative deviation of a focal length to begin with
 _MOST_STEPS = 200
-_SETTLED = 1e-12  # relative change at which descent ends
 _FARTHEST = 3.0  # of log f from where it began
 _SAME_POSE = 0.01  # [rad, m]
 _LOOSE = (1.0, 0.5, 0.5, 1.0)  # deviations of log f, of the principal point in longer sides, of k1; see `_descend`
@@ -183,5 +182,4 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
         return whole
 
     start = np.concatenate([theta, poses.ravel()])
-    until = {"max_nfev": _MOST_STEPS, "ftol": _SETTLED, "xtol": _SETTLED}
-    return least_squares(residuals, start, **{"jac": jacobian}, method="lm", x_scale="jac", **until)
+    return least_squares(residuals, start, **{"jac": jacobian}, method="lm", x_scale="jac", max_nfev=_MOST_STEPS)
