@@ -25,8 +25,8 @@ from app.api.guards.connection_timeouts import BodyTimeoutMiddleware
 from app.api.guards.security import BodyLimitMiddleware, SecurityMiddleware
 from app.api.guards.token_gate import TokenMiddleware
 from app.api.http_metrics import Metrics, MetricsMiddleware
-from app.api.routes import comparisons as neural
 from app.api.routes import (
+    calibration,
     episodes,
     estimates,
     events,
@@ -40,6 +40,7 @@ from app.api.routes import (
     status,
     storage,
 )
+from app.api.routes import comparisons as neural
 from app.api.routes.pages import driver, presets, stories, views
 from app.api.schemas.common import ForgottenEvent, FrameEvent, LookEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
@@ -56,6 +57,7 @@ from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
+from app.services.photos.board_photos import BoardPhotos
 from app.services.photos.photo_tables import PhotoTables
 from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
@@ -77,8 +79,8 @@ _DESCRIPTION = (
 )
 
 _ROUTES = (
-    status, objects, fields, scenes, presets, goals, photos, episodes, neural, estimates, predictions, jobs,
-    driver, views, stories, storage, events,
+    status, objects, fields, scenes, presets, goals, photos, calibration, episodes, neural, estimates, predictions,
+    jobs, driver, views, stories, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (objects.UPLOAD_PATH, fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
@@ -157,9 +159,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
         services = Services(
             settings, store, runner, viewer, objects, fields, neural, estimate_service, prediction_service,
-            goal_service, checks, table_photos, photo_tables, Episodes(runner, fields, goal_service, checks),
-            Driver(runner.hub.publish, GRACE_S), OwnObjects(runner), thumbnails, Outliner(runner.library),
-            Disturber(runner, np.random.default_rng()),
+            goal_service, checks, table_photos, photo_tables, BoardPhotos(table_photos.looker.ask),
+            Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish, GRACE_S), OwnObjects(runner),
+            thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()),
         )  # fmt: skip
         app.state.services = services
         app.state.metrics.watch(runner)
@@ -171,7 +173,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 def _body_limit(settings: Settings, path: str) -> int:
     """How large a request to a path may be [bytes]: only uploads and many sequences of actions are large."""
     path = path.rstrip("/")
-    if path in (goals.UPLOAD_PATH, photos.UPLOAD_PATH):
+    if path in (goals.UPLOAD_PATH, photos.UPLOAD_PATH, calibration.UPLOAD_PATH):
         return max(settings.max_photo_bytes, settings.max_body_bytes)
     if path in _UPLOAD_PATHS:
         return settings.max_upload_bytes

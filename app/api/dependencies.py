@@ -23,6 +23,7 @@ from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import Goals
 from app.services.objects.own_objects import OwnObjects
 from app.services.objects.thumbnails import Thumbnails
+from app.services.photos.board_photos import BoardPhotos
 from app.services.photos.photo_tables import PhotoTables
 from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
@@ -97,6 +98,7 @@ class Services:
     goal_checks: GoalChecks
     photos: TablePhotos
     photo_tables: PhotoTables
+    board_photos: BoardPhotos
     episodes: Episodes
     driver: Driver
     own_objects: OwnObjects

@@ -32,7 +32,7 @@ _CENTRE_SHARE, _FOCAL_SHARE = (
 )  # deviations of the principal point from the middle, and of a given focal length
 _MOST = 0.5  # of |k1|
 _LEAST_PX = 0.5  # of distortion in the photograph's corners
-_FINE_PX = 0.015  # of points, where the lens is modelled: they scatter by 0.01 px in VGA
+FINE_PX = 0.015  # of points, where the lens is modelled: they scatter by 0.01 px in VGA
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -79,6 +79,22 @@ def locate_board_through_lens(
         The camera of the straightened photograph, and the lens that straightens it. Its radial coefficient is 0 where
         the board's points do not tell of any: fewer than 3 standard deviations, or half a pixel in the corners.
     """
+    found, lens = board_points_through_lens(image, board, intrinsics)
+    size = image.shape[1], image.shape[0]
+    if intrinsics is not None:
+        _check_focal(found, size, intrinsics)
+    view = board_view(found, size, intrinsics)
+    return view, lens or Lens(view.intrinsics, 0.0)
+
+
+def board_points_through_lens(
+    image: UInt8[np.ndarray, "h w *channels"], board: Board, intrinsics: Float[np.ndarray, "3 3"] | None = None
+) -> tuple[FoundPoints, Lens | None]:
+    """Corners of the board's squares in the straightened photograph, and the lens; arguments as of `locate_board`.
+
+    Raises:
+        InvalidInput: if the image is no photograph, or no board or too little of it is found.
+    """
     found, size = board_points(image, board), (image.shape[1], image.shape[0])
     lens: Lens | None = None
     for _ in range(_ROUNDS):
@@ -87,10 +103,7 @@ def locate_board_through_lens(
         if fit is None:
             break
         lens, found = fit, board_points(fit.straightened(image), board)
-    if intrinsics is not None:
-        _check_focal(found, size, intrinsics)
-    view = board_view(found, size, intrinsics)
-    return view, lens or Lens(view.intrinsics, 0.0)
+    return found, lens
 
 
 def _fitted(seen: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None) -> Lens | None:
@@ -99,7 +112,7 @@ def _fitted(seen: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarr
     Pose, focal length, principal point and k1 are fitted together; a principal point beside the middle looks much like
     distortion, so that it is left free within 1 % of the image, and a focal length that is given within 1 %.
     """
-    accuracy, middle = _FINE_PX * max(1.0, max(size) / 1920), np.array(size) / 2
+    accuracy, middle = FINE_PX * max(1.0, max(size) / 1920), np.array(size) / 2
     start = calibrated(seen.points_m, seen.points_px, size, accuracy)
     if start is None:
         return None

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
-from osfcore.photo.board import Board, BoardView
+from osfcore.photo.board import Board, BoardView, locate_board
+from osfcore.photo.calibration.camera_file import KnownCamera
 from osfcore.photo.lens import CONTRADICTED, Lens, locate_board_through_lens
 from osfcore.photo.planar_pose import UNTOLD
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
@@ -85,6 +86,29 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
         notes.append(f"The lens bends straight lines ({bend}); the photo was straightened.")
     straight = replace(raw, encoded=lens.straightened(raw.encoded))
     return Located(straight, view.intrinsics, lens, source, view.T_world_camera, tuple(notes))
+
+
+def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
+    """The photograph of a calibrated camera: it stands where the calibration says, else over the board in view, if any.
+
+    Args:
+        raw: the decoded photo.
+        camera: that took it.
+
+    Raises:
+        InvalidInput: if the photo has another shape than those that the camera was calibrated with.
+    """
+    camera.lens_at(raw.sent_size)  # refuses it in the user's own pixels
+    lens = camera.lens_at((raw.encoded.shape[1], raw.encoded.shape[0]))
+    straight = replace(raw, encoded=lens.straightened(raw.encoded))
+    notes, pose, missing = [*raw.notes, "The camera is the one that was calibrated."], camera.T_world_camera, ""
+    if pose is None:
+        try:
+            pose = locate_board(straight.eight_bit, Board(), lens.intrinsics).T_world_camera
+        except InvalidInput as error:
+            missing = str(error)
+            notes.append(f"The calibration does not say where the camera stands, and no board was found. {error}")
+    return Located(straight, lens.intrinsics, lens, "given", pose, tuple(notes), missing)
 
 
 def _over_board(

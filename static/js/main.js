@@ -2,6 +2,7 @@
 import { setUpAddress } from "./address.js";
 import { VISITOR, get } from "./api.js";
 import { setUpBeside } from "./beside.js";
+import { setUpCalibrate } from "./calibrate.js";
 import { setUpCameras, showFrames } from "./cameras.js";
 import { setUpClip } from "./clip.js";
 import { setUpCompose } from "./compose.js";
@@ -102,6 +103,7 @@ setUpGoals();
 setUpCrop();
 setUpGoalCheck();
 setUpPhoto();
+setUpCalibrate();
 setUpCompose();
 setUpDrop();
 setUpEpisodeView();

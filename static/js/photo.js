@@ -286,6 +286,8 @@ export function setUpPhoto() {
     const { focal } = event.target.elements;
     act(event.submitter, async () => show(await patch(path(), { focal_px: focal.value ? Number(focal.value) : null })));
   });
+  byId("use-camera").addEventListener("click", () => act(byId("use-camera"), async () => show(await patch(path(), { focal_px: null, camera: known("camera") }))));
+  watch("camera", (camera) => { byId("photo-calibrated").hidden = !camera; });
   byId("photo-object").addEventListener("change", ({ target }) => choose(target.value));
   for (const radio of document.getElementsByName("photo-tool")) radio.addEventListener("change", () => chooseTool(radio.value));
   byId("photo-brush").addEventListener("input", ({ target }) => setBrush(Number(target.value)));

@@ -4,6 +4,7 @@
 // `training` is the job that trains a field now, or the latest one that did; `estimate` and `episode` likewise,
 // `objectWork` the one that fetches or makes objects, `clip` the one that makes a clip, `photoJob` the one
 // that looks at a photo of a table.
+// `camera` is the calibrated one that was saved on this page, null if there is none.
 // `goal` is the one that was chosen on this page; `draft` the one that is being composed, null when there is none.
 // `check` is what the service says of the goal and the table, null while it says nothing.
 // `driver` tells which visitor drives; `opened` is an episode that somebody wants to see, `report`
@@ -11,7 +12,7 @@
 const state = {
   scene: undefined, objects: [], fields: undefined, training: undefined, estimate: undefined, episode: undefined,
   objectWork: undefined, clip: undefined, photoJob: undefined,
-  goals: [], goal: null, check: null, draft: null, driver: null, opened: null, report: null, settings: null,
+  camera: null, goals: [], goal: null, check: null, draft: null, driver: null, opened: null, report: null, settings: null,
 };
 const listeners = Object.fromEntries(Object.keys(state).map((what) => [what, []]));
 

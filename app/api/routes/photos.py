@@ -32,10 +32,11 @@ from app.api.schemas.photos import (
 from app.storage.table_photos import TablePhoto
 from osfcore.photo.board import Board
 from osfcore.photo.board_page import board_pdf
+from osfcore.photo.calibration.camera_file import known_camera
 
 UPLOAD_PATH = "/api/photos"
 _ANY_FILE = "application/octet-stream"  # what browsers call formats that they do not know
-_BODY = {
+PHOTO_BODY = {
     "requestBody": {
         "required": True,
         "description": "A photo.",
@@ -56,7 +57,22 @@ def _known_photo(
 PhotoDep = Annotated[TablePhoto, Depends(_known_photo)]
 
 
-@router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409, 415, 503, 507), openapi_extra=_BODY)
+async def photo_body(request: Request, max_bytes: int) -> bytes:
+    """The photo that is sent.
+
+    Raises:
+        HTTPException: if it is none, or the upload broke off.
+    """
+    kind = kind_of(request)
+    if not (kind.startswith("image/") or kind == _ANY_FILE):
+        raise HTTPException(status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, "Send a photo, such as a JPEG or PNG file.")
+    try:
+        return await whole_body(request, max_bytes)
+    except ClientDisconnect:
+        raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
+
+
+@router.post("", status_code=status.HTTP_201_CREATED, responses=problems(409, 415, 503, 507), openapi_extra=PHOTO_BODY)
 async def create(
     services: ServicesDep,
     request: Request,
@@ -67,13 +83,7 @@ async def create(
     ] = None,
 ) -> TablePhotoOut:
     """Keep a photo of a table, of any size and usual format; its camera is found if the printed board is in view."""
-    kind = kind_of(request)
-    if not (kind.startswith("image/") or kind == _ANY_FILE):
-        raise HTTPException(status.HTTP_415_UNSUPPORTED_MEDIA_TYPE, "Send a photo, such as a JPEG or PNG file.")
-    try:
-        data = await whole_body(request, services.settings.max_photo_bytes)
-    except ClientDisconnect:
-        raise HTTPException(status.HTTP_400_BAD_REQUEST, "The upload broke off.") from None
+    data = await photo_body(request, services.settings.max_photo_bytes)
     photo = await run_in_threadpool(services.photos.receive, data, name, focal_px)
     response.headers["Location"] = f"{UPLOAD_PATH}/{photo.id}"
     return _out(services, photo)
@@ -100,9 +110,10 @@ def get(services: ServicesDep, photo: PhotoDep) -> TablePhotoOut:
 
 @router.patch("/{photo}", responses=problems(404, 503, 507))
 @slow
-def set_focal(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> TablePhotoOut:
-    """Give a photo another focal length."""
-    return _out(services, services.photos.set_focal(photo.id, body.focal_px))
+def set_camera(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> TablePhotoOut:
+    """Give a photo another focal length, or the calibrated camera that took it."""
+    camera = None if body.camera is None else known_camera(body.camera.model_dump())
+    return _out(services, services.photos.set_camera(photo.id, body.focal_px, camera))
 
 
 @router.delete("/{photo}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))

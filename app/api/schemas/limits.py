@@ -10,7 +10,9 @@ from osfcore.control.episode_settings import MAX_STEPS
 from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.objects.fetch import MAX_MASS_KG, MAX_TEXT
+from osfcore.photo.calibration.calibrate import MOST_PHOTOS
 
 Bounds = tuple[float, float]
 
@@ -67,6 +69,9 @@ STROKES = (0, 50)
 STROKE_POINTS = (1, 500)
 TOGETHER = (0, 8)
 POSE_CHOICE = (0, 100)
+BOARD_PHOTOS = (0, MOST_PHOTOS)
+BOARD_PLACE_M = (-TABLE_SIDE_M / 2, TABLE_SIDE_M / 2)
+BOARD_TURN_DEG = (-360, 360)
 
 # Jobs
 PUSH_EPISODES = (1, 100_000)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, FiniteFloat
 
+from app.api.schemas.calibration import CameraIn
 from app.api.schemas.common import Input, SceneOut, Seed
 from app.api.schemas.goals import GoalOut
 from app.api.schemas.jobs import JobOut
@@ -60,9 +61,10 @@ class MarkIn(Input):
 
 
 class PhotoPatch(Input):
-    """Another focal length; null for what board or file tell."""
+    """Another focal length; null for what board or file tell. A calibrated camera counts instead of it."""
 
     focal_px: Focal | None
+    camera: CameraIn | None = Field(None, description="`camera` of a calibration.")
 
 
 class FindIn(Input):

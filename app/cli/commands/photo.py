@@ -1,4 +1,4 @@
-"""`osf photo`: a board to print, and objects and lamp in a photograph."""
+"""`osf photo`: a board to print, a camera calibrated with it, and objects and lamp in a photograph."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from osfcore.photo.calibration.calibrate import Calibration
     from osfcore.photo.photograph import Photograph
     from osfcore.photo.poses.estimate_photo import PhotoModels
     from osfcore.photo.poses.photo_steps import PhotoStep
@@ -45,6 +46,59 @@ class PhotoBoard:
 
 
 @dataclass(frozen=True)
+class PhotoCalibrate:
+    """Calibrate a camera from several photos of the board, and tell the error to expect on the table."""
+
+    photo: tyro.conf.Positional[tuple[Path, ...]]
+    """JPEG, PNG or HEIC: three or more by one camera with one zoom, of the board tilted by 30 to 45 degrees."""
+    out: Path = Path("camera.json")
+    """JSON to write."""
+    table: Path | None = None
+    """Photo of the board lying on the table, by the camera in the place where it stays; tells where it stands."""
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the board's centre lies then: x and y in metres, and by how many degrees it is turned to the left."""
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    def run(self) -> dict[str, Any]:
+        """Calibrate; the result is what the file holds."""
+        from osfcore.io.files import write_json
+        from osfcore.photo.calibration.calibrate import board_place, calibrated_camera
+        from osfcore.photo.calibration.camera_file import calibration_to_json
+        from osfcore.photo.calibration.sighting import sight
+        from osfcore.photo.read_photograph import read_photograph
+
+        if self.out.suffix.lower() != ".json":
+            raise InvalidInput("output file", self.out, "a path that ends in .json")
+        place = board_place(*self.place)
+        views = [sight(read_photograph(path), path.name) for path in self.photo]
+        table = None if self.table is None else sight(read_photograph(self.table), self.table.name)
+        found = calibrated_camera(views, table, place)
+        result = calibration_to_json(found, self.out.stem)
+        write_json(self.out, result)
+        if not self.json:
+            _show_camera(found, self.out)
+        return result
+
+
+def _show_camera(found: Calibration, out: Path) -> None:
+    """The camera for people, and what would make it better."""
+    for name, rms in found.rms_px.items():
+        print(f"{name}: corners {rms:.2f} px from where they should appear.")
+    (f, _, x), (_, _, y), _ = found.lens.intrinsics.tolist()
+    print(f"K: focal length {f:.1f} px (+- {found.focal_std_px:.1f}), centre {x:.1f}, {y:.1f}.")
+    print(f"Distortion: k1 {found.lens.radial:.3f}. Corners scatter by {found.noise_px:.2f} px.")
+    if found.T_world_camera is not None:
+        print(f"It stands at {', '.join(f'{value:.3f}' for value in found.T_world_camera.position)} m.")
+    print(
+        f"Expected error on the table: {1e3 * found.table.mean_m:.1f} mm, at worst {1e3 * found.table.worst_m:.1f} mm."
+    )
+    if found.advice is not None:
+        print(f"One more photo would make it {1e3 * found.advice.mean_m:.1f} mm: {found.advice.words}.")
+    print(f"Wrote {out}.")
+
+
+@dataclass(frozen=True)
 class PhotoEstimate:
     """Find known objects and the lamp in photographs; a box around each object, or a mask, says what to look for."""
 
@@ -68,6 +122,8 @@ class PhotoEstimate:
     """Origin of objects: box's centre, YCB-Video's models, or YCB's meshes; by default what such files usually have."""
     focal: float | None = None
     """Focal length in pixels; by default what the board or the camera tells."""
+    camera: Path | None = None
+    """What 'osf photo calibrate' has written about the camera that took the photos."""
     images: Path | None = None
     """Folder for a picture of each object: photo, outlines of mask and object, the object as found."""
     seed: int = 0
@@ -90,7 +146,7 @@ class PhotoEstimate:
 
         fields = FieldLibrary(self.data_dir)
         choice = PoseChoice(None, self.scene_id, self.pose_source, self.pose_frame)
-        asked = Asked(self.photo, self.boxes, self.masks, self.poses, choice, self.image_id, self.focal)
+        asked = Asked(self.photo, self.boxes, self.masks, self.poses, choice, self.image_id, self.focal, self.camera)
         ready = read_inputs(asked, fields.names())
         models = PhotoModels({name: fields.load(name) for name in ready.names})
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
@@ -144,6 +200,8 @@ def _show(result: dict[str, Any], out: Path) -> None:
 
 
 Photo = Annotated[
-    Annotated[PhotoBoard, tyro.conf.subcommand("board")] | Annotated[PhotoEstimate, tyro.conf.subcommand("estimate")],
+    Annotated[PhotoBoard, tyro.conf.subcommand("board")]
+    | Annotated[PhotoCalibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[PhotoEstimate, tyro.conf.subcommand("estimate")],
     tyro.conf.OmitSubcommandPrefixes,
 ]

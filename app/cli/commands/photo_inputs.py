@@ -11,7 +11,8 @@ import numpy as np
 
 from osfcore.errors import InvalidInput, UnknownName, shown
 from osfcore.geometry.poses import Pose
-from osfcore.photo.located import locate
+from osfcore.photo.calibration.camera_file import KnownCamera, read_camera
+from osfcore.photo.located import locate, locate_calibrated
 from osfcore.photo.other_programs.mask_folder import read_masks
 from osfcore.photo.other_programs.pose_file import PoseChoice, read_poses
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
@@ -35,6 +36,7 @@ class Asked:
         choice: which poses of that file.
         images: numbers of the photos in files of BOP.
         focal: length in pixels of the photos.
+        camera: file of the calibrated camera that took the photos.
     """
 
     photos: tuple[Path, ...]
@@ -44,6 +46,7 @@ class Asked:
     choice: PoseChoice = field(default_factory=PoseChoice)
     images: tuple[int, ...] = ()
     focal: float | None = None
+    camera: Path | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -80,6 +83,9 @@ def read_inputs(asked: Asked, known: Collection[str]) -> Ready:
             raise InvalidInput(f"number of {what}", len(given), f"{len(asked.photos)}, one for each photo")
     if not asked.boxes and not asked.masks:
         raise InvalidInput("number of boxes", 0, "1 or more, or --masks given: an object needs a box or a mask")
+    if asked.camera is not None and asked.focal is not None:
+        raise InvalidInput("--focal", asked.focal, "left out, since --camera tells the focal length")
+    camera = None if asked.camera is None else read_camera(asked.camera)
     raws = [read_photograph(path) for path in asked.photos]
     boxes: list[dict[str, Box]] = [{} for _ in raws]
     for text in asked.boxes:
@@ -94,7 +100,7 @@ def read_inputs(asked: Asked, known: Collection[str]) -> Ready:
     names = tuple(dict.fromkeys(name for its in masks for name in its))
     photos, notes = [], []
     for path, raw, its in zip(asked.photos, raws, masks, strict=True):
-        photo, its_notes = _located(path, raw, its, asked.focal, is_alone=len(raws) == 1)
+        photo, its_notes = _located(path, raw, its, asked.focal, camera, is_alone=len(raws) == 1)
         photos.append(photo)
         notes += its_notes if len(raws) == 1 else [f"{path.name}: {note}" for note in its_notes]
     starts = {name: photos[0].T_world_camera @ pose for name, pose in poses.items() if name in names}
@@ -146,10 +152,16 @@ def _masks(
 
 
 def _located(
-    path: Path, raw: RawPhotograph, masks: Mapping[str, Any], focal: float | None, *, is_alone: bool
+    path: Path,
+    raw: RawPhotograph,
+    masks: Mapping[str, Any],
+    focal: float | None,
+    camera: KnownCamera | None,
+    *,
+    is_alone: bool,
 ) -> tuple[Photograph, list[str]]:
-    """The photograph with its camera, free of distortion: over the board if it shows one."""
-    found = locate(raw, focal)
+    """The photograph with its camera, free of distortion: over the board if it shows one, or as it was calibrated."""
+    found = locate(raw, focal) if camera is None else locate_calibrated(raw, camera)
     if found.T_world_camera is None and not is_alone:
         allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
         raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)

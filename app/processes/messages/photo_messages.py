@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from osfcore.geometry.poses import Pose
+from osfcore.photo.calibration.calibrate import Calibration
+from osfcore.photo.calibration.camera_file import KnownCamera
+from osfcore.photo.calibration.sighting import Sighting
 
 CameraSource = Literal["board", "given", "file", "assumed"]
 Points = tuple[tuple[float, float], ...]
@@ -18,10 +21,12 @@ class ReadPhoto:
     Attributes:
         data: the file as it was sent.
         focal_px: focal length in pixels of the photo as it was sent; None where nobody knows.
+        camera: that took it, if it was calibrated; the focal length does not count then.
     """
 
     data: bytes
     focal_px: float | None = None
+    camera: KnownCamera | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -109,4 +114,33 @@ class MaskFound:
     outline: tuple[Points, ...]
 
 
-PhotoOrder = ReadPhoto | FindMask
+@dataclass(frozen=True, slots=True)
+class SightBoard:
+    """Find the printed board in a photograph. Answered by a Sighting.
+
+    Attributes:
+        data: the file as it was sent.
+        name: of the photograph, for people.
+    """
+
+    data: bytes
+    name: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AssessCamera:
+    """Calibrate a camera. Answered by a Calibration.
+
+    Attributes:
+        views: of the board.
+        table: of the board on the table; None if there is none.
+        T_world_board: where the board lies then.
+    """
+
+    views: tuple[Sighting, ...]
+    table: Sighting | None
+    T_world_board: Pose
+
+
+PhotoOrder = ReadPhoto | FindMask | SightBoard | AssessCamera
+PhotoAnswer = PhotoRead | MaskFound | Sighting | Calibration

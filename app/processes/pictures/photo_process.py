@@ -5,14 +5,29 @@ Decoders have defects, so strangers' files are looked at here only: it may die o
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 from jaxtyping import Bool
 
 from app.processes.child_process import limit_memory
-from app.processes.messages.photo_messages import FindMask, Mark, MaskFound, PhotoOrder, PhotoRead, ReadPhoto
+from app.processes.messages.photo_messages import (
+    AssessCamera,
+    FindMask,
+    Mark,
+    MaskFound,
+    PhotoAnswer,
+    PhotoOrder,
+    PhotoRead,
+    ReadPhoto,
+    SightBoard,
+)
 from app.processes.process_server import ProcessServer
 from osfcore.errors import CorruptFile, OsfError
+
+if TYPE_CHECKING:
+    from osfcore.photo.read_photograph import RawPhotograph
 
 _MEMORY_BYTES = 3 << 29  # sound photos take two thirds of it
 _JPEG_QUALITY = 95
@@ -29,25 +44,35 @@ def photo_main(server: ProcessServer) -> None:
     server.serve(lambda order, _: carry_out(order))
 
 
-def carry_out(order: PhotoOrder) -> PhotoRead | MaskFound:
+def carry_out(order: PhotoOrder) -> PhotoAnswer:
     """Do what an order says.
 
     Raises:
-        PhotoRefused: if the photo cannot be used.
+        PhotoRefused: if the photo cannot be used, or shows no board or one that contradicts others where it should.
         InvalidInput: if the focal length or a mark makes no sense.
     """
-    return _read(order) if isinstance(order, ReadPhoto) else _mask(order)
-
-
-def _read(order: ReadPhoto) -> PhotoRead:
-    from osfcore.photo.located import locate
+    from osfcore.photo.calibration.calibrate import assess
+    from osfcore.photo.calibration.sighting import sight
     from osfcore.photo.read_photograph import read_photograph
 
     try:
-        raw = read_photograph(order.data)
+        match order:
+            case ReadPhoto():
+                return _read(order, read_photograph(order.data))
+            case SightBoard():
+                return sight(read_photograph(order.data), order.name)
+            case AssessCamera():
+                return assess(order.views, order.table, order.T_world_board)
+            case FindMask():
+                return _mask(order)
     except CorruptFile as error:
         raise PhotoRefused(str(error)) from None
-    found = locate(raw, order.focal_px)
+
+
+def _read(order: ReadPhoto, raw: RawPhotograph) -> PhotoRead:
+    from osfcore.photo.located import locate, locate_calibrated
+
+    found = locate(raw, order.focal_px) if order.camera is None else locate_calibrated(raw, order.camera)
     height, width = found.raw.encoded.shape[:2]
     return PhotoRead(
         _encoded(".jpg", found.raw.eight_bit, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]),

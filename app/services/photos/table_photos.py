@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import threading
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +15,8 @@ import numpy as np
 from app.jobs.job import Job
 from app.jobs.kinds.photos import FOUND, inputs_of
 from app.processes.messages.photo_messages import FindMask, Mark, MaskFound, PhotoRead, ReadPhoto
-from app.processes.pictures.photo_process import PhotoRefused, photo_main
-from app.processes.process_client import ProcessClient, ProcessHangs
 from app.services.fields import FieldCatalogue
+from app.services.photos.photo_looker import PhotoLooker
 from app.services.runner import Runner
 from app.storage.database import CannotStore, now_utc
 from app.storage.table_photos import PICTURE, STRAIGHT, MarkedObject, TablePhoto, TablePhotoStore, mask_file
@@ -26,11 +24,11 @@ from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
+from osfcore.photo.calibration.camera_file import KnownCamera
 from osfcore.photo.found_scene import FoundScene
 
 KIND = "photo"
 _NO_FILES: Mapping[str, bytes | None] = MappingProxyType({})
-_PATIENCE_S = 30.0  # sound photos take three, and a busy machine some to start the process
 
 
 class NothingMarked(OsfError):
@@ -60,13 +58,15 @@ class TablePhotos:
         fields: what can be recognised.
         data_dir: of the service.
         max_photos: kept at once.
+
+    Attributes:
+        looker: that looks at photographs.
     """
 
     def __init__(self, runner: Runner, fields: FieldCatalogue, data_dir: Path, max_photos: int) -> None:
         self._runner, self._fields = runner, fields
         self._store = TablePhotoStore(data_dir / "photos", max_photos)
-        self._process = ProcessClient(photo_main, (), "reader of photos", answer_s=_PATIENCE_S)
-        self._one_at_a_time = threading.Lock()  # so that none waits for another's time
+        self.looker = PhotoLooker()
 
     def start(self) -> None:
         """Remove what an earlier service left half done."""
@@ -74,7 +74,7 @@ class TablePhotos:
 
     def stop(self) -> None:
         """End the process that looks at photos, if there is one. Calling it again does nothing."""
-        self._process.stop()
+        self.looker.stop()
 
     # Photographs
 
@@ -120,14 +120,14 @@ class TablePhotos:
         self._store.keep(photo, data, read.jpeg, read.straight)
         return self._told(photo)
 
-    def set_focal(self, photo: str, focal_px: float | None) -> TablePhoto:
-        """Look at a photograph with another focal length, in pixels of the photo as it was sent.
+    def set_camera(self, photo: str, focal_px: float | None, camera: KnownCamera | None = None) -> TablePhoto:
+        """Look at a photograph with another focal length, in pixels of the photo as it was sent, or calibrated camera.
 
         Raises:
             UnknownName: if there is none.
-            InvalidInput: if the focal length makes no sense.
+            InvalidInput: if the focal length makes no sense, or the camera took photographs of another shape.
         """
-        read = self._read(self.read(self._store.sent(photo), photo), focal_px)
+        read = self._read(self.read(self._store.sent(photo), photo), focal_px, camera)
         facts = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
         files = {PICTURE: read.jpeg, STRAIGHT: read.straight}
         return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
@@ -160,7 +160,7 @@ class TablePhotos:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
         others = tuple(point for each in before.objects if each.name != name for point in each.mark.on)
         told = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
-        found = self._ask(FindMask(self.read(self.picture(photo), photo), told))
+        found = self.looker.ask(FindMask(self.read(self.picture(photo), photo), told))
         assert isinstance(found, MaskFound)
         entry = MarkedObject(name, mark, found.outline)
         return self._outdated(photo, lambda latest: latest.with_object(entry), {mask_file(name): found.png})
@@ -314,18 +314,10 @@ class TablePhotos:
         except OSError as error:
             raise CannotStore(folder, error.strerror or str(error)) from error
 
-    def _read(self, data: bytes, focal_px: float | None) -> PhotoRead:
-        read = self._ask(ReadPhoto(data, focal_px))
+    def _read(self, data: bytes, focal_px: float | None, camera: KnownCamera | None = None) -> PhotoRead:
+        read = self.looker.ask(ReadPhoto(data, focal_px, camera))
         assert isinstance(read, PhotoRead)
         return read
-
-    def _ask(self, order: ReadPhoto | FindMask) -> PhotoRead | MaskFound:
-        try:
-            with self._one_at_a_time:
-                return self._process.call(order)
-        except ProcessHangs:
-            late = f"The photo could not be looked at within {_PATIENCE_S:g} s; save it anew as a plain JPEG."
-            raise PhotoRefused(late) from None
 
 
 def _is_same(one: TablePhoto, other: TablePhoto) -> bool:
