@@ -122,7 +122,8 @@ class Calibrator:
         light, ambient = best[0]
         direct = self._direct_parts(views, params, light[None], pixels)[0]
         objects, table = pixels.gains(direct, ambient)
-        return Calibration(ImageModel(objects, ambient, table / objects), light, float(cost))
+        model = ImageModel(objects, ambient, table / objects, surroundings=pixels.surroundings)
+        return Calibration(model, light, float(cost))
 
     def _pixels(self, views: ObservedViews, params: SceneParameters) -> _Pixels:
         """The pixels that count, with what is seen there and its ambient part."""
@@ -141,9 +142,11 @@ class Calibrator:
         if views.masks is not None:
             objects &= masks > _OPAQUE
         has_no_pusher = np.abs(ambient - bare).max(axis=-1) < 1e-3
-        table = (opacity < _CLEAR) & (masks < _CLEAR) & has_no_pusher & (lit.max(axis=-1) > 0) & exposed
-        counted = objects | table
-        return _Pixels(counted, objects[counted], views.images[counted], ambient[counted])
+        others = (opacity < _CLEAR) & (masks < _CLEAR) & has_no_pusher
+        is_table = lit.max(axis=-1) > 0
+        counted, beyond = objects | (others & is_table & exposed), others & ~is_table
+        surroundings = np.median(views.images[beyond], axis=0).astype(float) if beyond.any() else None
+        return _Pixels(counted, objects[counted], views.images[counted], ambient[counted], surroundings)
 
     def _direct_parts(
         self, views: ObservedViews, params: SceneParameters, lights: np.ndarray, pixels: _Pixels
@@ -162,12 +165,14 @@ class _Pixels:
         of_objects: those that show objects; the others show the table.
         seen: their radiance.
         ambient: E.
+        surroundings: median radiance beyond the table; None where nothing else is seen.
     """
 
     counted: Bool[np.ndarray, "V h w"]
     of_objects: Bool[np.ndarray, "P"]
     seen: Float32[np.ndarray, "P 3"]
     ambient: Float32[np.ndarray, "P 3"]
+    surroundings: Float[np.ndarray, "3"] | None
 
     def costs(self, direct: Float32[np.ndarray, "L P 3"], ambients: Float[np.ndarray, "R"]) -> np.ndarray:
         """Mean truncated errors, L x R."""

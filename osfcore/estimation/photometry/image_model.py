@@ -32,12 +32,15 @@ class ImageModel:
         ambient: r, factor on the ambient light against the direct one.
         table: T, factors on the table's albedo, per colour.
         encoding: of the values that pictures hold.
+        surroundings: linear radiance of what lies beyond the table, in the pictures; None where it is as in fields.
+            Nobody knows what lights it, so that it tells nothing of the others.
     """
 
     gain: Float[np.ndarray, "3"]
     ambient: float
     table: Float[np.ndarray, "3"]
     encoding: Encoding = "linear"
+    surroundings: Float[np.ndarray, "3"] | None = None
 
     @property
     def scale(self) -> float:

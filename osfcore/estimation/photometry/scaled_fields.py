@@ -25,10 +25,15 @@ def adapted(models: ObjectModels, names: Iterable[str], model: ImageModel) -> Ob
         model: of the pictures.
     """
     return models.changed(
-        names,
-        lambda field: scaled_field(field, model.scale, model.ambient),
-        lambda table: scaled_table(table, model.scale * model.table, model.ambient),
+        names, lambda field: scaled_field(field, model.scale, model.ambient), lambda table: _adapted_table(table, model)
     )
+
+
+def _adapted_table(table: TableField, model: ImageModel) -> TableField:
+    scaled = scaled_table(table, model.scale * model.table, model.ambient)
+    if model.surroundings is None:
+        return scaled
+    return replace(scaled, background=(model.surroundings * model.scale / model.gain).astype(np.float32))
 
 
 def scaled_field(field: KiloOSF, albedo: float, ambient: float) -> KiloOSF:

@@ -84,6 +84,17 @@ def test_poses_and_light_of_an_srgb_picture_of_another_table_at_another_exposure
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("wall", [0.05, 0.25, 0.6])
+def test_half_of_the_light_is_no_srgb_whatever_lies_beyond_the_table(models, truth, wall):
+    dim = ImageModel(np.full(3, 0.5), 1.0, np.ones(3), surroundings=np.full(3, wall))
+    shown = observe(adapted(models, NAMES, dim), truth, default_cameras(96)[1:])
+    last = steps_of(estimate_first, models, replace(shown, images=shown.images * 0.5))[-1]
+    assert last.image_model.encoding == "linear"
+    np.testing.assert_allclose(last.image_model.gain, 0.5, rtol=0.1)
+    assert np.rad2deg(apart(last.estimate.state, truth)[2]) < 2
+
+
+@pytest.mark.slow
 def test_black_pictures_are_not_trusted(models, truth):
     seen = observe(models, truth, default_cameras(48)[2:])
     last = steps_of(estimate_first, models, replace(seen, images=np.zeros_like(seen.images)))[-1]

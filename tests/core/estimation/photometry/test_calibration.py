@@ -52,6 +52,20 @@ def test_refining_with_the_light_held_leaves_it_and_comes_nearer(models, truth, 
     assert found.unexplained < 0.1
 
 
+def test_what_lies_beyond_the_table_is_measured_and_tells_nothing_else(models, truth, pictures):
+    """No lamp lights it: a wall that stays as bright in half the light says nothing of the exposure."""
+    wall = np.array([0.1, 0.3, 0.2])
+    beside_a_wall = taken(models, truth, replace(MODEL, surroundings=wall))
+    calibrator = Calibrator(models, NAMES)
+    plain, walled = (
+        calibrator.refine(views_of(seen, 64), params_of(truth), MODEL.ambient, hold_light=True)
+        for seen in (pictures, beside_a_wall)
+    )
+    np.testing.assert_allclose(walled.model.surroundings, wall, rtol=1e-4)
+    np.testing.assert_allclose(walled.model.gain, plain.model.gain, rtol=1e-3)
+    assert walled.model.ambient == plain.model.ambient
+
+
 def test_a_wrong_pose_leaves_more_unexplained(models, truth, pictures):
     calibrator, views = Calibrator(models, NAMES), views_of(pictures, 64)
     right = params_of(truth)
