@@ -67,7 +67,7 @@ def test_a_camera_is_calibrated_photo_by_photo_and_takes_a_photo_of_the_table(se
     other = {**camera, "width": SIZE[1], "height": SIZE[0]}
     refuses(service.patch(path, json={"focal_px": None, "camera": other}), 422, "size of the photo")
     skewed = {**camera, "K": [[1, 2], [3]]}
-    refuses(service.patch(path, json={"focal_px": None, "camera": skewed}), 422, "K of camera")
+    refuses(service.patch(path, json={"focal_px": None, "camera": skewed}), 422, "3 x 3 finite numbers")
     service.delete(path)
 
 
