@@ -114,3 +114,14 @@ def tell_truth(monkeypatch, table, wanted):
     monkeypatch.setattr(closed_loop, "estimate_goal_image", lambda *_: steps(replace(wanted, pusher=None)))
     monkeypatch.setattr(closed_loop, "prefer_current_poses", lambda _models, _goal, found, _now: found)
     monkeypatch.setattr(closed_loop, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
+
+
+def noted(app, told):
+    """An app, of which every path that is asked for is noted."""
+
+    async def noting(scope, receive, send):
+        if scope["type"] == "http":
+            told.append(scope["path"])
+        await app(scope, receive, send)
+
+    return noting
