@@ -3,7 +3,7 @@ import { asked as askedOfAddress } from "./address.js";
 import { get, post, upload } from "./api.js";
 import { byId, el } from "./dom.js";
 import { isDriving } from "./driver.js";
-import { takeGoal } from "./goals.js";
+import { refreshGoals } from "./goals.js";
 import { inWords, known, labelOf, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
@@ -14,6 +14,7 @@ const PRESENCE_MS = 1000; // the service stops the robot after three of them wit
 const AGAIN_MS = 500;
 const ABSENT_MS = 5000;
 const NAME_MAX = 100;
+let wanted = null; // the goal that was sent last
 let isHeard = false; // whether the event stream is there
 let allowed = null; // the episode that this page has let move
 let isStopping = false;
@@ -136,7 +137,7 @@ function drawChoices() {
   byId("robot-names").replaceChildren(...names.map((name) =>
     el("label", {}, el("input", { type: "checkbox", value: name, checked: chosen.includes(name) }), labelOf(name))));
   const goal = byId("robot-goal");
-  const before = known("goal")?.id ?? goal.value;
+  const before = wanted ?? goal.value;
   goal.replaceChildren(...fitting().map(({ id, name, camera }) => el("option", { value: id, textContent: `${name}, camera ${camera.name}`, selected: id === before })));
   const camera = byId("robot-camera");
   const cameras = robot().cameras.map(({ name }) => name);
@@ -149,7 +150,11 @@ async function uploadGoal() {
   if (!file) return;
   const camera = robot().cameras.find(({ name }) => name === byId("robot-camera").value);
   const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX), camera: JSON.stringify(camera) });
-  await tellFailure(async () => takeGoal(await upload(`goals?${query}`, file, () => {}, "application/octet-stream")), byId("robot-file"));
+  await tellFailure(async () => {
+    wanted = (await upload(`goals?${query}`, file, () => {}, "application/octet-stream")).id;
+    await refreshGoals();
+    wanted = null; // from now on it is the choice of whoever sits here
+  }, byId("robot-file"));
   byId("robot-file").value = "";
 }
 
@@ -162,6 +167,7 @@ const start = () => act(byId("robot-start"), async () =>
 function drawWorld() {
   const isRobot = Boolean(robot()?.host) && (isBusy() || !byId("panel-robot").hidden);
   byId("world").hidden = !robot()?.host;
+  byId("robot-elsewhere").hidden = !isRobot;
   byId("world").textContent = isRobot ? `Robot at ${robot().host}: ${WORDS[robot().state]}` : "Simulated table";
   byId("world").dataset.state = { driving: "danger", lost: "lost", stopped: "lost" }[isRobot && robot().state] ?? "live";
 }
