@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def start_service(data_dir: Path, port: int, log: Path | None = None) -> subprocess.Popen[bytes]:
-    """Start the service and wait until page and stage are ready."""
-    command = [sys.executable, "-m", "app.cli", "serve", "--port", str(port), "--data-dir", str(data_dir)]
+def start_service(
+    data_dir: Path, port: int, log: Path | None = None, more: Sequence[str] = ()
+) -> subprocess.Popen[bytes]:
+    """Start the service, with more options if there are any, and wait until page and stage are ready."""
+    command = [sys.executable, "-m", "app.cli", "serve", "--port", str(port), "--data-dir", str(data_dir), *more]
     with (log or data_dir / "service.log").open("ab") as output:
         process = subprocess.Popen(command, stdout=output, stderr=output)
     deadline = time.monotonic() + START_S

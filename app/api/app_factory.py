@@ -36,6 +36,7 @@ from app.api.routes import (
     objects,
     photos,
     predictions,
+    robot,
     scenes,
     status,
     storage,
@@ -61,6 +62,7 @@ from app.services.photos.board_photos import BoardPhotos
 from app.services.photos.photo_tables import PhotoTables
 from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
+from app.services.robots.robot_table import RobotTable
 from app.services.runner import DemoScene, Runner
 from app.services.service_settings import Settings
 from app.services.visitors.driver import GRACE_S, Driver
@@ -80,7 +82,7 @@ _DESCRIPTION = (
 
 _ROUTES = (
     status, objects, fields, scenes, presets, goals, photos, calibration, episodes, neural, estimates, predictions,
-    jobs, driver, views, stories, storage, events,
+    jobs, robot, driver, views, stories, storage, events,
 )  # fmt: skip
 _UPLOAD_PATHS = (objects.UPLOAD_PATH, fields.UPLOAD_PATH, estimates.UPLOAD_PATH)
 _STREAM = "text/event-stream"
@@ -114,7 +116,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.install(app)
     for module in _ROUTES:
-        watching = module in (driver, views)  # what concerns one page alone
+        watching = module in (driver, views, robot)  # what concerns one page alone, and a stop, which anybody may call
         app.include_router(module.router, dependencies=[] if watching else [Depends(only_the_driver)])
     app.include_router(relay.router)
     _add_docs(app)
@@ -157,11 +159,14 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(viewer.start)
         thumbnails = Thumbnails(runner.library, settings.data_dir / "thumbnails")
         stack.push_async_callback(run_in_threadpool, thumbnails.stop)
+        robot_table = RobotTable(settings, runner, fields, goal_service)
+        stack.push_async_callback(run_in_threadpool, robot_table.close)
+        await run_in_threadpool(robot_table.start)
         services = Services(
             settings, store, runner, viewer, objects, fields, neural, estimate_service, prediction_service,
             goal_service, checks, table_photos, photo_tables, BoardPhotos(table_photos.looker.ask),
             Episodes(runner, fields, goal_service, checks), Driver(runner.hub.publish, GRACE_S), OwnObjects(runner),
-            thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()),
+            thumbnails, Outliner(runner.library), Disturber(runner, np.random.default_rng()), robot_table,
         )  # fmt: skip
         app.state.services = services
         app.state.metrics.watch(runner)

@@ -27,6 +27,7 @@ from app.services.photos.board_photos import BoardPhotos
 from app.services.photos.photo_tables import PhotoTables
 from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
+from app.services.robots.robot_table import RobotTable
 from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.services.visitors.driver import Driver
@@ -105,6 +106,7 @@ class Services:
     thumbnails: Thumbnails
     outliner: Outliner
     disturber: Disturber
+    robot: RobotTable
     event_texts: EventTexts = field(default_factory=EventTexts)
     lanes: Lanes = field(default_factory=Lanes)
     closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set

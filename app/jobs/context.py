@@ -15,6 +15,8 @@ from app.processes.messages.scene_messages import Act, ObserveScene, TakeView
 from app.processes.process_server import Answer
 from osfcore.objects.asset_library import AssetLibrary
 
+_LOOKS_EVERY_S = 0.05
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JobContext:
@@ -51,6 +53,7 @@ class JobControl:
         self._rests_after_round = threading.Event()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._changes: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._at_cancel: list[Callable[[], None]] = []
 
     @property
     def is_paused(self) -> bool:
@@ -77,6 +80,19 @@ class JobControl:
             while True:
                 changes.append(self._changes.get_nowait())
         return changes
+
+    def next_change(self) -> dict[str, Any] | None:
+        """Wait for parameters that are sent; None if the job is cancelled first."""
+        while not self._is_cancelled.is_set():
+            with contextlib.suppress(queue.Empty):
+                return self._changes.get(timeout=_LOOKS_EVERY_S)
+        return None
+
+    def on_cancel(self, call: Callable[[], None]) -> None:
+        """Have something called as soon as the job is cancelled, in whatever long step it is."""
+        self._at_cancel.append(call)
+        if self._is_cancelled.is_set():
+            call()
 
     def ask(self, command: Act | ObserveScene | TakeView) -> Any:  # noqa: ANN401  each command says what answers it
         """Have something done with the scene that this job drives, and wait for the answer.
@@ -106,5 +122,7 @@ class JobControl:
             case CancelJob():
                 self._is_cancelled.set()
                 self._may_run.set()
+                for call in self._at_cancel:
+                    call()
             case Answer():
                 self._answers.put(order)

@@ -21,6 +21,7 @@ Kind = Literal[
     "episode",
     "clip",
     "photo",
+    "robot",
 ]
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files
@@ -28,6 +29,7 @@ WORDS: Mapping[str, str] = {  # for people
     "collect_pushes": "data collection", "collect_object": "data collection", "collect_table": "data collection",
     "fetch_assets": "download of objects", "add_object": "new object", "train_field": "training",
     "estimate": "estimate", "episode": "episode", "clip": "clip", "photo": "look at a photo",
+    "robot": "episode with the robot",
 }  # fmt: skip
 FINISHED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
 

@@ -14,7 +14,7 @@ from osfcore.errors import OsfError
 
 RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."
 INTERRUPTED_NOTE = "The service stopped in the middle; the steps until then are kept."
-_KEEPING = ("episode",)  # kinds whose finished steps are worth keeping, however the job ends
+_KEEPING = ("episode", "robot")  # kinds whose finished steps are worth keeping, however the job ends
 Outcome = dict[str, Any] | JobCancelled | OsfError  # a result, or why there is none
 
 

@@ -85,6 +85,12 @@ def _photo(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
     yield from photo_job(params, place)
 
 
+def _robot(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
+    from app.jobs.kinds.robots import robot_job
+
+    yield from robot_job(params, place)
+
+
 KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "collect_pushes": _collect_pushes,
     "collect_object": _collect_object,
@@ -96,8 +102,9 @@ KINDS: dict[str, Callable[[dict[str, Any], JobContext], Iterator[Any]]] = {
     "episode": _episode,
     "clip": _clip,
     "photo": _photo,
+    "robot": _robot,
 }
-_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate", "clip", "photo")
+_WITHOUT_PHYSICS = ("fetch_assets", "add_object", "train_field", "estimate", "clip", "photo", "robot")
 _NOT_EXTRA = ("done", "total", "note", "view")
 
 

@@ -28,6 +28,13 @@ class Settings(BaseSettings):
         default=(), description="Origins, such as https://lab.example, that may use the service besides its own."
     )
     token: SecretStr | None = Field(default=None, min_length=8, description="That every request must bring, if set.")
+    robot: str | None = Field(
+        default=None, description="Address of a robot that may be driven, as 'osf robot' takes it."
+    )
+    robot_box: tuple[float, float, float, float] | None = Field(
+        default=None, description="x0, y0, x1, y1 [m] that its pusher's centre stays in, as JSON."
+    )
+    robot_top_speed_m_s: float = Field(default=0.1, description="Of its pusher.")
     demo_scene: bool = Field(default=True, description="Whether a scene is made when there is none.")
     max_body_bytes: int = Field(default=4 << 20, ge=1024)  # a thousand sequences of thirty actions in full precision
     max_upload_bytes: int = Field(default=1 << 30, ge=1024, description="Of a zipped image set or observation.")

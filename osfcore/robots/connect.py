@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.extras import need
@@ -29,13 +29,8 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
         ConnectionLost: if nobody answers.
         RobotRefused: if what answers is no robot.
     """
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        raise InvalidInput("address of the robot", url, FORMS) from None
-    if not host or parts.scheme not in ("http", "https", "ros"):
-        raise InvalidInput("address of the robot", url, FORMS)
+    parts = check_address(url)
+    host, port = parts.hostname or "", parts.port
     if parts.scheme != "ros":
         return HttpRobot(url, names)
     need("ros", "A robot under ROS")
@@ -48,3 +43,19 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
     cameras = tuple(filter(None, asked.pop("cameras", "").split(",")))
     address = f"ws://{f'[{host}]' if ':' in host else host}:{port or _ROS_PORT}"
     return RosRobot(address, RosNames(cameras, **asked), names, limits or SafetyLimits())
+
+
+def check_address(url: str) -> SplitResult:
+    """The parts of a robot's address.
+
+    Raises:
+        InvalidInput: if it is no such address.
+    """
+    try:
+        parts = urlsplit(url)
+        host, _ = parts.hostname, parts.port
+    except ValueError:
+        raise InvalidInput("address of the robot", url, FORMS) from None
+    if not host or parts.scheme not in ("http", "https", "ros"):
+        raise InvalidInput("address of the robot", url, FORMS)
+    return parts

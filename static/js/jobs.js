@@ -9,7 +9,7 @@ import { act, tellFailure } from "./toasts.js";
 const KINDS = {
   collect_pushes: "Pushes", collect_object: "Object images", collect_table: "Table images", fetch_assets: "Fetch objects",
   add_object: "New object",
-  train_field: "Field", estimate: "Estimate", episode: "Episode", clip: "Clip", photo: "Photo",
+  train_field: "Field", estimate: "Estimate", episode: "Episode", clip: "Clip", photo: "Photo", robot: "Robot",
 };
 export const LIVE = new Set(["queued", "running", "paused"]);
 const number = (name, label, value, min, max) => ({ name, label, value, min, max, type: "number" });
@@ -96,6 +96,7 @@ function orderText({ kind, params: p }) {
   if (kind === "clip" || kind === "photo") return `of ${p.title}`;
   if (kind === "estimate") return `${p.mode} frame of ${p.of.file_name ?? "a scene"}, ${p.names.length} objects, seed ${p.seed}`;
   if (kind === "episode") return `${p.names.map(labelOf).join(", ")}; ${p.settings.cost} cost, at most ${p.settings.steps} steps`;
+  if (kind === "robot") return `${p.names.map(labelOf).join(", ")}; at most ${p.settings.steps} steps`;
   return `${p.images} images of ${p.size} px, seed ${p.seed}`;
 }
 

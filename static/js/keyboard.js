@@ -5,6 +5,7 @@ import { byId } from "./dom.js";
 import { cancelEpisode, resetTable, startEpisode, stepOnce, togglePause } from "./episode.js";
 import { randomGoal } from "./goals.js";
 import { pushKey } from "./push.js";
+import { stopKey } from "./robot.js";
 import { anotherScene } from "./scenes.js";
 import { isLiveShown } from "./viewer.js";
 
@@ -54,6 +55,7 @@ function down(event) {
 /** The frame of the 3D view has events of its own, and is loaded again now and then. */
 function listenInView() {
   const view = byId("viewer");
+  view.addEventListener("load", () => view.contentWindow.addEventListener("keydown", stopKey, true));
   view.addEventListener("load", () => view.contentWindow.addEventListener("keydown", (event) => {
     const isOwn = OF_VIEW.includes(event.key) || (event.key === " " && isPressed(event.target));
     if (isPlain(event) && !isTyping(event.target) && !isOwn) take(event);

@@ -34,6 +34,7 @@ import { refreshPhotos, setUpPhoto } from "./photo.js";
 import { setUpPresets } from "./presets.js";
 import { setUpPush } from "./push.js";
 import { setUpResults } from "./results.js";
+import { hearRobot, hearStream, setUpRobot } from "./robot.js";
 import { refreshScenes, setUpScenes } from "./scenes.js";
 import { expectOlder, set } from "./state.js";
 import { setUpStory } from "./story.js";
@@ -115,6 +116,7 @@ setUpEpisodeSettings();
 setUpEpisode();
 setUpEpisodes();
 setUpWelcome();
+setUpRobot();
 setUpStory();
 setUpKeyboard();
 refreshObjects();
@@ -127,6 +129,7 @@ listen(VISITOR, {
     settleUnreachable();
     followHealth(again);
     refreshJobs();
+    hearStream(true);
     if (again) {
       expectOlder();
       set("draft", null); // told again if there still is one
@@ -140,10 +143,16 @@ listen(VISITOR, {
       refreshShown();
     }
   },
-  lost: () => status("Reconnecting", "lost"),
+  lost() {
+    status("Reconnecting", "lost");
+    hearStream(false);
+  },
   scene: (scene) => set("scene", scene),
   frame: showFrames,
-  job: (job) => showJob(job),
+  job(job) {
+    showJob(job);
+    hearRobot(job);
+  },
   look: showLook,
   forgotten({ job }) {
     dropJob(job);

@@ -2,7 +2,7 @@
 import { asked, note, onTravel } from "./address.js";
 import { byId } from "./dom.js";
 
-const tabs = () => [...document.querySelectorAll('[role="tab"]')];
+const tabs = () => [...document.querySelectorAll('[role="tab"]:not([hidden])')];
 
 export function showTab(name) {
   note({ tab: name });

@@ -42,6 +42,12 @@ class Serve:
     """Port of page, REST and viewer alike; 0 takes a free one."""
     data_dir: Path = field(default_factory=default_data_dir)
     """Objects, database, collections and logs."""
+    robot: str | None = None
+    """Address of a robot that the page may drive, as for 'osf robot'; its motion is allowed on the page, each time."""
+    box: tuple[float, float, float, float] | None = None
+    """x0 y0 x1 y1 [m] that the robot's pusher stays in, besides its own; 0.35 m to each side without it."""
+    top_speed: float | None = None
+    """Of the robot's pusher [m/s]; 0.1 without it."""
     json: bool = False
     """Print a JSON object as the last line when the service has stopped."""
 
@@ -97,18 +103,28 @@ def _settings(serve: Serve) -> tuple[Settings, str]:
     """
     from pydantic import SecretStr, ValidationError
 
+    from app.services.robots.robot_table import host_of, limits_of
     from app.services.service_settings import Settings
 
     try:
-        settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir)
+        settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir, **_robot(serve))
     except ValidationError as error:
         first = error.errors()[0]
         name = "OSF_" + "_".join(str(part) for part in first["loc"]).upper()
         raise InvalidInput(name, repr(first["input"])[:60], f"valid ({first['msg']})") from None
+    limits_of(settings)
+    if settings.robot is not None:
+        host_of(settings.robot)
     if settings.token is None and not is_loopback(serve.host):
         token = secrets.token_urlsafe(24)
         return settings.model_copy(update={"token": SecretStr(token)}), f"/?token={token}"
     return settings, ""
+
+
+def _robot(serve: Serve) -> dict[str, Any]:
+    """What was said of a robot; the environment tells what was not."""
+    told = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
+    return {name: value for name, value in told.items() if value is not None}
 
 
 def is_loopback(host: str) -> bool:

@@ -192,5 +192,6 @@ def test_every_kind_that_rest_tells_of_exists():
         "estimate",
         "episode",
         "photo",
+        "robot",
     }
     assert JobContext(Path("d"), Path("f")).library.root == Path("d/objects")

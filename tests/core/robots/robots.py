@@ -4,16 +4,22 @@ import contextlib
 import importlib.util
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import uvicorn
 
+from osfcore.control import closed_loop, estimators
+from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S
+from osfcore.progress import Progress
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
+from tests.core.control.scenes import sure
 from tests.live import free_port
 
 SERVER = Path(__file__).parents[3] / "examples" / "robot_server.py"
@@ -87,3 +93,35 @@ def serving(app):
     finally:
         server.should_exit = True
         thread.join()
+
+
+def toward_middle(state):
+    """A state with the box 6 cm nearer to the middle."""
+    place = state.pose(NAMES[1]).position
+    way = np.array([*(-0.06 * place[:2] / np.linalg.norm(place[:2])), 0.0])
+    shifts = np.stack([way if name == NAMES[1] else np.zeros(3) for name in state.names])
+    return replace(state, poses=Pose(state.poses.position + shifts, state.poses.quaternion))
+
+
+def tell_truth(monkeypatch, table, wanted):
+    """Let estimators know where everything is, and where it should be: looks then take no time."""
+
+    def steps(state, image_model=None):
+        yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
+
+    monkeypatch.setattr(estimators, "estimate_first", lambda *_: steps(table.truth()))
+    monkeypatch.setattr(estimators, "estimate_next", lambda *_, usual: steps(table.truth()))
+    monkeypatch.setattr(closed_loop, "estimate_goal_image", lambda *_: steps(replace(wanted, pusher=None)))
+    monkeypatch.setattr(closed_loop, "prefer_current_poses", lambda _models, _goal, found, _now: found)
+    monkeypatch.setattr(closed_loop, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
+
+
+def noted(app, told):
+    """An app, of which every path that is asked for is noted."""
+
+    async def noting(scope, receive, send):
+        if scope["type"] == "http":
+            told.append(scope["path"])
+        await app(scope, receive, send)
+
+    return noting

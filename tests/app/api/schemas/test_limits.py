@@ -27,6 +27,7 @@ NUMBERS = {
     "episodes": ["CollectPushesParams.episodes"],
     "steps": ["CollectPushesParams.steps"],
     "objects": ["CollectPushesParams.objects"],
+    "robot-steps": ["RobotSettingsIn.steps"],
     "size": ["CollectObjectParams.size", "CollectTableParams.size"],
 }  # fmt: skip
 QUERIES = {"grams": ("/api/objects", "mass_kg", 1000), "label": ("/api/objects", "label", 1)}

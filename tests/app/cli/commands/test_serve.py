@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from app.cli.commands.serve import CannotListen, Serve, bound_socket
+from app.cli.main import main
 from app.storage.database import FILE
 from osfcore.errors import InvalidInput
 from tests.app.conftest import until
@@ -185,3 +186,16 @@ def test_a_port_in_use_is_told():
 def test_addresses_that_are_none_are_told(host, port):
     with pytest.raises(CannotListen):
         bound_socket(host, port)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--robot", "ftp://arm"], "address of the robot is ftp://arm"),
+        (["--robot", "http://arm:8080", "--box", "1", "0", "-1", "0"], "safety box"),
+        (["--robot", "http://arm:8080", "--top-speed", "0"], "top speed"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_told_at_once(tmp_path, capsys, options, words):
+    assert main(["serve", "--port", "0", "--data-dir", str(tmp_path), *options]) == 1
+    assert words in capsys.readouterr().err

@@ -10,15 +10,11 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from osfcore.control import closed_loop, estimators
-from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.poses import Pose
+from osfcore.control import estimators
 from osfcore.io.image_file import write_png
-from osfcore.progress import Progress
 from osfcore.robots.connect import connect
 from osfcore.robots.robot import RobotRefused
-from tests.core.control.scenes import sure
-from tests.core.robots.robots import NAMES, example, serving, simulated, until
+from tests.core.robots.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
 from tests.core.robots.ros_stand_in import StandIn
 from tests.live import free_port
 
@@ -40,24 +36,9 @@ def robot(server, tmp_path, monkeypatch):
     wanted = toward_middle(start)
     write_png(tmp_path / "0.png", np.zeros((64, 64, 3), np.uint8))
 
-    def steps(state, image_model=None):
-        yield EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
-
-    monkeypatch.setattr(estimators, "estimate_first", lambda *_: steps(table.truth()))
-    monkeypatch.setattr(estimators, "estimate_next", lambda *_, usual: steps(table.truth()))
-    monkeypatch.setattr(closed_loop, "estimate_goal_image", lambda *_: steps(replace(wanted, pusher=None)))
-    monkeypatch.setattr(closed_loop, "prefer_current_poses", lambda _models, _goal, found, _now: found)
-    monkeypatch.setattr(closed_loop, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
+    tell_truth(monkeypatch, table, wanted)
     yield url, table
     table.restore(start)
-
-
-def toward_middle(state):
-    """A state with the box 6 cm nearer to the middle."""
-    place = state.pose(NAMES[1]).position
-    way = np.array([*(-0.06 * place[:2] / np.linalg.norm(place[:2])), 0.0])
-    shifts = np.stack([way if name == NAMES[1] else np.zeros(3) for name in state.names])
-    return replace(state, poses=Pose(state.poses.position + shifts, state.poses.quaternion))
 
 
 def drive(url, place, *more):

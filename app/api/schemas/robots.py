@@ -1,0 +1,88 @@
+"""Requests and responses that concern a robot."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, Field, FiniteFloat
+
+from app.api.schemas.common import Input, ObjectName, Seed
+from app.api.schemas.jobs import JobOut
+from app.api.schemas.limits import HORIZON, NAME, OBJECTS, PIXEL, SAMPLES, STEPS, sized, within
+from app.services.robots.robot_table import AskedDrive, RobotNow, State
+from osfcore.io.scene_file import CameraJson, camera_to_json
+
+Pixel = Annotated[FiniteFloat, Field(**within(PIXEL))]
+Box = Annotated[list[Pixel], Field(min_length=4, max_length=4, description="Left, top, right, bottom [px].")]
+Name = Annotated[str, Field(**sized(NAME))]
+
+
+class RobotSettingsIn(Input):
+    """What shall be other than by default."""
+
+    steps: int | None = Field(None, **within(STEPS), description="Actions at most, of 0.2 s each.")
+    samples: int | None = Field(None, **within(SAMPLES), description="Sequences of actions in each round of a plan.")
+    horizon: int | None = Field(None, **within(HORIZON), description="Actions in each.")
+    despite_doubts: bool | None = Field(None, description="Go on with a goal image that is not explained well.")
+
+
+class RobotEpisodeIn(Input):
+    """An episode with the robot."""
+
+    goal: str = Field(**sized(NAME), description="Identifier of a goal image that one of the robot's cameras took.")
+    names: list[ObjectName] = Field(**sized(OBJECTS), description="Objects on the robot's table.")
+    boxes: dict[Name, dict[Name, Box]] = Field(
+        default={}, max_length=16, description="By camera and object, as the table lies, if it delivers no masks."
+    )
+    seed: Seed = 0
+    settings: RobotSettingsIn = RobotSettingsIn()  # pyright: ignore[reportCallIssue]
+
+    def asked(self) -> AskedDrive:
+        """What the service's own modules take."""
+        boxes = {
+            camera: {name: (box[0], box[1], box[2], box[3]) for name, box in of.items()}
+            for camera, of in self.boxes.items()
+        }
+        return AskedDrive(self.goal, tuple(self.names), boxes, self.seed, self.settings.model_dump(exclude_none=True))
+
+
+class ConfirmationIn(Input):
+    """Permission to move."""
+
+    episode: str = Field(**sized(NAME), description="Identifier of the episode that asks.")
+
+
+class RobotLimitsOut(BaseModel):
+    """What holds for the robot's pusher, whatever is planned."""
+
+    box: list[float] = Field(description="x0, y0, x1, y1 of the pusher's centre [m].")
+    top_speed_m_s: float
+
+
+class RobotOut(BaseModel):
+    """The robot as it is now."""
+
+    host: str | None = Field(description="Where it is; null if the service has none.")
+    state: State = Field(
+        description='"looking" before anything may move, "asked" while it waits for permission, "driving", '
+        '"stopped", "lost" if it does not answer, else "idle".'
+    )
+    text: str = Field(description="What it does, or what happened, for a person.")
+    limits: RobotLimitsOut | None
+    cameras: list[CameraJson]
+    deadman_s: float | None = Field(description="Without a new command it halts after this time [s].")
+    episode: JobOut | None = Field(description="The job that drives it now, or did last.")
+
+    @staticmethod
+    def of(now: RobotNow) -> RobotOut:
+        """From the service's own."""
+        about, limits = now.description, now.limits
+        return RobotOut(
+            host=now.host,
+            state=now.state,
+            text=now.text,
+            limits=None if limits is None else RobotLimitsOut.model_validate(limits, from_attributes=True),
+            cameras=[] if about is None else [CameraJson.model_validate(camera_to_json(c)) for c in about.cameras],
+            deadman_s=None if about is None else about.deadman_s,
+            episode=None if now.episode is None else JobOut.of(now.episode),
+        )

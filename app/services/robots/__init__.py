@@ -1,0 +1,1 @@
+"""The robot that a service may drive beside its simulated tables."""

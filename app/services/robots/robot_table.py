@@ -1,0 +1,313 @@
+"""A robot's table: asking for episodes on it, allowing the first motion, and a stop that waits for nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+from urllib.parse import urlsplit
+
+from app.episodes.file_names import GOAL_FILE
+from app.jobs.job import Job, JobChanged
+from app.services.episodes import nested
+from app.services.event_hub import Notice
+from app.services.fields import FieldCatalogue
+from app.services.goals.goals import Goals
+from app.services.runner import Runner
+from app.services.service_settings import Settings
+from app.storage.database import CannotStore
+from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.robots.connect import check_address, connect
+from osfcore.robots.http_robot import HttpRobot
+from osfcore.robots.robot import RobotDescription
+from osfcore.robots.safety_limits import SafetyLimits
+
+KIND = "robot"
+LEASE_S = 3.0  # without a word from the page that let the robot move
+_STOP_WAIT_S = 0.5  # for the robot to confirm a stop, before the answer
+_GONE = "the page that let it move was closed, or has lost its connection"
+
+State = Literal["idle", "looking", "asked", "driving", "stopped", "lost"]
+Boxes = Mapping[str, Mapping[str, tuple[float, float, float, float]]]
+
+
+class NoRobot(OsfError):
+    """The service was started without a robot."""
+
+    def __init__(self) -> None:
+        super().__init__("This service has no robot; whoever starts it can name one: osf serve --robot URL.")
+
+
+class RobotBusy(OsfError):
+    """A robot does one thing at a time."""
+
+    def __init__(self) -> None:
+        super().__init__("The robot has an episode already; stop it first.")
+
+
+class NothingAsked(OsfError):
+    """A permission that nobody waits for."""
+
+    def __init__(self) -> None:
+        super().__init__("No episode of this name waits for permission to move the robot.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AskedDrive:
+    """What to do with the robot.
+
+    Attributes:
+        goal: identifier of a goal image that one of its cameras took.
+        names: of the objects on its table.
+        boxes: around the objects, by camera and name, if the robot delivers no masks [px].
+        seed: of the searches.
+        settings: changes of the defaults, as of other episodes.
+    """
+
+    goal: str
+    names: tuple[str, ...]
+    boxes: Boxes = field(default_factory=dict)
+    seed: int = 0
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RobotNow:
+    """How the robot is.
+
+    Attributes:
+        host: where it is; None if there is none.
+        state: what it does.
+        text: the same for a person, or what went wrong.
+        episode: job that drives it, or did last.
+        limits: for its pusher: the service's, within its own once it has told them.
+        description: what it says of itself; None while it has not answered.
+    """
+
+    host: str | None
+    state: State = "idle"
+    text: str = ""
+    episode: Job | None = None
+    limits: SafetyLimits | None = None
+    description: RobotDescription | None = None
+
+
+class RobotTable:
+    """The robot of one service. Any thread may call; all but `here` block.
+
+    Args:
+        settings: of the service: which robot, and its limits. No request can name another one.
+        runner: has the jobs.
+        fields: what can be recognised.
+        goals: goal images.
+        lease_s: for how long a page that let it move may be silent [s].
+
+    Raises:
+        InvalidInput, UnknownName: if it is no address of a robot, or a limit makes no sense.
+    """
+
+    def __init__(
+        self, settings: Settings, runner: Runner, fields: FieldCatalogue, goals: Goals, lease_s: float = LEASE_S
+    ) -> None:
+        self._url, self._runner, self._fields, self._goals = settings.robot, runner, fields, goals
+        self._lease_s = lease_s
+        self._limits = limits_of(settings)
+        self._host = None if self._url is None else host_of(self._url)
+        self._about: RobotDescription | None = None
+        self._line: HttpRobot | None = None  # of its own, for stops; holds no connection meanwhile
+        self._connecting, self._ordering = threading.Lock(), threading.Lock()
+        self._stopped: tuple[str, str] | None = None  # the job that was stopped, and why
+        self._watched: tuple[str, float] | None = None  # the page that let it move, and when it was last heard of
+        self._leave: Callable[[], None] = lambda: None
+
+    def start(self) -> None:
+        """Forget what an earlier service was asked for: perhaps it had another robot."""
+        for job in self._runner.jobs.live(KIND):
+            with contextlib.suppress(OsfError):
+                self._runner.jobs.cancel(job.id)
+        self._leave = self._runner.hub.subscribe(self._hear)
+
+    def close(self) -> None:
+        """Stop the robot and let it go."""
+        if self._live() is not None:
+            self.stop("the service was ended")
+        self._leave()
+        if self._line is not None:
+            self._line.close()
+
+    def now(self) -> RobotNow:
+        """How the robot is; connects to it if that has not come about yet."""
+        if self._url is None:
+            return RobotNow(None)
+        try:
+            self._described()
+        except OsfError as error:
+            return RobotNow(self._host, "lost", str(error), self._latest(), self._limits)
+        return self._now()
+
+    def begin(self, asked: AskedDrive) -> RobotNow:
+        """Queue an episode, which looks and plans, and then asks.
+
+        Raises:
+            NoRobot: if there is none.
+            ConnectionLost, RobotRefused: if it does not answer.
+            UnknownName: if there is no such goal, or no camera of the robot took it.
+            MissingFields, InvalidInput: if an object cannot be recognised, or a setting is out of range.
+            RobotBusy: if it has one.
+            QueueFull, StorageFull, CannotStore: if nothing more can be taken.
+        """
+        cameras = [camera.name for camera in self._described().cameras]
+        goal = self._goals.get(asked.goal)
+        if goal.camera.name not in cameras:
+            raise UnknownName("camera of the robot", goal.camera.name, cameras)
+        if len(set(asked.names)) != len(asked.names):
+            raise InvalidInput("objects", ", ".join(asked.names), "each named once")
+        self._fields.require(asked.names, "ours")
+        params = {
+            "url": self._url, "title": goal.name, "names": list(asked.names), "goal_camera": goal.camera.name,
+            "boxes": {camera: dict(boxes) for camera, boxes in asked.boxes.items()}, "seed": asked.seed,
+            "settings": nested(asked.settings), "box": self._limits.box, "top_speed_m_s": self._limits.top_speed_m_s,
+        }  # fmt: skip
+        with self._ordering, self._runner.jobs.new_inputs() as folder:
+            if self._live() is not None:
+                raise RobotBusy
+            try:
+                folder.mkdir(parents=True)
+                shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
+            except OSError as error:
+                raise CannotStore(folder, error.strerror or str(error)) from error
+            self._runner.submit_with_inputs(KIND, params, folder)
+        return self._now()
+
+    def allow(self, episode: str, page: str | None) -> RobotNow:
+        """Let the robot move.
+
+        Args:
+            episode: that asks.
+            page: that says so; soon after it was last heard of, the robot is stopped. None for programs: nobody
+                watches them.
+
+        Raises:
+            NothingAsked: if no such episode waits for it.
+        """
+        job = self._live()
+        if job is None or job.id != episode or self._state_of(job)[0] != "asked":
+            raise NothingAsked
+        if page is not None:
+            self._watched = page, time.monotonic()
+            threading.Thread(target=self._watch, args=(job.id,), name="robot lease", daemon=True).start()
+        self._runner.jobs.change(job.id, {"allowed": True})
+        return self._now()
+
+    def here(self, page: str) -> None:
+        """A page says that it is there; does not block."""
+        if self._watched is not None and self._watched[0] == page:
+            self._watched = page, time.monotonic()
+
+    def stop(self, reason: str) -> RobotNow:
+        """Stop the robot, whatever it does, and as often as one likes.
+
+        It is told directly, and by the process that drives it, at the same time: neither waits for the other.
+
+        Args:
+            reason: why, as the end of the sentence "The robot was stopped: ...".
+        """
+        told = threading.Thread(target=self._tell_to_stop, name="robot stop", daemon=True)
+        told.start()
+        job = self._live()
+        if job is not None:
+            if self._stopped is None or self._stopped[0] != job.id:
+                self._stopped = job.id, f"The robot was stopped: {reason}."
+                self._runner.hub.publish(Notice("warning", self._stopped[1]))
+            threading.Thread(target=self._cancel, args=(job.id,), name="robot cancel", daemon=True).start()
+        told.join(_STOP_WAIT_S)
+        return self._now()
+
+    # Inside
+
+    def _cancel(self, job: str) -> None:
+        with contextlib.suppress(OsfError):  # it may be over meanwhile
+            self._runner.jobs.cancel(job)
+
+    def _now(self) -> RobotNow:
+        job, about = self._latest(), self._about
+        limits = self._limits if about is None else self._limits.within(about.limits)
+        return RobotNow(self._host, *self._state_of(job), job, limits, about)
+
+    def _described(self) -> RobotDescription:
+        if self._url is None:
+            raise NoRobot
+        with self._connecting:
+            if self._about is None:
+                robot = connect(self._url, (), self._limits)
+                self._limits.within(robot.description.limits)
+                self._about = robot.description
+                if isinstance(robot, HttpRobot):
+                    self._line = robot
+                else:  # rosbridge would go on sending pictures
+                    robot.close()
+            return self._about
+
+    def _tell_to_stop(self) -> None:
+        if self._line is not None:
+            with contextlib.suppress(OsfError):  # one that cannot be reached halts by itself
+                self._line.stop()
+
+    def _watch(self, job: str) -> None:
+        """Stop the robot once the page that let it move is silent."""
+        while (live := self._live()) is not None and live.id == job and self._watched is not None:
+            if time.monotonic() - self._watched[1] > self._lease_s:
+                self.stop(_GONE)
+                return
+            time.sleep(self._lease_s / 10)
+
+    def _hear(self, event: object) -> None:
+        """However an episode ends, even by the death of its process: the robot refuses motions from then on."""
+        if isinstance(event, JobChanged) and event.job.kind == KIND and event.job.is_finished:
+            threading.Thread(target=self._tell_to_stop, name="robot stop", daemon=True).start()
+
+    def _live(self) -> Job | None:
+        return next(iter(self._runner.jobs.live(KIND)), None)
+
+    def _latest(self) -> Job | None:
+        return next(iter(self._runner.jobs.page(1, kind=KIND).jobs), None)
+
+    def _state_of(self, job: Job | None) -> tuple[State, str]:
+        if job is None:
+            return "idle", ""
+        drives = (job.result or {}).get("drives", "looking")
+        if self._stopped is not None and self._stopped[0] == job.id:
+            return "stopped", self._stopped[1]
+        if not job.is_finished:
+            return ("driving" if drives == "over" else drives), job.note
+        if job.state == "done":
+            return "idle", (job.result or {}).get("text") or ""
+        if drives == "lost":
+            return "lost", job.error or ""
+        if job.state == "failed" and drives in ("looking", "asked"):  # nothing has moved
+            return "idle", job.error or ""
+        return "stopped", job.error or "The episode was cancelled; the robot stands."
+
+
+def limits_of(settings: Settings) -> SafetyLimits:
+    """What the service lets a robot do.
+
+    Raises:
+        InvalidInput: if a limit makes no sense.
+    """
+    box = {} if settings.robot_box is None else {"box": settings.robot_box}
+    return SafetyLimits(top_speed_m_s=settings.robot_top_speed_m_s, **box)
+
+
+def host_of(url: str) -> str:
+    """Where a robot is, for people: without names of topics, and without what nobody shall read.
+
+    Raises:
+        InvalidInput: if it is no address of a robot.
+    """
+    check_address(url)
+    return urlsplit(url).netloc.rpartition("@")[2]

@@ -1,0 +1,240 @@
+import contextlib
+import io
+import json
+import time
+
+import pytest
+from PIL import Image
+
+from app.jobs.clock import JobClock
+from app.processes.messages.job_messages import JobCancelled, JobStep
+from app.services import runner
+from app.services.robots import robot_table
+from osfcore.geometry.cameras import default_cameras
+from osfcore.io.scene_file import camera_to_json
+from osfcore.robots.robot import ConnectionLost
+from tests.app.conftest import running, until
+from tests.core.robots.robots import NAMES, example, noted, serving, simulated
+from tests.live import free_port
+
+PAGE = {"X-OSF-Visitor": "page"}
+
+
+class Process:
+    """In place of a job's process: does nothing by itself, and notes what it is told."""
+
+    latest = None
+
+    def __init__(self, job, data_dir, folder, on_event):
+        self.id, self.clock, self.pid = job.id, JobClock(), None
+        self.orders, self.is_cancelled, self.outcome = [], False, None
+        self._tell = on_event
+        Process.latest = self
+
+    def tells(self, drives, done=0):
+        self._tell(JobStep(done, 30, "Pushing", {"drives": drives, "doubts": []}))
+
+    def order(self, message):
+        self.orders.append(message)
+
+    def cancel(self, grace_s):
+        self.is_cancelled = True
+
+    def wait(self):
+        time.sleep(0.01)
+        return JobCancelled() if self.is_cancelled else self.outcome
+
+    def end(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def robot(library):
+    """Address of a robot, and what it was asked."""
+    told = []
+    with contextlib.closing(simulated(library)) as table, serving(noted(example().robot(table), told)) as url:
+        yield url, told
+
+
+@contextlib.contextmanager
+def service_with(monkeypatch, library, tmp_path, **settings):
+    monkeypatch.setattr(runner, "JobProcess", Process)
+    monkeypatch.setattr(robot_table.RobotTable.__init__, "__defaults__", (0.4,))  # a lease that no test waits long for
+    with running(library, tmp_path, standby=False, **settings) as client:
+        yield client
+
+
+@pytest.fixture
+def service(monkeypatch, library, tmp_path, robot):
+    robot[1].clear()
+    with service_with(monkeypatch, library, tmp_path, robot=robot[0], robot_top_speed_m_s=0.05) as client:
+        yield client
+
+
+def photographed(client, name="0"):
+    """A goal that a camera of the robot has seen."""
+    png = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(png, "PNG")
+    camera = json.dumps({**camera_to_json(default_cameras(64)[0]), "name": name})
+    headers = {"Content-Type": "image/png"}
+    return client.post("/api/goals", params={"camera": camera}, content=png.getvalue(), headers=headers).json()["id"]
+
+
+def begun(client, drives="asked"):
+    """An episode of the robot that is so far."""
+    asked = client.post("/api/robot/episodes", json={"goal": photographed(client), "names": list(NAMES)})
+    assert asked.status_code == 202, asked.text
+    assert asked.json()["state"] == "looking"
+    until(lambda: client.app.state.services.runner.jobs.live("robot")[0].state == "running")
+    Process.latest.tells("asked")
+    if drives == "driving":
+        assert allow(client, asked.json()["episode"]["id"]).status_code == 200
+        Process.latest.tells("driving")
+    assert state(client) == drives
+    return asked.json()["episode"]["id"]
+
+
+def allow(client, episode, **more):
+    return client.post("/api/robot/confirmation", json={"episode": episode}, **more)
+
+
+def state(client):
+    return client.get("/api/robot").json()["state"]
+
+
+def test_it_tells_limits_that_hold_for_both(service, robot):
+    told = service.get("/api/robot").json()
+    assert (told["host"], told["state"], told["episode"]) == (robot[0].removeprefix("http://"), "idle", None)
+    assert told["limits"] == {"box": [-0.35, -0.35, 0.35, 0.35], "top_speed_m_s": 0.05}
+    assert [camera["name"] for camera in told["cameras"]] == ["0", "1", "2", "3"]
+
+
+def test_a_service_without_a_robot_says_so(monkeypatch, library, tmp_path):
+    with service_with(monkeypatch, library, tmp_path) as client:
+        assert client.get("/api/robot").json()["host"] is None
+        answer = client.post("/api/robot/episodes", json={"goal": "x", "names": ["025_mug"]})
+        assert (answer.status_code, "osf serve --robot" in answer.json()["detail"]) == (404, True)
+        assert client.post("/api/robot/stop").status_code == 200
+
+
+def test_a_robot_that_does_not_answer_is_lost(monkeypatch, library, tmp_path):
+    with service_with(monkeypatch, library, tmp_path, robot=f"http://127.0.0.1:{free_port()}") as client:
+        told = client.get("/api/robot").json()
+        assert (told["state"], "does not answer" in told["text"]) == ("lost", True)
+        assert client.post("/api/robot/episodes", json={"goal": "x", "names": ["025_mug"]}).status_code == 503
+
+
+def test_no_request_names_the_robot(service, robot):
+    body = {"goal": photographed(service), "names": list(NAMES), "url": "http://10.0.0.1"}
+    assert service.post("/api/robot/episodes", json=body).status_code == 422
+    begun(service)
+    (job,) = service.app.state.services.runner.jobs.live("robot")
+    assert (job.params["url"], job.params["top_speed_m_s"]) == (robot[0], 0.05)
+
+
+def test_nothing_moves_before_it_is_allowed_by_name(service, robot):
+    episode = begun(service)
+    assert allow(service, "another").status_code == 409
+    assert Process.latest.orders == []
+    assert allow(service, episode).status_code == 200
+    assert [order.params for order in Process.latest.orders] == [{"allowed": True}]
+    assert not {"/start", "/act"} & set(robot[1])
+
+
+def test_it_does_one_thing_at_a_time(service):
+    begun(service)
+    answer = service.post("/api/robot/episodes", json={"goal": photographed(service), "names": list(NAMES)})
+    assert answer.status_code == 409
+
+
+@pytest.mark.parametrize("drives", ["asked", "driving"])
+def test_a_stop_reaches_the_robot_and_ends_the_episode_however_often(service, robot, drives):
+    episode = begun(service, drives)
+    robot[1].clear()
+    for _ in range(3):
+        told = service.post("/api/robot/stop").json()
+        assert told["state"] == "stopped"
+        assert told["text"] == "The robot was stopped: somebody pressed Stop."
+    assert "/stop" in robot[1]
+    until(lambda: service.get(f"/api/jobs/{episode}").json()["state"] == "cancelled")
+    assert allow(service, episode).status_code == 409
+    assert state(service) == "stopped"
+
+
+def test_anybody_may_stop_it_while_only_the_driver_may_begin(service, robot):
+    service.app.state.services.driver.arrive("page")
+    other = {"X-OSF-Visitor": "other"}
+    body = {"goal": photographed(service), "names": list(NAMES)}
+    assert service.post("/api/robot/episodes", json=body, headers=other).status_code == 409
+    assert allow(service, begun(service), headers=other).status_code == 409
+    assert service.post("/api/robot/stop", headers=other).json()["state"] == "stopped"
+    assert "/stop" in robot[1]
+
+
+def test_a_page_that_falls_silent_stops_the_robot(service, robot):
+    assert allow(service, begun(service), headers=PAGE).status_code == 200
+    Process.latest.tells("driving")
+    robot[1].clear()
+    for _ in range(10):
+        service.post("/api/robot/presence", headers=PAGE)
+        time.sleep(0.08)
+    assert (state(service), robot[1]) == ("driving", [])
+    until(lambda: state(service) == "stopped")
+    assert "was closed, or has lost its connection" in service.get("/api/robot").json()["text"]
+    until(lambda: "/stop" in robot[1])
+
+
+def test_another_page_does_not_keep_it_moving(service):
+    assert allow(service, begun(service), headers=PAGE).status_code == 200
+
+    def stopped():
+        service.post("/api/robot/presence", headers={"X-OSF-Visitor": "other"})
+        return state(service) == "stopped"
+
+    until(stopped)
+
+
+def test_programs_are_not_watched(service):
+    begun(service, "driving")
+    time.sleep(1.0)
+    assert state(service) == "driving"
+
+
+@pytest.mark.parametrize(("outcome", "then"), [({"drives": "over", "text": "Done."}, "idle"), (None, "lost")])
+def test_however_an_episode_ends_the_robot_is_told_to_stop(service, robot, outcome, then):
+    begun(service, "driving")
+    if outcome is None:
+        Process.latest.tells("lost")
+    robot[1].clear()
+    Process.latest.outcome = outcome or ConnectionLost("http://robot", "no route")
+    until(lambda: state(service) == then)
+    until(lambda: "/stop" in robot[1])
+
+
+def test_the_end_of_the_service_stops_it(monkeypatch, library, tmp_path, robot):
+    with service_with(monkeypatch, library, tmp_path, robot=robot[0]) as client:
+        begun(client, "driving")
+        robot[1].clear()
+    assert "/stop" in robot[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"names": ["no such thing"]}, "no such thing"),
+        ({"names": [NAMES[0], NAMES[0]]}, "each named once"),
+        ({"goal": "nothing"}, "nothing"),
+        ({"settings": {"steps": 0}}, ""),
+    ],
+)
+def test_what_cannot_be_is_refused_at_once(service, change, words):
+    body = {"goal": photographed(service), "names": list(NAMES), **change}
+    answer = service.post("/api/robot/episodes", json=body)
+    assert answer.status_code in (409, 422)
+    assert words in answer.json()["detail"]
+
+
+def test_a_goal_of_another_camera_is_refused(service):
+    body = {"goal": photographed(service, "above"), "names": list(NAMES)}
+    answer = service.post("/api/robot/episodes", json=body)
+    assert (answer.status_code, "camera of the robot named 'above'" in answer.json()["detail"]) == (422, True)
