@@ -182,4 +182,5 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
         return whole
 
     start = np.concatenate([theta, poses.ravel()])
-    return least_squares(residuals, start, **{"jac": jacobian}, method="lm", x_scale="jac", max_nfev=_MOST_STEPS)
+    how = {"method": "lm", "x_scale": "jac", "max_nfev": _MOST_STEPS}
+    return least_squares(residuals, start, jacobian, **how)  # pyright: ignore[reportArgumentType]
