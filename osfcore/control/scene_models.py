@@ -54,10 +54,7 @@ def load_scene_models(
     """
     shapes = load_shapes(data_dir, fields, names)
     pushes = PushModel(read_network(network_path(data_dir)), shapes, device)
-    return SceneModels(
-        ObjectModels({name: fields.load(name) for name in names}, fields.load_table(), device=device),
-        pushes,
-        pushes,
-        shapes,
-        {name: assets.info(name).symmetry for name in names},
-    )
+    symmetries = {name: assets.info(name).symmetry for name in names}
+    loaded, table = {name: fields.load(name) for name in names}, fields.load_table()
+    appearance = ObjectModels(loaded, table, device=device, symmetries=symmetries)
+    return SceneModels(appearance, pushes, pushes, shapes, symmetries)

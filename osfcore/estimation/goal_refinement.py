@@ -15,7 +15,13 @@ from osfcore.estimation.objective.parametrization import SceneParameters
 from osfcore.estimation.search.gauss_newton import PLANAR_PARAMETERS, GaussNewtonState, gauss_newton
 from osfcore.estimation.step_reporter import StepReporter
 from osfcore.estimation.steps import EstimateStep
-from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit, goal_allowance, misfits
+from osfcore.estimation.uncertainty import (
+    SURE_RIVAL_RATIO,
+    estimate_with_uncertainty,
+    evaluate_fit,
+    goal_allowance,
+    misfits,
+)
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import Observation
@@ -123,7 +129,8 @@ class GoalRefinement:
 
     def doubted(self, at: GaussNewtonState) -> list[int]:
         """Numbers of the objects whose fit is poor, or whose pose the image does not determine."""
-        return [n for n, doubt in enumerate(self.estimate(at, {}).doubts) if doubt]
+        sure = {n: ratio for n, ratio in self.rivals.items() if ratio >= SURE_RIVAL_RATIO}
+        return [n for n, doubt in enumerate(self.estimate(at, sure).doubts) if doubt]
 
     def misfits(self, params: SceneParameters) -> list[int]:
         """Numbers of the objects that the image does not show where a guess has them."""

@@ -33,6 +33,9 @@ _MIN_OVERLAP = 0.75  # of silhouette and mask
 _MIN_PIXELS = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
 _MIN_RIVAL_RATIO = 1.05
+# Loss of the best other orientation, over that of the one chosen, from which a residual of up to a share of the level
+# rather tells that the field errs; wrong poses reached 7.5.
+SURE_RIVAL_RATIO, _SURE_SHARE = 12.0, 0.3
 AMBIGUOUS = "another orientation explains the images as well"  # a doubt
 _MAX_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths were within -1 and 4 mm
 
@@ -163,7 +166,8 @@ def estimate_with_uncertainty(
         params: what was found.
         normals: Gauss-Newton's matrices there, one for each object and one for the light.
         fit: of the guess.
-        rivals: by object, the best loss of a different orientation over the loss of the one chosen.
+        rivals: by object, the best loss of a different orientation over the loss of the one chosen. Where all others
+            explain the images far worse, larger residuals are allowed.
         light_held: the light was given, not searched.
         lowest: height of each object's lowest point [m], if objects can only stand on the table.
         allowed: residuals up to which an object's images are not doubted; `MAX_RESIDUAL` by default.
@@ -202,6 +206,8 @@ def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.
 def _reason_for_doubt(
     fit: FitQuality, n: int, most: float, position_std: float, rotation_std: float, rival: float
 ) -> str:
+    if SURE_RIVAL_RATIO <= rival < np.inf:
+        most = max(most, _SURE_SHARE * fit.level[n])
     misfit = _misfit(fit, n, most)
     if misfit:
         return misfit

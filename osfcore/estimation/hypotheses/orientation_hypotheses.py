@@ -107,8 +107,8 @@ def compare_orientations(
     Returns:
         The better scene, and the ratio of the worse loss to the better one; infinite without a distinct hypothesis.
     """
-    same = rotation_angle(others.quaternion, at.params.quaternions[number]) <= _SAME_RAD
-    far = others[~same]
+    name, own_quaternion = at.params.names[number], at.params.quaternions[number]
+    far = others[models.turned(name, own_quaternion, others.quaternion) > _SAME_RAD]
     if not len(far.position):
         return at, np.inf
     own = crop_to_object(rough, models, at.params, number)
@@ -127,7 +127,7 @@ def compare_orientations(
         rival = _refine(models, fine, rival, number, _pose(rival.params, number), _FINE_ITERATIONS)
     own = crop_to_object(fine, models, at.params, number)
     here, there = (loss_of(models, own, params) for params in (at.params, rival.params))
-    angle = rotation_angle(rival.params.quaternions[number], at.params.quaternions[number])
+    angle = models.turned(name, own_quaternion, rival.params.quaternions[number][None])[0]
     ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
     return (replace(rival, losses=at.losses) if there < _BETTER * here else at), float(ratio)
 

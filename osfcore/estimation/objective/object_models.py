@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
+import numpy as np
+from jaxtyping import Float
+
 from osfcore.errors import UnknownName
 from osfcore.estimation.objective.resting_orientations import DensityGrid, RestingOrientations, resting_orientations
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table_field import TableField
+from osfcore.metrics.pose_errors import rotation_error
+from osfcore.objects.asset import Symmetry
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import PLANNING, Quality, Renderer
 
@@ -19,13 +24,21 @@ FieldT = TypeVar("FieldT", bound=DensityGrid)
 class ObjectModels:
     """Fields of the objects, and two renderers of them: alone over black, and together on the table."""
 
-    def __init__(self, fields: Mapping[str, KiloOSF], table: TableField, *, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        fields: Mapping[str, KiloOSF],
+        table: TableField,
+        *,
+        device: str = "cpu",
+        symmetries: Mapping[str, Symmetry] | None = None,
+    ) -> None:
         """Prepare fields.
 
         Args:
             fields: by name of the object.
             table: what the objects lie on.
             device: where images are rendered, see `SceneRenderer`.
+            symmetries: which orientations of an object look the same; none of those left out.
 
         Raises:
             InvalidInput: if there is no such device.
@@ -33,6 +46,7 @@ class ObjectModels:
         alone, together = (SceneRenderer(fields, ground, device=device) for ground in (None, table))
         self._set(fields, alone, together)
         self._changeable = fields, table, device
+        self._symmetries = dict(symmetries or {})
 
     @classmethod
     def rendered_by(
@@ -55,6 +69,7 @@ class ObjectModels:
     def _set(self, fields: Mapping[str, DensityGrid], alone: Renderer, together: Renderer) -> None:
         self._fields = dict(fields)
         self._resting: dict[str, RestingOrientations] = {}
+        self._symmetries: dict[str, Symmetry] = {}
         self._changeable: tuple[Mapping[str, KiloOSF], TableField, str] | None = None
         self.alone, self.together = alone, together
 
@@ -75,7 +90,8 @@ class ObjectModels:
         """
         assert self._changeable is not None, "can_change tells"
         fields, ground, device = self._changeable
-        models = ObjectModels({name: field(fields[name]) for name in names}, table(ground), device=device)
+        changed = {name: field(fields[name]) for name in names}
+        models = ObjectModels(changed, table(ground), device=device, symmetries=self._symmetries)
         models._resting = {name: self.resting(name) for name in names}
         return models
 
@@ -88,6 +104,13 @@ class ObjectModels:
         for name in names:
             if name not in self._fields:
                 raise UnknownName("field", name, sorted(self._fields))
+
+    def turned(
+        self, name: str, one: Float[np.ndarray, "4"], others: Float[np.ndarray, "B 4"]
+    ) -> Float[np.ndarray, "B"]:
+        """Angles between an object's orientations [rad], over all that look like `one`."""
+        symmetry = self._symmetries.get(name, Symmetry("none"))
+        return np.array([rotation_error(symmetry, other, one) for other in others])
 
     def resting(self, name: str) -> RestingOrientations:
         """How an object can lie on a table, found when first asked for."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.photo.calibration.camera_fit import INTRINSICS, POSE, PoseVector, Theta, on_board, pose_of, seen
@@ -70,7 +70,7 @@ def workspace_grid() -> Float[np.ndarray, "G 3"]:
 
 def in_picture(
     theta: Theta, pose: PoseVector, points: Float[np.ndarray, "G 3"], size: tuple[int, int]
-) -> Float[np.ndarray, "G"]:
+) -> Bool[np.ndarray, "G"]:
     """Which points of the board's frame a camera sees."""
     pixels = seen(theta, pose, points)[0]
     is_before = pose_of(pose).apply(points)[:, 2] > 0

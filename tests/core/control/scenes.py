@@ -5,6 +5,7 @@ import numpy as np
 from osfcore.control.scene_models import SceneModels
 from osfcore.dynamics.push_models import load_push_model, load_shapes
 from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.uncertainty import FitQuality
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -38,3 +39,9 @@ def sure(state: SceneState, doubts: tuple[str, ...] | None = None) -> EstimatedS
     doubts = ("",) * count if doubts is None else doubts
     reason = "; ".join(f"{n}: {d}" for n, d in zip(state.names, doubts, strict=True) if d)
     return EstimatedState(state, np.full(count, 1e-3), np.full(count, 1e-2), 1e-2, doubts, reason)
+
+
+def perfect_fit(count: int) -> FitQuality:
+    """Images that show objects just as they are rendered."""
+    each = np.ones(count)
+    return FitQuality(np.zeros((1, count)), 100 * each[None], 0.1 * each, 0.3 * each, each, 0.0, 0.0)

@@ -20,7 +20,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.planning.mppi import PlanSettings
 from osfcore.planning.pose_cost import PoseGoal
 from osfcore.progress import Progress
-from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, models, sure, table
+from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, models, perfect_fit, sure, table
 
 DARK = ImageModel(np.full(3, 0.67), 1.0, np.ones(3), "srgb")
 SMALL = EpisodeSettings(steps=12, plan=PlanSettings(samples=48, horizon=10))
@@ -45,7 +45,7 @@ def told(world, monkeypatch):
     monkeypatch.setattr(estimators, "estimate_first", lambda *_: steps("first", world.truth()))
     monkeypatch.setattr(estimators, "estimate_next", lambda *_, usual: steps("next", world.truth()))
     monkeypatch.setattr(module, "relocalize", lambda *_: steps("search", world.truth()))
-    monkeypatch.setattr(module, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
+    monkeypatch.setattr(module, "expected_fit", lambda *_: perfect_fit(len(NAMES)))
     return doubts
 
 

@@ -217,3 +217,13 @@ def test_a_goal_may_be_brighter_or_dimmer_than_the_scene():
 def test_a_goal_is_not_doubted_for_what_all_fields_err_by_nor_believed_where_everything_is_off():
     fit = fit_of(4, level=np.array([0.5, 0.1, 0.3, 0.3]))
     np.testing.assert_allclose(goal_allowance(fit, np.array([0.0, 0.0, 2.0, np.nan])), [0.04, 0.02, 0.18, 0.04])
+
+
+@pytest.mark.parametrize(
+    ("rival", "residual", "is_doubted"),
+    [(20.0, 0.08, False), (20.0, 0.1, True), (5.0, 0.08, True), (np.inf, 0.08, True), (20.0, 0.03, False)],
+)
+def test_a_field_that_errs_is_no_doubt_where_every_other_orientation_is_far_worse(rival, residual, is_doubted):
+    """At a level of 0.3 a residual up to 0.09 is forgiven; without other orientations nothing speaks for this one."""
+    fit = fit_of(residuals=np.full((2, 1), residual))
+    assert bool(estimate_with_uncertainty(params(), normals(), fit, {0: rival}).doubted) == is_doubted

@@ -19,7 +19,7 @@ from osfcore.geometry.workspace import STEP_S
 from osfcore.progress import Progress
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
-from tests.core.control.scenes import sure
+from tests.core.control.scenes import perfect_fit, sure
 from tests.live import free_port
 
 SERVER = Path(__file__).parents[3] / "examples" / "robot_server.py"
@@ -113,7 +113,7 @@ def tell_truth(monkeypatch, table, wanted):
     monkeypatch.setattr(estimators, "estimate_next", lambda *_, usual: steps(table.truth()))
     monkeypatch.setattr(closed_loop, "estimate_goal_image", lambda *_: steps(replace(wanted, pusher=None)))
     monkeypatch.setattr(closed_loop, "prefer_current_poses", lambda _models, _goal, found, _now: found)
-    monkeypatch.setattr(closed_loop, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
+    monkeypatch.setattr(closed_loop, "expected_fit", lambda *_: perfect_fit(len(NAMES)))
 
 
 def noted(app, told):

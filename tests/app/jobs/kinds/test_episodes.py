@@ -34,7 +34,7 @@ from osfcore.paper import stages
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first
 from osfcore.progress import Progress
 from tests.app.jobs.kinds.test_remote_world import NAMES, Stage, stage  # noqa: F401  a fixture
-from tests.core.control.scenes import sure
+from tests.core.control.scenes import perfect_fit, sure
 
 SMALL = {"steps": 3, "plan": {"samples": 16, "horizon": 6}}
 
@@ -67,7 +67,7 @@ def sighted(monkeypatch, stage):  # noqa: F811
 
     for name in ("estimate_first", "estimate_next"):
         monkeypatch.setattr(estimators, name, found)
-    monkeypatch.setattr(core, "expected_residuals", lambda *_: np.zeros(len(NAMES)))
+    monkeypatch.setattr(core, "expected_fit", lambda *_: perfect_fit(len(NAMES)))
 
 
 def entries(state):

@@ -3,6 +3,8 @@ import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
+from osfcore.geometry.poses import quaternion_exp
+from osfcore.objects.asset import Symmetry
 from osfcore.render.types import SceneBatch
 from tests.core.render.scenes import ball, plain_table, state, view
 
@@ -33,3 +35,19 @@ def test_one_renderer_shows_the_table_and_the_other_black(plain):
 def test_a_device_that_does_not_exist_is_refused():
     with pytest.raises(InvalidInput):
         ObjectModels({"ball": ball()}, plain_table(), device="abacus")
+
+
+def test_orientations_that_look_the_same_are_not_turned():
+    """About the axis of a body of revolution any angle is none, on the models themselves and on changed ones."""
+    bowl = ObjectModels(
+        {"ball": ball()}, plain_table(), symmetries={"ball": Symmetry("continuous", axis=(0.0, 0.0, 1.0))}
+    )
+    upright, about, tilted = np.eye(4)[0], np.eye(4)[3], quaternion_exp(np.array([0.5, 0.0, 0.0]))
+    for models in (bowl, bowl.changed(("ball",), lambda field: field, lambda table: table)):
+        np.testing.assert_allclose(
+            models.turned("ball", upright, np.stack([upright, about, tilted])), [0, 0, 0.5], atol=1e-6
+        )
+    plain = ObjectModels({"ball": ball()}, plain_table())
+    np.testing.assert_allclose(
+        plain.turned("ball", upright, np.stack([upright, about, tilted])), [0, np.pi, 0.5], atol=1e-6
+    )
