@@ -36,13 +36,12 @@ from app.api.routes import (
     objects,
     photos,
     predictions,
-    robot,
     scenes,
     status,
     storage,
 )
 from app.api.routes import comparisons as neural
-from app.api.routes.pages import driver, presets, stories, views
+from app.api.routes.pages import driver, presets, robot, stories, views
 from app.api.schemas.common import ForgottenEvent, FrameEvent, LookEvent, NoticeEvent, Problem
 from app.api.schemas.estimates import EstimateIn
 from app.api.schemas.goals import GoalIn

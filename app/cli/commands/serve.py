@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput, OsfError
+from osfcore.extras import need
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -53,6 +54,7 @@ class Serve:
 
     def run(self) -> dict[str, Any]:
         """Serve until interrupted."""
+        need("serve", "This command")
         from app.cli.service_log import start_log
         from app.storage.database import check_data_dir
 
