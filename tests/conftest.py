@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
 import osfcore.geometry.convex_parts
@@ -45,8 +46,10 @@ def library() -> AssetLibrary:
     library = AssetLibrary(CACHE / f"objects-{_objects_key()}")
     folder = os.environ.get("OSF_TEST_YCB")
     source = FolderSource(Path(folder)) if folder else WheelSource(CACHE / "downloads")
-    for _ in fetch(TEST_OBJECTS, source, library):
-        pass
+    CACHE.mkdir(exist_ok=True)
+    with FileLock(CACHE / "objects.lock"):  # processes that share the tests would all convert them
+        for _ in fetch(TEST_OBJECTS, source, library):
+            pass
     return library
 
 

@@ -8,6 +8,7 @@ beside its place, synced, and renamed, so that a kill or a full disk leaves eith
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
@@ -262,13 +263,21 @@ class AssetLibrary:
 
     def _put(self, folder: Path, place: Path) -> None:
         folder.chmod(0o755)  # mkdtemp makes it private, but another user may serve what this one fetched
-        if place.exists():
-            with self._temporary(place.name) as trash:
+        while not _renamed(folder, place):  # another process may put the same object there at any moment
+            with self._temporary(place.name) as trash, contextlib.suppress(FileNotFoundError):
                 os.rename(place, trash / "old")
-                os.rename(folder, place)
-        else:
-            os.rename(folder, place)
         _sync(self.root)
+
+
+def _renamed(folder: Path, place: Path) -> bool:
+    """Give a folder its name, unless something with contents has that name."""
+    try:
+        os.rename(folder, place)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+            raise
+        return False
+    return True
 
 
 def _parts(arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "_ 3"], ...]:

@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -155,6 +156,14 @@ def test_a_root_that_cannot_be_made_is_told(tmp_path, asset):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(FetchFailed, match="cannot be written"):
         AssetLibrary(tmp_path / "file" / "objects").write(asset, "a test")
+
+
+def test_many_may_write_the_same_object_at_once(tmp_path, asset):
+    shelf = AssetLibrary(tmp_path / "objects")
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda n: shelf.write(asset, f"writer {n}"), range(40)))
+    assert shelf.load("toy").info == asset.info
+    assert [path.name for path in shelf.root.iterdir()] == ["toy"]
 
 
 # Files of this process can grow to a few kilobytes only, as on a full disk.
