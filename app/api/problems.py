@@ -42,6 +42,7 @@ STATUS_OF_KIND = {
     "EpisodeGoesOn": 409,
     "NotDriving": 409,
     "NoRobot": 404,
+    "NoPicture": 404,
     "RobotBusy": 409,
     "NothingAsked": 409,
     "ConnectionLost": 503,

@@ -37,7 +37,12 @@ class DataDirectoryInUse(OsfError):
 
 def now_utc() -> str:
     """The time in UTC, ISO 8601 with milliseconds."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return utc_of(datetime.now(UTC).timestamp())
+
+
+def utc_of(seconds: float) -> str:
+    """A moment since the epoch [s] in the same form."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def check_data_dir(data_dir: Path) -> None:

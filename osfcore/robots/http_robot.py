@@ -88,10 +88,19 @@ class HttpRobot:
             CorruptFile, InvalidInput: if what it sends is not what it should be.
         """
         pusher = decode(PointJson, self._json("GET", "pusher"), f"answer of {self._url}/pusher").position
-        pictures = [self._bytes(f"images/{quote(camera.name, safe='')}") for camera in self._cameras]
+        pictures = self.pictures()
         sent = self._masks() if masks and self._masked.issuperset(self._names) else None
         seconds = time.monotonic() - self._began
         return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
+
+    def pictures(self) -> tuple[bytes, ...]:
+        """A picture of every camera, as the robot sends it.
+
+        Raises:
+            ConnectionLost: if nobody answers.
+            RobotRefused: if it does not want to.
+        """
+        return tuple(self._bytes(f"images/{quote(camera.name, safe='')}") for camera in self._cameras)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Hold a velocity for 0.2 s; the robot answers when that is over.

@@ -98,3 +98,7 @@ class Robot(World, Stoppable, Protocol):
     def description(self) -> RobotDescription:
         """What the robot says of itself."""
         ...
+
+    def pictures(self) -> tuple[bytes, ...]:
+        """A new picture of each camera, as files that `read_photograph` takes; also while another thread does more."""
+        ...

@@ -134,11 +134,21 @@ class RosRobot:
             RobotRefused: if pictures or transforms do not come.
             CorruptFile, InvalidInput: if they are not what they should be.
         """
-        topics = [self._topics.topic(camera.name, self._topics.image) for camera in self._cameras]
-        self._wait({topic: self._bridge.count(topic) + _FRESH for topic in topics})
-        pictures = [_picture(self._bridge.received(topic)[-1].message, topic) for topic in topics]
+        pictures = self.pictures()
         pusher = self._tree().pose(self._topics.pusher, self._topics.table).position
         return observation_of(self._cameras, pictures, self._names, pusher, time.monotonic() - self._began)
+
+    def pictures(self) -> tuple[bytes, ...]:
+        """A picture of every camera, taken after this was asked.
+
+        Raises:
+            ConnectionLost: if the connection broke.
+            RobotRefused: if pictures do not come.
+            CorruptFile: if they are not what they should be.
+        """
+        topics = [self._topics.topic(camera.name, self._topics.image) for camera in self._cameras]
+        self._wait({topic: self._bridge.count(topic) + _FRESH for topic in topics})
+        return tuple(_picture(self._bridge.received(topic)[-1].message, topic) for topic in topics)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Send a velocity again and again for 0.2 s, then zero.

@@ -4,6 +4,7 @@ import { get, post, upload } from "./api.js";
 import { byId, el } from "./dom.js";
 import { isDriving } from "./driver.js";
 import { refreshGoals } from "./goals.js";
+import { setUpRobotCameras } from "./robot-cameras.js";
 import { inWords, known, labelOf, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
@@ -194,6 +195,7 @@ function draw() {
 }
 
 export function setUpRobot() {
+  setUpRobotCameras();
   byId("robot-stop").addEventListener("click", stopRobot);
   byId("robot-allow").addEventListener("click", allow);
   byId("robot-refuse").addEventListener("click", stopRobot);

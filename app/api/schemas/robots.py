@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Annotated
 
 from pydantic import BaseModel, Field, FiniteFloat
@@ -9,7 +10,9 @@ from pydantic import BaseModel, Field, FiniteFloat
 from app.api.schemas.common import Input, ObjectName, Seed
 from app.api.schemas.jobs import JobOut
 from app.api.schemas.limits import HORIZON, NAME, OBJECTS, PIXEL, SAMPLES, STEPS, sized, within
+from app.services.robots.robot_pictures import CameraNow
 from app.services.robots.robot_table import AskedDrive, RobotNow, State
+from app.storage.database import utc_of
 from osfcore.io.scene_file import CameraJson, camera_to_json
 
 Pixel = Annotated[FiniteFloat, Field(**within(PIXEL))]
@@ -57,6 +60,24 @@ class RobotLimitsOut(BaseModel):
 
     box: list[float] = Field(description="x0, y0, x1, y1 of the pusher's centre [m].")
     top_speed_m_s: float
+
+
+class RobotCameraOut(BaseModel):
+    """A camera of the robot, and when it saw what its picture shows."""
+
+    name: str
+    width: int = Field(description="Of its picture [px].")
+    height: int = Field(description="[px]")
+    seen_at: str | None = Field(description="UTC, ISO 8601; null if it has shown nothing yet.")
+    age_s: float | None = Field(description="How long ago that was, by the clock of the service [s].")
+
+    @staticmethod
+    def of(now: CameraNow) -> RobotCameraOut:
+        """From the service's own."""
+        camera, at_s = now.camera, None if now.picture is None else now.picture.at_s
+        seen_at = None if at_s is None else utc_of(at_s)
+        age_s = None if at_s is None else max(0.0, time.time() - at_s)
+        return RobotCameraOut(name=camera.name, width=camera.width, height=camera.height, seen_at=seen_at, age_s=age_s)
 
 
 class RobotOut(BaseModel):

@@ -86,12 +86,15 @@ def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgre
 def _driven(
     drive: RobotDrive, progress: RobotProgress, may_move: threading.Event, place: JobContext
 ) -> Iterator[RobotProgress]:
-    from osfcore.control.events import Planning
+    from app.episodes.robots.camera_files import write_pictures
+    from osfcore.control.events import Observed, Planning
 
     assert place.orders is not None
     progress = replace(progress, doubts=drive.doubts)
     for event in drive.run():
         progress = _after(progress, event)
+        if isinstance(event, Observed):
+            write_pictures(place.folder, event.observation)
         yield progress
         if isinstance(event, Planning) and not may_move.is_set():
             yield replace(progress, drives="asked", note="Waiting for permission to move")

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
@@ -17,6 +18,7 @@ from app.services.episodes import nested
 from app.services.event_hub import Notice
 from app.services.fields import FieldCatalogue
 from app.services.goals.goals import Goals
+from app.services.robots.robot_pictures import RobotPictures
 from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore
@@ -97,7 +99,7 @@ class RobotNow:
 
 
 class RobotTable:
-    """The robot of one service. Any thread may call; all but `here` block.
+    """The robot of one service, and in `pictures` what its cameras saw last. Any thread may call; all but `here` block.
 
     Args:
         settings: of the service: which robot, and its limits. No request can name another one.
@@ -118,11 +120,14 @@ class RobotTable:
         self._limits = limits_of(settings)
         self._host = None if self._url is None else host_of(self._url)
         self._about: RobotDescription | None = None
-        self._line: HttpRobot | None = None  # of its own, for stops; holds no connection meanwhile
+        self._line: HttpRobot | None = None  # of its own, for stops and pictures; a stop waits for no picture
         self._connecting, self._ordering = threading.Lock(), threading.Lock()
         self._stopped: tuple[str, str] | None = None  # the job that was stopped, and why
         self._watched: tuple[str, float] | None = None  # the page that let it move, and when it was last heard of
         self._leave: Callable[[], None] = lambda: None
+        self.pictures = RobotPictures(
+            lambda: self._described().cameras, self._taken, self._may_look, self._latest_folder
+        )
 
     def start(self) -> None:
         """Forget what an earlier service was asked for: perhaps it had another robot."""
@@ -269,6 +274,21 @@ class RobotTable:
         """However an episode ends, even by the death of its process: the robot refuses motions from then on."""
         if isinstance(event, JobChanged) and event.job.kind == KIND and event.job.is_finished:
             threading.Thread(target=self._tell_to_stop, name="robot stop", daemon=True).start()
+
+    def _taken(self) -> tuple[bytes, ...]:
+        assert self._url is not None
+        if self._line is not None:
+            return self._line.pictures()
+        with contextlib.closing(connect(self._url, (), self._limits)) as robot:
+            return robot.pictures()
+
+    def _may_look(self) -> bool:
+        live = self._live()
+        return live is None or live.state == "queued" or self._state_of(live)[0] not in ("looking", "driving")
+
+    def _latest_folder(self) -> Path | None:
+        latest = self._latest()
+        return None if latest is None else self._runner.jobs.folder(latest.id)
 
     def _live(self) -> Job | None:
         return next(iter(self._runner.jobs.live(KIND)), None)

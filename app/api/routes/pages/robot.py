@@ -2,14 +2,15 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, status
+from fastapi import APIRouter, Depends, Header, Path, Response, status
 
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import VISITOR_HEADER, ServicesDep, only_the_driver
 from app.api.lanes import slow, urgent
-from app.api.routes import problems
+from app.api.problems import named_in_path
+from app.api.routes import JPEG, problems
 from app.api.schemas.limits import NAME, VISITOR, sized
-from app.api.schemas.robots import ConfirmationIn, RobotEpisodeIn, RobotOut
+from app.api.schemas.robots import ConfirmationIn, RobotCameraOut, RobotEpisodeIn, RobotOut
 
 router = APIRouter(prefix="/api/robot", tags=["robot"], responses=problems(), route_class=BoundedRoute)
 _DRIVER = [Depends(only_the_driver)]
@@ -24,6 +25,28 @@ Page = Annotated[
 def get(services: ServicesDep) -> RobotOut:
     """Tell which robot there is, its limits, and what it does. `host` is null where the service has none."""
     return RobotOut.of(services.robot.now())
+
+
+@router.get("/cameras", responses=problems(404, 503))
+@slow
+def cameras(services: ServicesDep) -> list[RobotCameraOut]:
+    """Tell of each camera when it saw what its picture shows.
+
+    While an episode looks or moves that is its own last look, for nothing shall hold up the robot; else the robot looks
+    now, at most once a second.
+    """
+    return [RobotCameraOut.of(now) for now in services.robot.pictures.all()]
+
+
+@router.get("/cameras/{name:path}.jpg", response_class=Response, responses={**problems(404, 503), **JPEG})
+@slow
+def picture(
+    services: ServicesDep, name: Annotated[str, Path(description="Name of one of the robot's cameras.")]
+) -> Response:
+    """Show what a camera of the robot saw last; when that was, and when the robot looks, is as for all of them."""
+    with named_in_path():
+        seen = services.robot.pictures.one(name)
+    return Response(seen.jpeg, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
 
 @router.post(
