@@ -127,7 +127,8 @@ class JobLoop:
         self._finish(run, outcome)
 
     def _finish(self, run: JobProcess, outcome: Outcome) -> None:
-        job = self._table[run.id]
+        with self._changed:  # until whoever has cancelled it has said why
+            job = self._table[run.id]
         if run.is_cancelled and not isinstance(outcome, dict):
             outcome = JobCancelled()  # whatever ended it first, it was asked to
         then = after(job, outcome, self._folders.folder(job.id))

@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from app.episodes.robots.stopped_report import STOPPED, tell_stopped
 from app.jobs.job import Job, ended
 from app.processes.messages.job_messages import JobCancelled
 from osfcore.errors import OsfError
 
 RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."
 INTERRUPTED_NOTE = "The service stopped in the middle; the steps until then are kept."
+_WITHOUT_A_WORD = "The robot was stopped: its job was cancelled."
 _KEEPING = ("episode", "robot")  # kinds whose finished steps are worth keeping, however the job ends
 Outcome = dict[str, Any] | JobCancelled | OsfError  # a result, or why there is none
 
@@ -50,6 +52,8 @@ def after(job: Job, outcome: Outcome, folder: Path) -> Job:
     else:
         can_resume = job.kind == "train_field" and isinstance(outcome, JobStopped | JobDied)
         then = ended(job, "failed", note="Failed", error=f"{outcome} {RESUMES_NOTE}" if can_resume else str(outcome))
+    if then.state != "done" and job.kind == "robot":
+        then = _robot_stopped(then, folder)
     if then.state != "done" and not keeps:
         shutil.rmtree(folder, ignore_errors=True)
         return then
@@ -61,3 +65,13 @@ def after(job: Job, outcome: Outcome, folder: Path) -> Job:
                 left.unlink()
     files = tuple(sorted(path.name for path in folder.glob("[!.]*") if path.is_file()))
     return replace(then, files=files)
+
+
+def _robot_stopped(then: Job, folder: Path) -> Job:
+    """The job of a robot that was broken off: it and its report tell so, and why, in the same words."""
+    result = dict(then.result or {})
+    if result.get("outcome") is None:
+        why = then.error or _WITHOUT_A_WORD
+        tell_stopped(folder, why)
+        result |= {"outcome": STOPPED, "text": why}
+    return replace(then, result=result)

@@ -178,8 +178,13 @@ class Jobs:
             self._changed.notify_all()
             return self.get(job.id)
 
-    def cancel(self, job: str, wait_s: float = 3.0) -> Job:
+    def cancel(self, job: str, wait_s: float = 3.0, why: str | None = None) -> Job:
         """Take a job out of the queue or end it; waits until it has ended.
+
+        Args:
+            job: identifier.
+            wait_s: for how long at most [s].
+            why: a sentence that the job tells from then on, where that is not clear.
 
         Raises:
             UnknownName: if there is no such job.
@@ -192,11 +197,13 @@ class Jobs:
             if known.state == "queued":
                 shutil.rmtree(self.folder(job), ignore_errors=True)
                 forget_workshop(self._data_dir, self._table, known)
-                self._table.set(ended(self._table[job], "cancelled", note="Cancelled"))
+                self._table.set(ended(self._table[job], "cancelled", note="Cancelled", error=why))
                 self._table.publish_queue()
                 return self.get(job)
             if self._loop.run is not None:
                 self._loop.run.cancel(0.0 if known.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
+            if known.error is None and why is not None:
+                self._table.set(replace(self._table[job], error=why))
             self._changed.wait_for(lambda: self._table[job].is_finished, wait_s)
             return self.get(job)
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO_FILE
 from app.episodes.frames import frame, read_frames, write_video
 from app.episodes.record import by_name, goal_to_json
+from app.episodes.robots.stopped_report import STOPPED
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.geometry.states import Observation
 from osfcore.io.files import write_json
@@ -71,12 +72,12 @@ class RobotRecord:
             self._write()
 
     def broken_off(self, reason: str) -> None:
-        """Note that the episode ended before its end.
+        """Note that the episode ended before its end, unless that has come.
 
         Raises:
             CannotWrite: if the disk refuses.
         """
-        self._outcome = "stopped", reason
+        self._outcome = self._outcome or (STOPPED, reason)
         self._write()
 
     def finish(self) -> dict[str, Any]:

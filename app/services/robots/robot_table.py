@@ -138,8 +138,10 @@ class RobotTable:
 
     def close(self) -> None:
         """Stop the robot and let it go."""
-        if self._live() is not None:
+        live = self._live()
+        if live is not None:
             self.stop("the service was ended")
+            self._cancel(live.id)  # again, until it has ended: what comes next would not let it
         self._leave()
         if self._line is not None:
             self._line.close()
@@ -235,8 +237,9 @@ class RobotTable:
     # Inside
 
     def _cancel(self, job: str) -> None:
+        why = self._stopped[1] if self._stopped is not None and self._stopped[0] == job else None
         with contextlib.suppress(OsfError):  # it may be over meanwhile
-            self._runner.jobs.cancel(job)
+            self._runner.jobs.cancel(job, why=why)
 
     def _now(self) -> RobotNow:
         job, about = self._latest(), self._about

@@ -1,3 +1,6 @@
+import json
+from dataclasses import replace
+
 import pytest
 
 from app.jobs.job import Job
@@ -50,6 +53,31 @@ def test_an_episode_keeps_its_steps_however_it_ends(folder, outcome, state, erro
     assert over.is_finished
     assert (over.done, over.result) == (3, {"steps": 3})
     assert (folder / "inputs").is_dir()
+
+
+@pytest.mark.parametrize("outcome", [STOPPED, DIED, REFUSED, JobCancelled()])
+@pytest.mark.parametrize("told", [(None, None), ("stopped", "The robot was stopped: by something.")])
+def test_a_robot_that_was_stopped_and_its_report_tell_the_same_cause(folder, outcome, told):
+    (folder / "report.json").write_text(json.dumps({"outcome": told[0], "text": told[1], "steps": []}))
+    why = "The robot was stopped: somebody pressed Stop."
+    over = after(replace(running("robot"), error=why), outcome, folder)
+    report = json.loads((folder / "report.json").read_text())
+    assert report == {"outcome": "stopped", "text": over.error, "steps": []}
+    assert over.result == {"steps": 3, "outcome": "stopped", "text": over.error}
+    assert (over.error == why) == (outcome == JobCancelled())
+
+
+def test_a_robot_whose_episode_was_over_is_not_called_stopped(folder):
+    text = json.dumps({"outcome": "reached", "text": "It is reached."})
+    (folder / "report.json").write_text(text)
+    over = after(replace(running("robot"), result={"outcome": "reached"}), JobCancelled(), folder)
+    assert (over.result, (folder / "report.json").read_text()) == ({"outcome": "reached"}, text)
+
+
+def test_a_robot_that_was_stopped_without_a_report_tells_it_itself(tmp_path):
+    over = after(running("robot"), JobCancelled(), tmp_path / "none")
+    assert over.result["outcome"] == "stopped"
+    assert "its job was cancelled" in over.result["text"]
 
 
 @pytest.mark.parametrize(

@@ -3,21 +3,29 @@ import io
 import json
 import time
 
+import httpx2
+import numpy as np
 import pytest
 from PIL import Image
 
+from app.episodes.file_names import REPORT_FILE
+from app.episodes.robots.camera_files import write_pictures
 from app.jobs.clock import JobClock
 from app.processes.messages.job_messages import JobCancelled, JobStep
 from app.services import runner
 from app.services.robots import robot_table
 from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.states import Observation
+from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_to_json
 from osfcore.robots.robot import ConnectionLost
 from tests.app.conftest import running, until
 from tests.core.robots.robots import NAMES, example, noted, serving, simulated
+from tests.core.robots.ros_stand_in import StandIn
 from tests.live import free_port
 
 PAGE = {"X-OSF-Visitor": "page"}
+GREY = 188  # in sRGB, half the radiance
 
 
 class Process:
@@ -161,6 +169,39 @@ def test_a_stop_reaches_the_robot_and_ends_the_episode_however_often(service, ro
     assert state(service) == "stopped"
 
 
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        (lambda client, _: client.post("/api/robot/stop"), "somebody pressed Stop"),
+        (lambda client, episode: client.delete(f"/api/jobs/{episode}"), "its job was cancelled"),
+        (lambda client, _: until(lambda: state(client) == "stopped"), "the page that let it move was closed"),
+        (lambda client, _: client.app.state.services.robot.close(), "the service was ended"),
+    ],
+)
+def test_job_and_report_of_what_was_stopped_tell_how(service, how, words):
+    episode = begun(service)
+    assert allow(service, episode, headers=PAGE).status_code == 200
+    Process.latest.tells("driving")
+    report = service.app.state.services.runner.jobs.folder(episode) / REPORT_FILE
+    write_json(report, {"outcome": None, "text": None, "steps": []})
+    how(service, episode)
+    until(lambda: service.get(f"/api/jobs/{episode}").json()["state"] == "cancelled")
+    result = service.get(f"/api/jobs/{episode}").json()["result"]
+    told = json.loads(report.read_text())
+    assert (result["outcome"], told["outcome"]) == ("stopped", "stopped")
+    assert words in result["text"]
+    assert told["text"] == result["text"]
+
+
+def test_why_it_was_stopped_is_known_after_the_service_was_started_anew(monkeypatch, library, tmp_path, robot):
+    with service_with(monkeypatch, library, tmp_path, robot=robot[0]) as client:
+        begun(client, "driving")
+        client.post("/api/robot/stop")
+    with service_with(monkeypatch, library, tmp_path, robot=robot[0]) as client:
+        told = client.get("/api/robot").json()
+        assert (told["state"], told["text"]) == ("stopped", "The robot was stopped: somebody pressed Stop.")
+
+
 def test_anybody_may_stop_it_while_only_the_driver_may_begin(service, robot):
     service.app.state.services.driver.arrive("page")
     other = {"X-OSF-Visitor": "other"}
@@ -238,3 +279,106 @@ def test_a_goal_of_another_camera_is_refused(service):
     body = {"goal": photographed(service, "above"), "names": list(NAMES)}
     answer = service.post("/api/robot/episodes", json=body)
     assert (answer.status_code, "camera of the robot named 'above'" in answer.json()["detail"]) == (422, True)
+
+
+def cameras(client):
+    """Names of cameras, and when they saw what is shown."""
+    return {camera["name"]: camera["seen_at"] for camera in client.get("/api/robot/cameras").json()}
+
+
+def shown(client, name="0"):
+    answer = client.get(f"/api/robot/cameras/{name}.jpg")
+    assert (answer.status_code, answer.headers["Content-Type"]) == (200, "image/jpeg"), answer.text
+    return pixels(answer.content)
+
+
+def pixels(file):
+    return np.asarray(Image.open(io.BytesIO(file)).convert("RGB"), int)
+
+
+def looked(client, episode):
+    """As an episode does that has looked, and has seen grey everywhere."""
+    views = default_cameras(64)
+    seen = Observation(views, np.full((4, 64, 64, 3), 0.5, np.float32), NAMES, None, None, 0.0)
+    write_pictures(client.app.state.services.runner.jobs.folder(episode), seen)
+
+
+def test_cameras_are_shown_as_they_see_it_and_asked_at_most_once_a_second(service, robot):
+    assert service.get("/api/robot/cameras/0.jpg").status_code == 200
+    asked = robot[1].count("/images/0")
+    assert asked == 1
+    (first, *_) = told = service.get("/api/robot/cameras").json()
+    assert [(camera["name"], camera["width"], camera["height"]) for camera in told] == [
+        (str(n), 64, 64) for n in range(4)
+    ]
+    assert first["age_s"] < 30
+    assert shown(service).shape == (64, 64, 3)
+    before = cameras(service)
+    until(lambda: cameras(service) != before)
+    assert all(seen > before[name] for name, seen in cameras(service).items())
+
+
+def test_a_picture_is_what_the_camera_sent(service, robot):
+    sent = pixels(httpx2.get(f"{robot[0]}/images/1").content)
+    assert np.abs(shown(service, "1") - sent).mean() < 2
+
+
+def test_an_episode_that_looks_or_moves_is_not_held_up_by_who_watches(service, robot):
+    episode = begun(service, "driving")
+    looked(service, episode)
+    robot[1].clear()
+    before = cameras(service)
+    assert all(before.values())
+    assert np.all(shown(service) == GREY)
+    time.sleep(1.1)
+    assert cameras(service) == before
+    assert robot[1] == []
+
+
+def test_before_the_first_look_there_is_no_picture_and_that_is_told(service, robot):
+    begun(service, "driving")
+    assert set(cameras(service).values()) == {None}
+    answer = service.get("/api/robot/cameras/0.jpg")
+    assert (answer.status_code, "first look" in answer.json()["detail"]) == (404, True)
+
+
+def test_whoever_is_asked_for_permission_sees_the_table_as_it_is_now(service):
+    looked(service, begun(service))
+    before = cameras(service)
+    until(lambda: cameras(service) != before)
+    assert not np.all(shown(service) == GREY)
+
+
+def test_a_camera_that_there_is_not_is_told(service):
+    answer = service.get("/api/robot/cameras/above.jpg")
+    assert (answer.status_code, "no camera of the robot named 'above'" in answer.json()["detail"]) == (404, True)
+
+
+def test_what_was_seen_stays_when_the_robot_is_lost(monkeypatch, library, tmp_path):
+    with contextlib.closing(simulated(library)) as table, contextlib.ExitStack() as going:
+        url = going.enter_context(serving(example().robot(table)))
+        with service_with(monkeypatch, library, tmp_path, robot=url) as client:
+            before, picture = cameras(client), shown(client)
+            going.close()
+            time.sleep(1.1)
+            assert cameras(client) == before
+            np.testing.assert_array_equal(shown(client), picture)
+
+
+def test_without_a_robot_there_are_no_cameras(monkeypatch, library, tmp_path):
+    with service_with(monkeypatch, library, tmp_path) as client:
+        for path in ("cameras", "cameras/0.jpg"):
+            answer = client.get(f"/api/robot/{path}")
+            assert (answer.status_code, "osf serve --robot" in answer.json()["detail"]) == (404, True)
+
+
+def test_cameras_of_ros_are_shown_too_with_slashes_in_their_names(monkeypatch, library, tmp_path):
+    stand_in = StandIn()
+    for topic, message in list(stand_in.messages().items()):
+        if topic.startswith("/left/"):
+            stand_in.extra[topic.replace("/left/", "/front/left/")] = message
+    with stand_in.running() as url:
+        url = url.replace("left,right", "front/left,right")
+        with service_with(monkeypatch, library, tmp_path, robot=url) as client:
+            assert list(cameras(client)) == ["front/left", "right"]
+            assert shown(client, "front/left").shape == (64, 64, 3)
