@@ -1,6 +1,7 @@
 """A robot driven from the page: a real browser, the real service, the example's robot on a simulated table."""
 
 import contextlib
+import re
 import shutil
 import urllib.request
 from dataclasses import replace
@@ -68,8 +69,34 @@ def moving(page, robot):
     until(lambda: np.any(robot[1].truth().pusher != before), 60)
     page.wait_for_selector('#world[data-state="danger"]', timeout=WAIT_MS)
     assert page.inner_text("#world") == f"Robot at {robot[0].removeprefix('http://')}: moving"
+    assert "its own looks" in page.inner_text("#robot-cameras-note")
+    assert len(addresses(page)) == 4
     page.screenshot(path=ARTIFACTS / "robot-moves.png")
     robot[2].clear()
+
+
+def addresses(page):
+    """Of the pictures of the robot's cameras that have been loaded."""
+    images = page.locator("#robot-cameras img")
+    return images.evaluate_all("all => all.filter((one) => one.naturalWidth === 256).map((one) => one.src)")
+
+
+def test_it_shows_what_the_cameras_of_the_robot_see_and_how_old_that_is(page, robot):
+    until(lambda: len(addresses(page)) == 4, 60)
+    before = addresses(page)
+    until(lambda: not set(before) & set(addresses(page)), 60)
+    captions = page.locator("#robot-cameras span").all_inner_texts()
+    assert [caption.partition(", ")[0] for caption in captions] == ["0", "1", "2", "3"]
+    assert all(re.fullmatch(r"\d, (now|\d+ s ago)", caption) for caption in captions)
+    assert "the tab Robot" in page.inner_text("#robot-elsewhere")
+    ARTIFACTS.mkdir(exist_ok=True)
+    page.screenshot(path=ARTIFACTS / "robot-cameras.png")
+    robot[2].clear()
+    page.click("#tab-scenes")
+    page.wait_for_timeout(1000)  # for what was asked before
+    robot[2].clear()
+    page.wait_for_timeout(3000)
+    assert not [path for path in robot[2] if path.startswith("/images")]
 
 
 @pytest.mark.parametrize("how", ["button", "Escape", "closed"])
