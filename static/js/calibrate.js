@@ -3,7 +3,7 @@ import { post, upload } from "./api.js";
 import { byId, el } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { set } from "./state.js";
-import { act } from "./toasts.js";
+import { act, tellFailure } from "./toasts.js";
 
 const NAME_MAX = 100;
 const KEPT = "osf-camera"; // the camera that was saved, for photos of later visits
@@ -28,7 +28,11 @@ function entry(photo, told) {
   return el("li", {}, el("div", { className: "marked" }, el("span", { className: "title", textContent: photo.name }), drop), found);
 }
 
+/** Where the board lies on the table, as REST takes it. */
+const place = () => Object.fromEntries([...new FormData(byId("board-place"))].map(([name, value]) => [name, Number(value)]));
+
 function show(told) {
+  byId("board-place").hidden = !table;
   const all = table ? [...photos, table] : photos;
   byId("board-photos").replaceChildren(...all.map((photo) => entry(photo, told)));
   byId("calibration-result").hidden = !told;
@@ -53,7 +57,7 @@ async function assess() {
   show(null);
   const seen = photos.filter(({ refused }) => !refused).map(({ id }) => id);
   if (!seen.length && !table) return;
-  const told = await post("calibration", { photos: seen, table: table?.id ?? null });
+  const told = await post("calibration", { photos: seen, table: table?.id ?? null, place: place() });
   if (mine === asked) show(told);
 }
 
@@ -112,5 +116,7 @@ export function setUpCalibrate() {
       if (mayDrive()) await act(byId(button), () => add(files, isTable));
     });
   }
+  byId("board-place").addEventListener("submit", (event) => event.preventDefault());
+  byId("board-place").addEventListener("change", () => { if (byId("board-place").reportValidity()) tellFailure(assess); });
   byId("save-camera").addEventListener("click", save);
 }

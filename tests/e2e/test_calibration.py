@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from osfcore.photo.calibration.calibrate import board_place
 from tests.app.api.routes.test_calibration import ON_TABLE, TILTS, png_of
 from tests.app.api.routes.test_table_photos import gray
 from tests.core.photo.seen_boards import K, tilted
@@ -41,6 +42,14 @@ def send(page, field, *photos):
     page.wait_for_selector("#calibration-result:not([hidden])")
 
 
+def lain(page, field, value):
+    """Say where the board lies on the table."""
+    with page.expect_response(lambda answer: answer.url.endswith("/api/calibration")):
+        page.fill(f'#board-place [name="{field}"]', str(value))
+        page.press(f'#board-place [name="{field}"]', "Enter")
+    page.wait_for_selector("#save-camera:not([disabled])")
+
+
 def test_a_camera_is_calibrated_saved_and_used(page, port):
     boards = [(f"board{n}.png", png_of(tilted(tilt).inverse(), n)) for n, tilt in enumerate(TILTS)]
     send(page, "#board-photo-files", boards[0])
@@ -55,13 +64,17 @@ def test_a_camera_is_calibrated_saved_and_used(page, port):
     assert page.is_hidden("#calibration-missing")
     assert page.inner_text("#calibration-error").startswith("0.")
     table = png_of(ON_TABLE, 9)
+    assert page.is_hidden("#board-place")
     send(page, "#table-view-file", ("table.png", table))
+    lain(page, "x_m", 0.1)
+    lain(page, "turn_deg", 90)
+    turned = board_place(0.1, 0.0, 90.0) @ ON_TABLE
     assert page.locator("#board-photos li").count() == len(boards) + 1
     with page.expect_download() as download:
         page.click("#save-camera")
     camera = json.loads(download.value.path().read_text())
     assert np.abs(np.array(camera["K"]) - K).max() < 3
-    assert np.abs(np.array(camera["T_world_camera"]) - ON_TABLE.matrix()).max() < 2e-3
+    assert np.abs(np.array(camera["T_world_camera"]) - turned.matrix()).max() < 2e-3
     page.set_input_files("#table-photo-file", {"name": "t.png", "mimeType": "image/png", "buffer": table})
     page.wait_for_selector("#photo-calibrated:not([hidden])")
     with page.expect_response(lambda answer: answer.request.method == "PATCH"):

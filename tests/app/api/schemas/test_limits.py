@@ -27,6 +27,9 @@ NUMBERS = {
     "episodes": ["CollectPushesParams.episodes"],
     "steps": ["CollectPushesParams.steps"],
     "objects": ["CollectPushesParams.objects"],
+    "x_m": ["PlaceIn.x_m"],
+    "y_m": ["PlaceIn.y_m"],
+    "turn_deg": ["PlaceIn.turn_deg"],
     "robot-steps": ["RobotSettingsIn.steps"],
     "size": ["CollectObjectParams.size", "CollectTableParams.size"],
 }  # fmt: skip
