@@ -63,11 +63,11 @@ class HttpRobot:
             self._cameras = tuple(_camera(entry) for entry in told.cameras)
             limits = SafetyLimits((*told.limits.box,), told.limits.top_speed_m_s)  # pyright: ignore[reportArgumentType]
             cameras = tuple(camera.kept() for camera in self._cameras)
-            self._description = RobotDescription(cameras, limits, told.pusher_radius_m, told.deadman_s)
+            masks = frozenset(told.masks)
+            self._description = RobotDescription(cameras, limits, told.pusher_radius_m, told.deadman_s, masks)
         except OsfError:
             self.close()
             raise
-        self._masked = frozenset(told.masks)
         self._began = time.monotonic()
 
     @property
@@ -89,7 +89,7 @@ class HttpRobot:
         """
         pusher = decode(PointJson, self._json("GET", "pusher"), f"answer of {self._url}/pusher").position
         pictures = self.pictures()
-        sent = self._masks() if masks and self._masked.issuperset(self._names) else None
+        sent = self._masks() if masks and self._description.masks.issuperset(self._names) else None
         seconds = time.monotonic() - self._began
         return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
 

@@ -59,12 +59,14 @@ class RobotDescription:
         limits: that it keeps itself.
         pusher_radius_m: of its hand, a vertical cylinder [m].
         deadman_s: without a new command it halts after this time [s].
+        masks: objects whose masks it delivers.
     """
 
     cameras: tuple[Camera, ...]
     limits: SafetyLimits
     pusher_radius_m: float = PUSHER_RADIUS_M
     deadman_s: float = STEP_S
+    masks: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         """Check the ranges.

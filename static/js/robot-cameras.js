@@ -2,7 +2,7 @@
 import { get } from "./api.js";
 import { LatestImage } from "./cameras.js";
 import { byId, el } from "./dom.js";
-import { known } from "./state.js";
+import { known, set } from "./state.js";
 
 const EVERY_MS = 2000;
 const OLD_S = 10; // from then on it is said in colour
@@ -35,9 +35,11 @@ function draw(cameras) {
     const its = tiles.get(camera.name);
     its.words.textContent = `${camera.name}, ${age(camera)}`;
     its.words.className = camera.age_s > OLD_S ? "old" : "";
-    if (camera.seen_at && camera.seen_at !== its.shown) its.latest.show(`${its.href}?v=${encodeURIComponent(camera.seen_at)}`);
-    its.shown = camera.seen_at;
+    const url = camera.seen_at && `${its.href}?v=${encodeURIComponent(camera.seen_at)}`;
+    if (url && url !== its.shown) its.latest.show(url);
+    its.shown = url;
   }
+  set("robotPictures", Object.fromEntries([...tiles].map(([name, { shown }]) => [name, shown])));
 }
 
 async function refresh() {

@@ -4,6 +4,7 @@ import { get, post, upload } from "./api.js";
 import { byId, el } from "./dom.js";
 import { isDriving } from "./driver.js";
 import { refreshGoals } from "./goals.js";
+import { boxesFor, drawnBoxes, forgetBoxes, missingBoxes, setUpRobotBoxes } from "./robot-boxes.js";
 import { setUpRobotCameras } from "./robot-cameras.js";
 import { inWords, known, labelOf, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
@@ -121,7 +122,8 @@ function reason() {
   if (robot().state === "lost" && !robot().cameras.length) return "The robot does not answer.";
   if (isBusy()) return "It has an episode.";
   if (!chosenNames().length) return "Choose the objects on its table.";
-  return byId("robot-goal").value ? "" : "Choose a photo that one of its cameras took, without the pusher.";
+  if (!byId("robot-goal").value) return "Choose a photo that one of its cameras took, without the pusher.";
+  return missingBoxes();
 }
 
 function drawStart() {
@@ -129,6 +131,11 @@ function drawStart() {
   const why = reason();
   byId("robot-start").disabled = why !== "";
   byId("robot-reason").textContent = why || "It looks and plans; then it asks before anything moves.";
+}
+
+function chooseNames() {
+  boxesFor(chosenNames());
+  drawStart();
 }
 
 function drawChoices() {
@@ -143,7 +150,7 @@ function drawChoices() {
   const camera = byId("robot-camera");
   const cameras = robot().cameras.map(({ name }) => name);
   if (camera.options.length !== cameras.length) camera.replaceChildren(...cameras.map((name) => el("option", { value: name, textContent: name })));
-  drawStart();
+  chooseNames();
 }
 
 async function uploadGoal() {
@@ -159,8 +166,11 @@ async function uploadGoal() {
   byId("robot-file").value = "";
 }
 
-const start = () => act(byId("robot-start"), async () =>
-  set("robot", await post("robot/episodes", { goal: byId("robot-goal").value, names: chosenNames(), settings: { steps: Number(byId("robot-steps").value) } })));
+const start = () => act(byId("robot-start"), async () => {
+  const asked = { goal: byId("robot-goal").value, names: chosenNames(), boxes: drawnBoxes(), settings: { steps: Number(byId("robot-steps").value) } };
+  set("robot", await post("robot/episodes", asked));
+  forgetBoxes();
+});
 
 // Drawing
 
@@ -196,6 +206,7 @@ function draw() {
 
 export function setUpRobot() {
   setUpRobotCameras();
+  setUpRobotBoxes(drawStart);
   byId("robot-stop").addEventListener("click", stopRobot);
   byId("robot-allow").addEventListener("click", allow);
   byId("robot-refuse").addEventListener("click", stopRobot);
@@ -205,7 +216,7 @@ export function setUpRobot() {
   });
   byId("robot-start").addEventListener("click", start);
   byId("robot-file").addEventListener("change", uploadGoal);
-  byId("robot-names").addEventListener("change", drawStart);
+  byId("robot-names").addEventListener("change", chooseNames);
   byId("robot-goal").addEventListener("change", drawStart);
   window.addEventListener("keydown", stopKey, true);
   new MutationObserver(drawWorld).observe(byId("panel-robot"), { attributeFilter: ["hidden"] });

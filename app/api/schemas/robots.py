@@ -91,6 +91,7 @@ class RobotOut(BaseModel):
     text: str = Field(description="What it does, or what happened, for a person.")
     limits: RobotLimitsOut | None
     cameras: list[CameraJson]
+    masks: list[str] = Field(description="Objects whose masks it delivers; where others lie, boxes are needed.")
     deadman_s: float | None = Field(description="Without a new command it halts after this time [s].")
     episode: JobOut | None = Field(description="The job that drives it now, or did last.")
 
@@ -104,6 +105,7 @@ class RobotOut(BaseModel):
             text=now.text,
             limits=None if limits is None else RobotLimitsOut.model_validate(limits, from_attributes=True),
             cameras=[] if about is None else [CameraJson.model_validate(camera_to_json(c)) for c in about.cameras],
+            masks=[] if about is None else sorted(about.masks),
             deadman_s=None if about is None else about.deadman_s,
             episode=None if now.episode is None else JobOut.of(now.episode),
         )

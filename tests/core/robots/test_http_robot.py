@@ -36,6 +36,7 @@ def test_it_describes_itself(robot, server):
         np.testing.assert_allclose(camera.intrinsics, true.intrinsics)
     assert told.limits.box == (-0.35, -0.35, 0.35, 0.35)
     assert told.deadman_s == 0.2
+    assert told.masks == set(NAMES)
 
 
 def test_pictures_come_as_radiance_with_masks_on_demand(robot, server):

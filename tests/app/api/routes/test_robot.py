@@ -115,6 +115,7 @@ def test_it_tells_limits_that_hold_for_both(service, robot):
     assert (told["host"], told["state"], told["episode"]) == (robot[0].removeprefix("http://"), "idle", None)
     assert told["limits"] == {"box": [-0.35, -0.35, 0.35, 0.35], "top_speed_m_s": 0.05}
     assert [camera["name"] for camera in told["cameras"]] == ["0", "1", "2", "3"]
+    assert told["masks"] == sorted(NAMES)
 
 
 def test_a_service_without_a_robot_says_so(monkeypatch, library, tmp_path):
