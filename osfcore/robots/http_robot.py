@@ -41,7 +41,7 @@ class RobotJson(Entry):
 
 
 class HttpRobot:
-    """One robot; a `Robot`.
+    """One robot; a `Robot`. `description` is what it says of itself.
 
     Args:
         url: where it is, such as http://192.168.0.7:8080.
@@ -64,16 +64,11 @@ class HttpRobot:
             limits = SafetyLimits((*told.limits.box,), told.limits.top_speed_m_s)  # pyright: ignore[reportArgumentType]
             cameras = tuple(camera.kept() for camera in self._cameras)
             masks = frozenset(told.masks)
-            self._description = RobotDescription(cameras, limits, told.pusher_radius_m, told.deadman_s, masks)
+            self.description = RobotDescription(cameras, limits, told.pusher_radius_m, told.deadman_s, masks)
         except OsfError:
             self.close()
             raise
         self._began = time.monotonic()
-
-    @property
-    def description(self) -> RobotDescription:
-        """What the robot says of itself."""
-        return self._description
 
     def reset(self, seed: int) -> Observation:
         """Only look: what lies on the table is a person's business."""
@@ -89,7 +84,7 @@ class HttpRobot:
         """
         pusher = decode(PointJson, self._json("GET", "pusher"), f"answer of {self._url}/pusher").position
         pictures = self.pictures()
-        sent = self._masks() if masks and self._description.masks.issuperset(self._names) else None
+        sent = self._masks() if masks and self.description.masks.issuperset(self._names) else None
         seconds = time.monotonic() - self._began
         return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
 

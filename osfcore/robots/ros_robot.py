@@ -84,7 +84,7 @@ class _Picture(Entry):
 
 
 class RosRobot:
-    """One robot; a `Robot`.
+    """One robot; a `Robot`. `description` has cameras as ROS tells them, and the limits that were given.
 
     Args:
         url: of rosbridge's websocket, ws://host:9090.
@@ -114,13 +114,8 @@ class RosRobot:
         except OsfError:
             self._bridge.close()
             raise
-        self._description = RobotDescription(cameras, limits)
+        self.description = RobotDescription(cameras, limits)
         self._began = time.monotonic()
-
-    @property
-    def description(self) -> RobotDescription:
-        """Cameras as ROS tells them, limits as they were given."""
-        return self._description
 
     def reset(self, seed: int) -> Observation:
         """Only look: what lies on the table is a person's business."""

@@ -87,7 +87,7 @@ function keep() {
   if (box[2] - box[0] >= LEAST_PX && box[3] - box[1] >= LEAST_PX) {
     const { name } = camera();
     boxes.set(name, of(name).set(byId("robot-box-object").value, box));
-    byId("robot-box-object").value = without(name)[0] ?? byId("robot-box-object").value;
+    byId("robot-box-object").value = without(name)[0] ?? names[0];
     tell();
   }
   drawPicture();

@@ -1,4 +1,4 @@
-"""A robot under ROS driven from the page: boxes drawn in its pictures, for it delivers no masks; rosbridge is a stand-in."""
+"""A robot under ROS driven from the page, with boxes drawn in its pictures; rosbridge is a stand-in."""
 
 import contextlib
 import shutil
@@ -23,17 +23,17 @@ AROUND_PX = 3
 
 @pytest.fixture(scope="module")
 def robot(library):
-    """The stand-in, its address, boxes around the objects in the first camera's picture, and a photo by that."""
+    """The stand-in, its address, boxes around the objects by camera, and a photo of how the table should look."""
     with contextlib.closing(simulated(library, SIDE)) as table:
         start = table.truth()
-        (masks,) = table.render(table.cameras[:1], masks=True).masks
-        boxes = {name: around(mask) for name, mask in zip(table.names, masks, strict=True)}
+        masks = table.render(table.cameras, masks=True).masks
+        boxes = [{name: around(mask) for name, mask in zip(table.names, its, strict=True)} for its in masks]
         table.load(replace(toward_middle(start), pusher=np.array([-0.35, -0.35, start.pusher[2]])))
         photo = encode_jpeg(to_uint8(srgb_of_linear(table.render(table.cameras[:1]).images[0])))
         table.restore(start)
         stand_in = TableStandIn(table)
         with stand_in.running() as url:
-            yield stand_in, f"{url.partition('?')[0]}?{QUERY}", boxes, photo
+            yield stand_in, f"{url.partition('?')[0]}?{QUERY}", dict(zip(stand_in.cameras, boxes, strict=True)), photo
 
 
 def around(mask):
@@ -75,11 +75,14 @@ def test_it_is_driven_with_boxes_that_are_drawn_in_its_pictures(page, robot):
     page.set_input_files("#robot-file", {"name": "wanted.jpg", "mimeType": "image/jpeg", "buffer": photo})
     page.wait_for_selector("#robot-goal option", state="attached", timeout=WAIT_MS)
     page.wait_for_selector("#robot-boxes-image[href]", timeout=WAIT_MS)
-    for name in NAMES:
-        assert page.is_disabled("#robot-start")
-        assert "Draw a box around" in page.inner_text("#robot-reason")
-        assert page.input_value("#robot-box-object") == name
-        draw(page, boxes[name])
+    assert page.is_disabled("#robot-start")
+    assert "Draw a box around Tomato soup can, Gelatin box in" in page.inner_text("#robot-reason")
+    for camera, around_objects in boxes.items():
+        page.select_option("#robot-box-camera", camera)
+        for name in NAMES:
+            page.select_option("#robot-box-object", name)
+            draw(page, around_objects[name])
+    assert page.is_enabled("#robot-start")
     ARTIFACTS.mkdir(exist_ok=True)
     page.screenshot(path=ARTIFACTS / "robot-boxes.png")
     page.click("#robot-start:not([disabled])", timeout=WAIT_MS)

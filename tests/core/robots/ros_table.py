@@ -24,19 +24,19 @@ class TableStandIn(StandIn):
         super().__init__()
         self.table, self._using = table, threading.RLock()
         names = QUERY.partition("=")[2].split(",")
-        self._cameras = dict(zip(names, table.cameras, strict=True))
+        self.cameras = dict(zip(names, table.cameras, strict=True))
         self._told = self._seen = None
         self._look()
 
     def messages(self):
         told = {f"/{name}/image_raw/compressed": {"format": "jpeg", "data": data} for name, data in self._seen.items()}
-        for name, camera in self._cameras.items():
+        for name, camera in self.cameras.items():
             told[f"/{name}/camera_info"] = {
                 "header": {"frame_id": f"{name}_optical"}, "width": camera.width, "height": camera.height,
                 "d": [0.0] * 5, "k": (camera.intrinsics - _HALF_PIXEL).ravel().tolist(),
             }  # fmt: skip
         static = [transform("base", "table", T_BASE_TABLE)]
-        static += [transform("base", f"{n}_optical", T_BASE_TABLE @ c.T_world_camera) for n, c in self._cameras.items()]
+        static += [transform("base", f"{n}_optical", T_BASE_TABLE @ c.T_world_camera) for n, c in self.cameras.items()]
         told["/tf_static"] = {"transforms": static}
         pusher = Pose(self.pusher, np.array([1.0, 0, 0, 0]))
         return told | {"/tf": {"transforms": [transform("table", "pusher", pusher)]}}
@@ -59,7 +59,7 @@ class TableStandIn(StandIn):
 
     def _look(self):
         self.pusher = self.table.truth().pusher
-        seen = self.table.render(tuple(self._cameras.values())).images
+        seen = self.table.render(tuple(self.cameras.values())).images
         bgr = [to_uint8(srgb_of_linear(image))[..., ::-1] for image in seen]
         jpegs = [cv2.imencode(".jpg", each, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes() for each in bgr]
-        self._seen = dict(zip(self._cameras, (base64.b64encode(each).decode() for each in jpegs), strict=True))
+        self._seen = dict(zip(self.cameras, (base64.b64encode(each).decode() for each in jpegs), strict=True))
