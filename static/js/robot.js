@@ -41,7 +41,7 @@ export function hearRobot(job) {
   if (job.kind !== "robot") return;
   const now = `${job.id} ${job.state} ${job.result?.drives} ${job.done}`;
   if (now !== heard) refreshRobot();
-  else byId("robot-note").textContent = inWords(job.note);
+  else if (isBusy()) byId("robot-note").textContent = inWords(job.note); // once it was stopped, why is what counts
   heard = now;
 }
 

@@ -80,12 +80,14 @@ class RobotPictures:
             ConnectionLost, RobotRefused: if it has never answered.
         """
         cameras = self._cameras()
-        with self._looking:  # who comes meanwhile sees what is seen now
-            if self._may_look() and time.monotonic() - self._tried_at >= FRESH_S:
-                self._look(cameras)
-                self._tried_at = time.monotonic()
-            own = self._own
-        folder = self._episode()
+        if self._looking.acquire(blocking=not self._own):  # who comes during the first look waits for it
+            try:
+                if self._may_look() and time.monotonic() - self._tried_at >= FRESH_S:
+                    self._look(cameras)
+                    self._tried_at = time.monotonic()
+            finally:
+                self._looking.release()
+        own, folder = self._own, self._episode()
         return tuple(CameraNow(camera, _newest(own.get(camera.name), folder, camera.name)) for camera in cameras)
 
     def one(self, name: str) -> CameraPicture:
