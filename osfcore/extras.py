@@ -15,6 +15,7 @@ PACKAGES = {
     "mcap": ("foxglove",),
     "lerobot": ("pyarrow", "imageio_ffmpeg"),
     "ros": ("websockets",),
+    "usd": ("pxr",),
 }  # fmt: skip
 _LATEST_FOR_PYBULLET = (3, 11)
 
