@@ -106,7 +106,7 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
     write_bop_scene(tmp_path / "000048", *rendered)
     seen, state = tmp_path / "seen", tmp_path / "state.json"
     assert main(["import", "bop", str(tmp_path / "000048"), "--out", str(seen), "--images", "3", "9", "--json"]) == 0
-    assert result_of(capsys) == {"out": str(seen), "images": [3, 9], "objects": list(NAMES)}
+    assert result_of(capsys) == {"out": str(seen), "images": [3, 9], "objects": list(NAMES), "left_out": []}
     assert [camera.name for camera in read_observation(seen).cameras] == ["3", "9"]
     poses = json.loads((seen / "poses.json").read_text())
     for name in NAMES:
@@ -125,6 +125,8 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
     assert main(["export", "bop", *arguments]) == 0
     assert "4 poses in 2 images of scene 48" in capsys.readouterr().out
     assert len((tmp_path / "ours.csv").read_text().splitlines()) == 5
+    assert main(["check", str(tmp_path / "ours.csv")]) == 0
+    assert "is a good results file of BOP: 4 poses of 2 objects in 2 images." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
