@@ -1,5 +1,6 @@
 # make demo   build everything and open the page      make test   the quick tests (minutes)
 # make test-all   every test, browser included      make coverage   lines that the quick tests reach
+# make test-pythons   that the library installs and runs on later Pythons, where there is no simulator
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   OSF_DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
@@ -11,7 +12,9 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 OFFLINE := echo "make: the packages could not be installed; see the lines above (is there a network connection?)" >&2
 
-.PHONY: demo install dev test test-all test-types coverage lint soak bench clean
+LATER := 3.12 3.13
+
+.PHONY: demo install dev test test-all test-types test-pythons coverage lint soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch
@@ -47,6 +50,17 @@ test-all: dev test-types
 # Shapes and types of arrays are checked while the tests of the library run.
 test-types: dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile -p tests.typecheck tests/core
+
+# Their packages stay in .cache, five gigabytes each where torch comes with CUDA; from then on 'make test-all' has the test, too.
+test-pythons: dev $(LATER:%=.cache/python%/.installed)
+	$(BIN)/pytest -m slow tests/test_wheel.py -k later
+
+.cache/python%/.installed: pyproject.toml requirements.lock
+	python$* -m venv .cache/python$*
+	$(if $(TORCH_INDEX),.cache/python$*/bin/pip install -q -c requirements.lock --index-url $(TORCH_INDEX) torch,:)
+	.cache/python$*/bin/pip install -q -c requirements.lock '.[serve,gym,mcap,lerobot,ros,usd]'
+	.cache/python$*/bin/pip uninstall -q -y osf-manipulation
+	@touch $@
 
 coverage: dev
 	$(BIN)/pytest -n 2 --dist loadfile --cov=osfcore --cov=app --cov-report=term:skip-covered

@@ -17,7 +17,7 @@ A map of the rooms, each importing only from those above it:
     robots       robots over HTTP and ROS 2 as worlds; limits and a stop around any world
     paper        the paper's dynamics model as published, to compare ours with
     world        the simulated tabletop (PyBullet) and data collection
-    export       scenes and fields as files that other programs open: binary glTF, Gaussian splats
+    export       scenes and fields as files that other programs open: binary glTF, USD, Gaussian splats
     environments the tabletop as a Gymnasium environment, for programs that learn
     inspection   checks of files, and pictures of how they were understood
     experiments  evaluations and benchmarks; only the command line imports it

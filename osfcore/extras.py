@@ -10,11 +10,12 @@ from osfcore.errors import OsfError
 PACKAGES = {
     "sim": ("pybullet", "embreex", "coacd", "imageio_ffmpeg"),
     "serve": ("fastapi", "fastapi_offline", "uvicorn", "viser", "websockets", "msgspec", "prometheus_client",
-              "itsdangerous", "pydantic_settings"),
+              "itsdangerous", "pydantic_settings", "pybullet"),
     "gym": ("gymnasium",),
     "mcap": ("foxglove",),
     "lerobot": ("pyarrow", "imageio_ffmpeg"),
     "ros": ("websockets",),
+    "usd": ("pxr",),
 }  # fmt: skip
 _LATEST_FOR_PYBULLET = (3, 11)
 
@@ -46,9 +47,8 @@ def need(extra: str, what: str) -> None:
     Raises:
         MissingExtra: if they are not.
     """
-    missing = _missing(extra)
-    if missing:
-        raise MissingExtra(what, extra, missing)
+    if lacking := missing(extra):
+        raise MissingExtra(what, extra, lacking)
 
 
 def told_of(error: ModuleNotFoundError, what: str) -> MissingExtra | None:
@@ -60,8 +60,13 @@ def told_of(error: ModuleNotFoundError, what: str) -> MissingExtra | None:
     """
     package = (error.name or "").partition(".")[0]
     extra = next((extra for extra, packages in PACKAGES.items() if package in packages), None)
-    return None if extra is None else MissingExtra(what, extra, _missing(extra))
+    return None if extra is None else MissingExtra(what, extra, missing(extra))
 
 
-def _missing(extra: str) -> list[str]:
+def missing(extra: str) -> list[str]:
+    """Import names of packages of an extra that are not installed.
+
+    Args:
+        extra: of PACKAGES.
+    """
     return [package for package in PACKAGES[extra] if find_spec(package) is None]

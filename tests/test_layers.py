@@ -64,6 +64,7 @@ OWNERS = {  # who alone may import a package
     "pytorch_mppi": ("osfcore.experiments.benchmarks.pusht.planners",),
     "foxglove": ("app.episodes.mcap",),
     "imageio_ffmpeg": ("app.episodes.frames", "app.episodes.clip.clip", "osfcore.export.lerobot.video"),
+    "pxr": ("osfcore.export.usd",),
     "pyarrow": ("osfcore.export.lerobot.tables",),
     "fastapi": ("app",),
     "uvicorn": ("app",),

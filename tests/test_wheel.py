@@ -1,5 +1,7 @@
 """What pip installs of the wheel alone is a library that works, and says what more the rest needs."""
 
+import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,8 +13,11 @@ ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 
-def run(*command, cwd, check=True):
-    done = subprocess.run([str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False)
+def run(*command, cwd, check=True, **environment):
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
     assert done.returncode == 0 or not check, done.stderr[-2000:]
     return done
 
@@ -66,3 +71,58 @@ def test_what_is_missing_is_told_in_one_sentence(python, place, arguments, words
     (sentence,) = told.stderr.splitlines()
     assert sentence.startswith(words)
     assert "pip install 'osf-manipulation[" in sentence
+
+
+@pytest.fixture(scope="module", params=["3.12", "3.13"])
+def later(request, place, built):
+    """Python for which there is no PyBullet, with the wheel and all else that its extras bring."""
+    packages = ROOT / ".cache" / f"python{request.param}"
+    if not (packages / ".installed").exists():
+        pytest.skip(f"the packages for Python {request.param} are not here; 'make test-pythons' installs them")
+    home = place / request.param
+    run(packages / "bin" / "python", "-m", "venv", home, cwd=place)
+    (site,) = home.glob("lib/*/site-packages")
+    (site / "shared.pth").write_text(str(packages / site.relative_to(home)))
+    (wheel,) = built.glob("*.whl")
+    run(home / "bin" / "pip", "install", "-q", "--no-index", f"{wheel}[serve,gym,mcap,lerobot,ros,usd]", cwd=place)
+    return home / "bin" / "python"
+
+
+@pytest.fixture(scope="module")
+def pushed(place):
+    """Options that tell a scene and pushes in it."""
+    at = {"009_gelatin_box": [0.05, 0.02, 0.0145], "005_tomato_soup_can": [-0.08, 0.05, 0.0505]}
+    objects = [{"name": name, "position": position, "quaternion": [1, 0, 0, 0]} for name, position in at.items()]
+    scene = {"objects": objects, "light": {"position": [0.5, 0.3, 0.8]}, "pusher": {"position": [0.05, -0.1, 0.062]}}
+    (place / "scene.json").write_text(json.dumps({**scene, "cameras": []}))
+    (place / "actions.json").write_text(json.dumps({"actions": [[[0, 0.2, 0]] * 3], "step_s": 0.2}))
+    return place / "scene.json", place / "actions.json"
+
+
+def test_a_later_python_estimates(later, place):
+    shutil.copytree(ROOT / "examples", place / "examples", dirs_exist_ok=True)
+    run(later, "-W", "error", "-c", "import osfcore; osfcore.SceneRenderer, osfcore.Episode", cwd=place)
+    assert "light: 0." in run(later, "examples/estimate.py", cwd=place, PYTHONWARNINGS="error").stdout
+
+
+def test_a_later_python_predicts_draws_and_exports(later, place, pushed):
+    out = place / f"out{later.parts[-3]}"
+    commands = (
+        ("--help",),
+        ("check", pushed[0]),
+        ("predict", "--state", pushed[0], "--actions", pushed[1], "--out", out / "rollouts.json", "--images", out),
+        ("export", "scene", "--scene", pushed[0], "--out", out / "scene.usdz"),
+        ("export", "field", "009_gelatin_box", "--out", out / "gelatin.glb"),
+    )
+    told = [run(later.with_name("osf"), *c, cwd=place, PYTHONWARNINGS="error", OSF_DATA_DIR=str(out)) for c in commands]
+    assert "009_gelatin_box: goes up to" in told[2].stdout
+    assert {"000.png", "rollouts.json", "scene.usdz", "gelatin.glb"} <= {path.name for path in out.iterdir()}
+
+
+@pytest.mark.parametrize("arguments", [("serve",), ("episode", "--out", "e"), ("collect", "pushes", "--out", "p.h5")])
+def test_a_later_python_tells_what_it_lacks_in_one_sentence(later, place, arguments):
+    told = run(later.with_name("osf"), *arguments, cwd=place, check=False, OSF_DATA_DIR=str(place / "data"))
+    assert told.returncode == 1
+    (sentence,) = told.stderr.splitlines()
+    assert "needs pybullet, which is not installed" in sentence
+    assert sentence.endswith("under Python 3.11, the last one that PyBullet has wheels for.")

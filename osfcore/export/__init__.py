@@ -1,1 +1,1 @@
-"""Scenes and fields as files that other programs open: binary glTF and Gaussian splats."""
+"""Scenes and fields as files that other programs open: binary glTF, USD and Gaussian splats."""

@@ -38,6 +38,15 @@ def coloured_mesh(field: KiloOSF, light: Light | None = None) -> trimesh.Trimesh
     return mesh
 
 
+def field_meshes(field: KiloOSF, name: str, light: Light | None = None) -> trimesh.Scene:
+    """The coloured mesh, named, as exporters take it; arguments and errors as of `field_glb`."""
+    import trimesh
+
+    scene = trimesh.Scene()
+    scene.add_geometry(coloured_mesh(field, light), node_name=name, geom_name=name)
+    return scene
+
+
 def field_glb(field: KiloOSF, name: str, light: Light | None = None) -> bytes:
     """A field as binary glTF with vertex colours (see `osfcore.export.gltf` for axes and colours).
 
@@ -50,8 +59,4 @@ def field_glb(field: KiloOSF, name: str, light: Light | None = None) -> bytes:
     Raises:
         InvalidInput: if nothing in the field is solid.
     """
-    import trimesh
-
-    scene = trimesh.Scene()
-    scene.add_geometry(coloured_mesh(field, light), node_name=name, geom_name=name)
-    return glb(scene, is_unlit=light is not None)
+    return glb(field_meshes(field, name, light), is_unlit=light is not None)

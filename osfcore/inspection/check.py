@@ -30,6 +30,7 @@ from osfcore.io.rollout_file import actions_from_json
 from osfcore.io.scene_file import scene_from_json
 from osfcore.io.state_file import estimated_from_json, is_estimated
 from osfcore.photo.other_programs.bop_images import is_bop_scene, read_images
+from osfcore.photo.other_programs.pose_file import result_images
 
 _REASON_CHARACTERS = 500
 
@@ -39,7 +40,7 @@ class Report:
     """What a file turned out to be.
 
     Attributes:
-        kind: "scene", "state", "observation", "scene of BOP", "image set", "push file",
+        kind: "scene", "state", "observation", "scene of BOP", "results file of BOP", "image set", "push file",
             "actions", "field" or "dynamics".
         summary: its contents in words.
         facts: its contents in numbers.
@@ -71,8 +72,10 @@ def check_path(path: Path) -> Report:
         return _check_pushes(path)
     if path.suffix.lower() == ".safetensors":
         return _check_field(path)
+    if path.suffix.lower() == ".csv":
+        return _check_results(path)
     kinds = (
-        "a .json scene, state or actions, a .h5 push file, a .safetensors field or network, "
+        "a .json scene, state or actions, a .h5 push file, a .safetensors field or network, a .csv of BOP's results, "
         "nor the folder of an observation, image set or scene of BOP"
     )
     raise CorruptFile(path, f"it is neither {kinds}")
@@ -114,6 +117,14 @@ def _check_bop(folder: Path) -> Report:
     world = "cameras in one world" if facts["cameras in a world"] == len(images) else "cameras without a common world"
     summary = f"{facts['images']} images of {facts['objects']} objects, {facts['masks']} masks, {world}"
     return Report("scene of BOP", summary, facts)
+
+
+def _check_results(path: Path) -> Report:
+    images = result_images(path)
+    facts = {"poses": sum(map(len, images.values())), "images": len(images)}
+    facts |= {"scenes": len({scene for scene, _ in images}), "objects": len(set().union(*images.values()))}
+    summary = f"{facts['poses']} poses of {facts['objects']} objects in {facts['images']} images"
+    return Report("results file of BOP", summary, facts)
 
 
 def _check_field(path: Path) -> Report:

@@ -192,6 +192,8 @@ def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
     try:
         with h5py.File(path) as file:
             return tuple(_from_group(group) for _, group in sorted(file.items()))
+    except FileNotFoundError:
+        raise CorruptFile(path, "there is no such file") from None
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise CorruptFile(path, f"it is not a push file ({error})") from error
 

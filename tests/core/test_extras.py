@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from osfcore.extras import PACKAGES, MissingExtra, need, told_of
+from osfcore.extras import PACKAGES, MissingExtra, missing, need, told_of
 
 
 def without(monkeypatch, *packages):
@@ -15,6 +15,7 @@ def without(monkeypatch, *packages):
 @pytest.mark.parametrize("extra", PACKAGES)
 def test_what_is_installed_is_not_missed(extra):
     need(extra, "This")
+    assert missing(extra) == []
 
 
 def test_what_is_missing_is_told_with_how_to_get_it(monkeypatch):

@@ -14,7 +14,7 @@ from osfcore.errors import CorruptFile, OsfError
 
 @dataclass(frozen=True)
 class Check:
-    """Validate a scene, a state, a push file, a field, or a folder: an observation, image set or scene of BOP."""
+    """Validate a scene, state, push file, field, results of BOP, or a folder: observation, image set, scene of BOP."""
 
     path: tyro.conf.Positional[Path]
     """File or folder to check; an image set may be zipped."""

@@ -108,6 +108,7 @@ class Predict:
     ) -> dict[str, Any]:
         """Draw one sequence; PSNR by step where the simulator could be asked."""
         from osfcore.experiments.dynamics.visual_prediction import PSNR_FILE, VisualPrediction, show_prediction
+        from osfcore.extras import missing
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import read_json
@@ -117,7 +118,7 @@ class Predict:
         library, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         fields = {name: library.load(name) for name in state.names}
         renderer = SceneRenderer(fields, library.load_table(), device=str(pick_device(self.device)))
-        lacking = [name for name in state.names if not assets.has(name)]
+        lacking = missing("sim") or [name for name in state.names if not assets.has(name)]
         request = VisualPrediction(state, rollouts, actions, self.sequence, camera, folder)
         follow(show_prediction(request, renderer, None if lacking else assets))
         if lacking:

@@ -22,6 +22,7 @@ from osfcore.dynamics.motion import Motion, Sweep, headings, sleeping
 from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
 from osfcore.dynamics.shapes.object_shapes import ObjectShape, ShapeTable
 from osfcore.dynamics.training.windows import Recording, turn_between
+from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import rotate
 from osfcore.io.push_file import Disturbed, PushEpisode
 
@@ -151,10 +152,15 @@ def samples(
         table: shapes of the objects.
         device: that computes.
         others: further substeps, such as disturbed states.
+
+    Raises:
+        InvalidInput: if there is none.
     """
     pieces = itertools.chain(_recorded(recording), others)
     graphs = (_graph_and_target(piece, table, device) for piece in pieces)
     parts = [_sample(*graph) for graph in graphs if graph is not None]
+    if not parts:
+        raise InvalidInput("number of steps in which an object could move", 0, "at least 1: collect more pushes")
     columns = list(zip(*parts, strict=True))
     return Samples(*(_Rows.of(torch.cat(columns[k]), torch.cat(columns[k + 1])) for k in (0, 2, 4)))
 

@@ -21,7 +21,6 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
 from osfcore.render.scene_renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
-from osfcore.world.tabletop import Tabletop
 
 PSNR_FILE, SHEET_FILE = "psnr.json", "prediction.png"
 _MOST_COLUMNS = 11  # of the contact sheet
@@ -100,6 +99,8 @@ def predicted_states(request: VisualPrediction) -> tuple[SceneState, ...]:
 
 def _simulated(request: VisualPrediction, assets: AssetLibrary) -> Iterator[Float[np.ndarray, "h w 3"]]:
     """What the camera would truly see."""
+    from osfcore.world.tabletop import Tabletop  # predictions alone do without the simulator
+
     world = Tabletop(assets, cameras=(request.camera,))
     try:
         world.restore(request.state)

@@ -6,7 +6,7 @@ near it, and else can be replaced by the table that the objects tell.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,10 +30,12 @@ class BopScene:
     Attributes:
         observation: cameras bear the numbers of their images.
         poses: `T_world_object` by name, as the first chosen image that shows the object annotates it.
+        left_out: other objects that are annotated in these images.
     """
 
     observation: Observation
     poses: Mapping[str, Pose]
+    left_out: tuple[str, ...]
 
 
 def read_bop_scene(
@@ -41,14 +43,16 @@ def read_bop_scene(
     choice: BopChoice | None = None,
     names: tuple[str, ...] | None = None,
     table_prior: Callable[[str], TablePrior] | None = None,
+    known: Collection[str] | None = None,
 ) -> BopScene:
     """Read a scene.
 
     Args:
         folder: of the scene.
         choice: which images, and how they are read.
-        names: of the objects; None for all that are annotated.
-        table_prior: how an object can lie, to find the table by how the objects do; None to take BOP's world for it.
+        names: of the objects; None for all that are annotated and known.
+        table_prior: how a known object can lie, to find the table by how they do; None to take BOP's world for it.
+        known: objects that can be estimated; None for all.
 
     Raises:
         CorruptFile: if a file is missing or broken.
@@ -56,8 +60,9 @@ def read_bop_scene(
             world is not the table's frame.
     """
     images = read_images(folder, choice)
-    names = _names(names, images)
-    cameras = _in_bop_world(images) if table_prior is None else _over_found_table(images, table_prior)
+    there = tuple(sorted({name for image in images for name in image.poses}))
+    names = _names(names, there, known)
+    cameras = _in_bop_world(images) if table_prior is None else _over_found_table(images, table_prior, known)
     poses = {
         name: next(c @ i.poses[name] for c, i in zip(cameras, images, strict=True) if name in i.poses) for name in names
     }
@@ -74,13 +79,12 @@ def read_bop_scene(
         None,
         0.0,
     )
-    return BopScene(observation, poses)
+    return BopScene(observation, poses, tuple(name for name in there if name not in names))
 
 
-def _names(asked: tuple[str, ...] | None, images: Sequence[BopImage]) -> tuple[str, ...]:
-    there = tuple(sorted({name for image in images for name in image.poses}))
+def _names(asked: tuple[str, ...] | None, there: tuple[str, ...], known: Collection[str] | None) -> tuple[str, ...]:
     if asked is None:
-        return there
+        return tuple(name for name in there if known is None or name in known)
     if missing := [name for name in asked if name not in there]:
         raise InvalidInput("object", missing[0], f"one that scene_gt.json has: {', '.join(there) or 'none'}")
     return asked
@@ -96,9 +100,15 @@ def _in_bop_world(images: Sequence[BopImage]) -> list[Pose]:
     return poses
 
 
-def _over_found_table(images: Sequence[BopImage], table_prior: Callable[[str], TablePrior]) -> list[Pose]:
+def _over_found_table(
+    images: Sequence[BopImage], table_prior: Callable[[str], TablePrior], known: Collection[str] | None
+) -> list[Pose]:
     """`T_world_camera` of each image over the table on which the objects of the first one lie."""
-    annotated = images[0].poses
+    lost = [image.number for image in images if image.T_camera_world is None]
+    if lost and len(images) > 1:
+        what = f"cam_R_w2c and cam_t_w2c of image {lost[0]}"
+        raise InvalidInput(what, "missing", "given for several images; choose one with --images")
+    annotated = {name: pose for name, pose in images[0].poses.items() if known is None or name in known}
     found = table_from_objects([table_prior(name) for name in annotated], list(annotated.values()))
     if found is None:
         raise InvalidInput("table under the objects", "not to be found", "one that two or more objects stand on")

@@ -111,6 +111,18 @@ def scene_gt_names(path: Path, image: int) -> tuple[str, ...]:
     return tuple(row.name for row in read_json(path, _gt_rows) if row.image == image)
 
 
+def result_images(path: Path) -> dict[tuple[int, int], list[str]]:
+    """Objects by scene and image in results of BOP (.csv).
+
+    Raises:
+        CorruptFile: if the file is none, or a pose in it is none.
+    """
+    found: dict[tuple[int, int], list[str]] = {}
+    for row in _csv_rows(path):
+        found.setdefault((row.scene, row.image), []).append(row.name)
+    return found
+
+
 def _of_image(rows: list[_Row], choice: PoseChoice) -> dict[str, Pose]:
     scene = _only("scene", choice.scene, {row.scene for row in rows})
     rows = [row for row in rows if row.scene == scene]

@@ -195,7 +195,7 @@ def test_a_push_that_works_from_one_place_alone_is_not_chosen_unless_rollouts_ar
 
     def slippery(state, actions, before=None):
         future = carried(state, actions)
-        slips = (actions[:, :, 0] > 0.045).all(axis=1) & ~np.array_equal(state.pusher, start.pusher)
+        slips = (actions[:, :, 0] > 0.045).all(axis=1) & (not np.array_equal(state.pusher, start.pusher))
         still = np.broadcast_to(state.poses.position, future.positions.shape)
         positions = np.where(slips[:, None, None, None], still, future.positions)
         return Rollouts(state.names, positions, future.quaternions, future.pusher)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,12 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportScene:
-    """A scene as GLB for Blender, game engines and browsers: objects, table, pusher, cameras, and the light."""
+    """A scene as GLB or USDZ for Blender, game engines and browsers: objects, table, pusher, cameras, and the light."""
 
     scene: Path
     """scene.json, or the state.json of an estimate."""
     out: Path
-    """GLB to write."""
+    """.glb or .usdz to write."""
     fields: bool = False
     """Objects as the surfaces of their fields, also where this machine has their meshes."""
     data_dir: Path = field(default_factory=default_data_dir)
@@ -35,17 +36,20 @@ class ExportScene:
 
     def run(self) -> dict[str, Any]:
         """Export; the result tells which objects are meshes and which are surfaces of fields."""
-        from osfcore.export.scene_glb import scene_glb
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.scene_file import read_scene
         from osfcore.objects.asset_library import AssetLibrary
 
-        _check_out(self.out, ".glb")
+        suffix = _check_out(self.out, ".glb", ".usdz")
+        if suffix == ".glb":
+            from osfcore.export.scene_glb import scene_glb as export
+        else:
+            from osfcore.export.usd.export import scene_usdz as export
         scene = read_scene(self.scene)
         library, fields = AssetLibrary(self.data_dir / "objects"), FieldLibrary(self.data_dir)
         scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
         shapes = {n: library.load(n).mesh if n in scanned else fields.load(n) for n in scene.state.names}
-        size = _write(self.out, lambda: scene_glb(scene, shapes, fields.load_table()))
+        size = _write(self.out, lambda: export(scene, shapes, fields.load_table()))
         others = [name for name in scene.state.names if name not in scanned]
         if not self.json:
             x, y, z = scene.state.light.direction
@@ -57,12 +61,12 @@ class ExportScene:
 
 @dataclass(frozen=True)
 class ExportField:
-    """The surface of a field as GLB, with a colour for each vertex."""
+    """The surface of a field as GLB or USD, with a colour for each vertex."""
 
     name: tyro.conf.Positional[str]
     """Name of an object that has a field, such as 006_mustard_bottle, or a .safetensors file."""
     out: Path
-    """GLB to write."""
+    """.glb, .usdz or .usdc to write."""
     light: tuple[float, float, float] | None = None
     """Direction toward a light whose shading is baked into the colours; without it they are the albedo."""
     data_dir: Path = field(default_factory=default_data_dir)
@@ -72,11 +76,15 @@ class ExportField:
 
     def run(self) -> dict[str, Any]:
         """Export; the result tells what the colours are."""
-        from osfcore.export.field_mesh import field_glb
+        suffix = _check_out(self.out, ".glb", ".usdz", ".usdc")
+        if suffix == ".glb":
+            from osfcore.export.field_mesh import field_glb as export
+        else:
+            from osfcore.export.usd.export import field_usd
 
-        _check_out(self.out, ".glb")
+            export = partial(field_usd, is_packed=suffix == ".usdz")
         light, shape = None if self.light is None else _light(self.light), _field(self.name, self.data_dir)
-        size = _write(self.out, lambda: field_glb(shape, Path(self.name).stem, light))
+        size = _write(self.out, lambda: export(shape, Path(self.name).stem, light))
         if not self.json:
             colours = "the albedo" if light is None else f"those under the light toward {self.light}, baked in"
             print(f"Wrote {self.out}, {size / 1e6:.1f} MB; its colours are {colours}.")
@@ -110,13 +118,15 @@ class ExportSplats:
         return {"out": str(self.out), "bytes": size, "splats": count, "light": splats.light.direction.tolist()}
 
 
-def _check_out(out: Path, suffix: str) -> None:
-    """Refuse what cannot be written before the work begins."""
+def _check_out(out: Path, *suffixes: str) -> str:
+    """Refuse what cannot be written before the work begins; which of the suffixes it is."""
     from osfcore.io.output_paths import check_place
 
-    if out.suffix.lower() != suffix:
-        raise InvalidInput("output file", out, f"a path that ends in {suffix}")
+    suffix = out.suffix.lower()
+    if suffix not in suffixes:
+        raise InvalidInput("output file", out, f"a path that ends in {' or '.join(suffixes)}")
     check_place(out)
+    return suffix
 
 
 def _light(direction: tuple[float, float, float]) -> Light:

@@ -27,7 +27,7 @@ class Import:
     images: tuple[int, ...] | None = None
     """Numbers of the images; by default all, or 32 spread over them."""
     names: tuple[str, ...] | None = None
-    """Objects to keep; by default all, of which there may be 8."""
+    """Objects to keep; by default all that have a field, of which there may be 8."""
     table: Literal["world", "objects"] = "world"
     """Where the table is: BOP's world is its frame (z up, table at z = 0), or where most objects would stand."""
     encoding: Literal["srgb", "linear"] = "srgb"
@@ -40,7 +40,8 @@ class Import:
     """Print the result as one JSON object in the last line."""
 
     def run(self) -> dict[str, Any]:
-        """Import; the result tells images and objects."""
+        """Import; the result tells images and objects, and which objects were left out."""
+        from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import folder_at_once, write_json
         from osfcore.io.observation_file import write_observation
         from osfcore.photo.other_programs.bop_images import BopChoice
@@ -51,7 +52,8 @@ class Import:
             raise InvalidInput("output folder", self.out, "new or empty")
         choice = BopChoice(self.images, self.encoding, self.models)
         prior = self._prior if self.table == "objects" else None
-        scene = read_bop_scene(self.scene, choice, self.names, prior)
+        known = FieldLibrary(self.data_dir).names()
+        scene = read_bop_scene(self.scene, choice, self.names, prior, known)
         poses = {
             name: {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
             for name, pose in scene.poses.items()
@@ -63,7 +65,10 @@ class Import:
         names = list(scene.observation.names)
         if not self.json:
             print(f"Wrote {self.out}: images {', '.join(images)} of {', '.join(names)}.")
-        return {"out": str(self.out), "images": [int(image) for image in images], "objects": names}
+            if self.names is None and scene.left_out:
+                print(f"Left out, as there are no fields of them: {', '.join(scene.left_out)}.")
+        left_out = list(scene.left_out)
+        return {"out": str(self.out), "images": [int(i) for i in images], "objects": names, "left_out": left_out}
 
     def _prior(self, name: str) -> Any:  # noqa: ANN401  TablePrior, which the start of the command line must not load
         from osfcore.estimation.objective.resting_orientations import resting_orientations

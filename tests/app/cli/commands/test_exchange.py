@@ -2,11 +2,13 @@
 
 import io
 import json
+import sys
 
 import gsply
 import numpy as np
 import pytest
 import trimesh
+from pxr import Usd, UsdGeom
 
 from app.cli.main import main
 from osfcore.fields.field_weights import write_field
@@ -64,6 +66,34 @@ def test_a_field_from_a_file_becomes_a_mesh(field_file, tmp_path, capsys):
     np.testing.assert_allclose(mesh.extents, 2 * HALF, atol=2e-3)
 
 
+def test_the_same_comes_as_usd(rendered, field_file, tmp_path, capsys, data_dir):
+    scene = tmp_path / "scene.json"
+    scene.write_text(json.dumps(scene_to_json(Scene(rendered[1], default_cameras(64)))))
+    arguments = ["export", "scene", "--scene", str(scene), "--out", str(tmp_path / "scene.usdz"), "--json"]
+    assert main([*arguments, "--data-dir", str(data_dir)]) == 0
+    assert sorted(result_of(capsys)["meshes"]) == list(NAMES)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
+    kinds = [prim.GetTypeName() for prim in stage.Traverse()]
+    assert (kinds.count("Mesh"), kinds.count("Camera"), kinds.count("DistantLight")) == (4, 4, 1)
+    for suffix in (".usdz", ".usdc"):
+        out = tmp_path / f"solid{suffix}"
+        assert main(["export", "field", str(field_file), "--out", str(out), "--light", "1", "0", "1"]) == 0
+        assert "baked in" in capsys.readouterr().out
+        stage = Usd.Stage.Open(str(out))
+        (mesh,) = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+        np.testing.assert_allclose(np.ptp(UsdGeom.Mesh(mesh).GetExtentAttr().Get(), axis=0), 2 * HALF, atol=2e-3)
+
+
+def test_usd_is_refused_in_words_where_its_library_is_missing(field_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None)
+    for module in [name for name in sys.modules if name.startswith("osfcore.export.usd")]:
+        monkeypatch.delitem(sys.modules, module)
+    assert main(["export", "field", str(field_file), "--out", str(tmp_path / "solid.usdz")]) == 1
+    assert "A USD file needs pxr, which is not installed; get it with: pip install 'osf-manipulation[usd]'." in (
+        capsys.readouterr().err
+    )
+
+
 def test_splats_say_that_their_light_is_baked_in(field_file, tmp_path, capsys):
     out = tmp_path / "solid.ply"
     assert main(["export", "splats", str(field_file), "--out", str(out)]) == 0
@@ -76,7 +106,7 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
     write_bop_scene(tmp_path / "000048", *rendered)
     seen, state = tmp_path / "seen", tmp_path / "state.json"
     assert main(["import", "bop", str(tmp_path / "000048"), "--out", str(seen), "--images", "3", "9", "--json"]) == 0
-    assert result_of(capsys) == {"out": str(seen), "images": [3, 9], "objects": list(NAMES)}
+    assert result_of(capsys) == {"out": str(seen), "images": [3, 9], "objects": list(NAMES), "left_out": []}
     assert [camera.name for camera in read_observation(seen).cameras] == ["3", "9"]
     poses = json.loads((seen / "poses.json").read_text())
     for name in NAMES:
@@ -95,13 +125,16 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
     assert main(["export", "bop", *arguments]) == 0
     assert "4 poses in 2 images of scene 48" in capsys.readouterr().out
     assert len((tmp_path / "ours.csv").read_text().splitlines()) == 5
+    assert main(["check", str(tmp_path / "ours.csv")]) == 0
+    assert "is a good results file of BOP: 4 poses of 2 objects in 2 images." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (("export", "scene", "--scene", "none.json", "--out", "a.glb"), "none.json cannot be used"),
-        (("export", "field", "009_gelatin_box", "--out", "a.obj"), "must be a path that ends in .glb"),
+        (("export", "field", "009_gelatin_box", "--out", "a.obj"), "a path that ends in .glb or .usdz or .usdc"),
+        (("export", "scene", "--scene", "none.json", "--out", "a.usdc"), "a path that ends in .glb or .usdz"),
         (("export", "field", "spoon", "--out", "a.glb"), "There is no field named 'spoon'"),
         (("export", "splats", "009_gelatin_box", "--out", "a.glb"), "must be a path that ends in .ply"),
         (("export", "splats", "009_gelatin_box", "--out", "a.ply", "--light", "0", "0", "-1"), "light elevation"),

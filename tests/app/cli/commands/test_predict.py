@@ -114,6 +114,14 @@ def test_without_meshes_there_are_predictions_alone(files, tmp_path, capsys):
     assert len(list((folder / "images").glob("*.png"))) == count + 1
 
 
+def test_without_the_simulator_there_are_predictions_alone(files, data_dir, capsys, monkeypatch):
+    folder, count = files
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name == "pybullet" else name)
+    assert call(folder, data_dir, "--images", str(folder / "images")) == 0
+    assert "predictions alone; the simulator lacks pybullet." in capsys.readouterr().out
+    assert len(list((folder / "images").glob("*.png"))) == count + 1
+
+
 @pytest.mark.parametrize(
     ("actions", "words"),
     [

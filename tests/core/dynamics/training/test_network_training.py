@@ -207,6 +207,14 @@ def test_recordings_without_substeps_are_told(tmp_path, shapes):
         list(train_dynamics(config(path, tmp_path), shapes))
 
 
+def test_recordings_in_which_nothing_is_touched_are_told(tmp_path, shapes):
+    begin = scene(shapes, {PAIRS[0][0]: (0.2, 0.0), PAIRS[0][1]: (0.2, 0.2)})
+    away = episode(shapes, begin, np.tile([-0.1, 0.0, 0.0], (5, 1)))
+    path = write(tmp_path / "away.h5", [away] * 3)
+    with pytest.raises(InvalidInput, match="steps in which an object could move is 0"):
+        list(train_dynamics(config(path, tmp_path), shapes))
+
+
 @pytest.fixture(scope="module")
 def recording(shapes):
     return record([pushes(shapes, *PAIRS[0], seed) for seed in range(3)], shapes, 4)

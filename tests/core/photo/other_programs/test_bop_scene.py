@@ -20,7 +20,7 @@ from osfcore.photo.other_programs.pose_file import PoseChoice, read_poses
 from osfcore.photo.poses.table_prior import TablePrior
 from osfcore.world.scene_request import SceneRequest
 from osfcore.world.tabletop import Tabletop
-from tests.core.photo.other_programs.bop_scenes import write_bop_scene, write_models_info
+from tests.core.photo.other_programs.bop_scenes import annotation, write_bop_scene, write_models_info
 
 NAMES = ("003_cracker_box", "006_mustard_bottle")
 LINEAR = BopChoice(encoding="linear")
@@ -156,6 +156,29 @@ def test_a_table_is_found_under_the_objects_of_any_world(folder, rendered):
             np.testing.assert_allclose(place, expected, atol=1e-2, err_msg=f"{k} {view}")
 
 
+def test_the_table_is_found_without_objects_that_nobody_knows(folder, rendered):
+    fields = FieldLibrary(None)
+    observation, state = rendered
+    number = 18  # the marker, of which there is no field
+
+    def add_marker(content):
+        for entries, camera in zip(content.values(), observation.cameras, strict=True):
+            floating = camera.T_world_camera.inverse() @ Pose(np.array([0.0, 0, 0.3]), state.poses.quaternion[0])
+            entries.append(annotation(floating, number))
+
+    edit(folder / "scene_gt.json", add_marker)
+    scene = read_bop_scene(
+        folder,
+        LINEAR,
+        table_prior=lambda name: TablePrior(resting_orientations(fields.load(name))),
+        known=fields.names(),
+    )
+    assert (scene.observation.names, scene.left_out) == (NAMES, ("040_large_marker",))
+    edit(folder / "scene_camera.json", without_places)
+    with pytest.raises(InvalidInput, match="given for several images; choose one with --images"):
+        read_bop_scene(folder, LINEAR, table_prior=lambda name: TablePrior(resting_orientations(fields.load(name))))
+
+
 def without_places(content):
     for entry in content.values():
         del entry["cam_R_w2c"], entry["cam_t_w2c"]
@@ -196,6 +219,8 @@ def test_what_is_chosen_must_be_there(folder):
         read_bop_scene(folder, BopChoice((4,)))
     with pytest.raises(InvalidInput, match="object is 025_mug, but it must be one that"):
         read_bop_scene(folder, LINEAR, ("025_mug",))
+    known = read_bop_scene(folder, LINEAR, known=NAMES[:1])
+    assert (known.observation.names, known.left_out) == (NAMES[:1], NAMES[1:])
     (folder / "rgb" / "000003.png").unlink()
     with pytest.raises(CorruptFile, match=r"rgb.000003\.png cannot be used"):
         read_bop_scene(folder)

@@ -1,0 +1,135 @@
+"""Exported scenes as Pixar's library reads them: geometry, colours, cameras and light; its own checks find nothing."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+from pxr import Ar, Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
+
+from osfcore.estimation.photometry.camera_response import linear_of_srgb
+from osfcore.export.usd.export import field_usd, scene_usdz
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import Camera, default_cameras
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.states import SceneState
+from osfcore.io.scene_file import Scene
+from tests.core.export.test_splats import ALBEDO, HALF, ellipsoid_field
+
+MUSTARD = "006_mustard_bottle"
+LIGHT = Light(np.array([1.0, -0.5, 0.8]))
+OFF_CENTRE = Camera(
+    "off centre", default_cameras()[1].T_world_camera, np.array([[90.0, 0, 40], [0, 80, 20], [0, 0, 1]]), 96, 64
+)
+CAMERAS = (*default_cameras(64), OFF_CENTRE)
+
+
+def opened(content, folder, suffix=".usdz"):
+    path = folder / f"content{suffix}"
+    path.write_bytes(content)
+    return Usd.Stage.Open(str(path))
+
+
+def shown_as(stage, name):
+    (prim,) = (prim for prim in stage.Traverse() if prim.GetDisplayName() == name)
+    return prim
+
+
+def pose_of(prim):
+    """`T_world_prim`; USD's matrices act on rows."""
+    return np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+
+
+@pytest.fixture(scope="module")
+def scene():
+    quaternions = quaternion_exp(np.array([[0, 0, 0.4], [1.2, 0.3, -0.5], [0, 0, 0]]))
+    poses = Pose(np.array([[0.05, -0.1, 0.095], [-0.1, 0.02, 0.05], [0.1, 0.1, 0.04]]), quaternions)
+    return Scene(SceneState((MUSTARD, "solid 1", "solid_1"), poses, LIGHT, np.array([0.0, 0.1, 0.062])), CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def stage(scene, library, one_thread, tmp_path_factory):
+    solid = ellipsoid_field()
+    shapes = {MUSTARD: library.load(MUSTARD).mesh, "solid 1": solid, "solid_1": solid}
+    content = scene_usdz(scene, shapes, FieldLibrary(None).load_table())
+    return opened(content, tmp_path_factory.mktemp("usd"))
+
+
+def faults(stage):
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    return [error.GetErrorAsString() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+
+
+def test_pixars_checks_find_no_fault(stage, tmp_path, one_thread):
+    assert faults(stage) == []
+    assert faults(opened(field_usd(ellipsoid_field(), "solid"), tmp_path)) == []
+    assert faults(opened(field_usd(ellipsoid_field(), "solid", LIGHT, is_packed=False), tmp_path, ".usdc")) == []
+
+
+def test_everything_stands_where_the_scene_says(scene, stage, library):
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    for name in scene.state.names:
+        np.testing.assert_allclose(pose_of(shown_as(stage, name)), scene.state.pose(name).matrix(), atol=1e-9)
+    mesh, read = library.load(MUSTARD).mesh, UsdGeom.Mesh(shown_as(stage, MUSTARD))
+    np.testing.assert_allclose(read.GetPointsAttr().Get(), mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(np.reshape(read.GetFaceVertexIndicesAttr().Get(), (-1, 3)), mesh.faces)
+    np.testing.assert_allclose(read.GetNormalsAttr().Get(), mesh.normals, atol=1e-6)
+    table = UsdGeom.Mesh(shown_as(stage, "table")).GetExtentAttr().Get()
+    np.testing.assert_allclose(table, [[-0.6, -0.6, 0], [0.6, 0.6, 0]], atol=1e-6)
+    np.testing.assert_allclose(pose_of(shown_as(stage, "pusher"))[:3, 3], scene.state.pusher, atol=1e-9)
+
+
+def test_the_light_is_the_parallel_and_the_ambient_one(stage):
+    distant = UsdLux.DistantLight(shown_as(stage, "light"))
+    np.testing.assert_allclose(pose_of(distant.GetPrim())[:3, 2], LIGHT.direction, atol=1e-9)
+    assert distant.GetIntensityAttr().Get() / np.pi == pytest.approx(0.75)
+    assert distant.GetAngleAttr().Get() == 0
+    (dome,) = (prim for prim in stage.Traverse() if prim.IsA(UsdLux.DomeLight))
+    assert UsdLux.DomeLight(dome).GetIntensityAttr().Get() == 0.25
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
+def test_cameras_see_points_where_ours_do(stage, camera):
+    prim = shown_as(stage, f"camera {camera.name}")
+    frustum = UsdGeom.Camera(prim).GetCamera(Usd.TimeCode.Default()).frustum
+    matrix = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3))
+    seen = np.array([matrix.Transform(Gf.Vec3d(*point)) for point in points.tolist()])
+    pixels = np.stack([(1 + seen[:, 0]) / 2 * camera.width, (1 - seen[:, 1]) / 2 * camera.height], axis=1)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-3)
+
+
+def source_of(prim, name):
+    """The shader that an input of a mesh's material comes from."""
+    material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+    surface = material.ComputeSurfaceSource()[0]
+    return UsdShade.Shader(surface.GetInput(name).GetConnectedSources()[0][0].source.GetPrim())
+
+
+def test_the_texture_is_kept_and_stands_upright(stage, library):
+    prim = shown_as(stage, MUSTARD)
+    texture = source_of(prim, "diffuseColor")
+    assert texture.GetInput("sourceColorSpace").Get() == "sRGB"
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(texture.GetInput("file").Get().resolvedPath))
+    image = np.asarray(Image.open(io.BytesIO(asset.GetBuffer())), float)
+    mesh = library.load(MUSTARD).mesh
+    assert np.abs(image - mesh.texture).mean() < 4  # of 255; JPEG
+    np.testing.assert_allclose(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), mesh.uv, atol=1e-6)
+
+
+@pytest.mark.parametrize(("light", "colour"), [(None, "diffuseColor"), (LIGHT, "emissiveColor")])
+def test_a_field_s_surface_has_its_colours(light, colour, tmp_path, one_thread):
+    stage = opened(field_usd(ellipsoid_field(), "006 solid", light, is_packed=False), tmp_path, ".usdc")
+    prim = shown_as(stage, "006 solid")
+    mesh = UsdGeom.Mesh(prim)
+    points = np.array(mesh.GetPointsAttr().Get())
+    np.testing.assert_allclose(np.linalg.norm(points / HALF, axis=1), 1, atol=0.05)
+    normals = points / HALF**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    shade = np.ones(len(points)) if light is None else 0.25 + 0.75 * np.maximum(normals @ light.direction, 0)
+    colours = np.array(mesh.GetDisplayColorPrimvar().Get())
+    np.testing.assert_allclose(colours, linear_of_srgb(shade[:, None] * np.array(ALBEDO)), atol=0.06)
+    assert source_of(prim, colour).GetInput("varname").Get() == "displayColor"
