@@ -116,7 +116,7 @@ def test_a_comparison_that_arrives_after_it_was_switched_off_is_not_shown(page):
         }};
     }}""")
     page.check("#compare")
-    page.wait_for_function("window.arriving", timeout=1000 * COMPILE_S)
+    page.wait_for_function("() => window.arriving", timeout=1000 * COMPILE_S)
     page.uncheck("#compare")
     page.wait_for_timeout(2 * LATE_MS)
     assert decibels(page) == []
