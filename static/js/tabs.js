@@ -26,7 +26,7 @@ function follow({ tab }) {
 export function setUpTabs() {
   follow(asked());
   onTravel(follow);
-  for (const tab of tabs()) {
+  for (const tab of document.querySelectorAll('[role="tab"]')) { // some are shown later
     tab.addEventListener("click", () => showTab(tab.id.slice(4)));
     tab.addEventListener("keydown", (event) => {
       const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];

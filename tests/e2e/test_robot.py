@@ -45,7 +45,8 @@ def page(browser, service):
     page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
     page.problems = []
     watch_errors(page)
-    page.goto(f"{service}/?tab=robot")
+    page.goto(service)
+    page.click("#tab-robot", timeout=WAIT_MS)  # comes once the robot has been asked for
     page.wait_for_selector("#panel-robot:not([hidden])", timeout=WAIT_MS)
     yield page
     assert page.problems == []
@@ -69,7 +70,7 @@ def moving(page, robot):
     until(lambda: np.any(robot[1].truth().pusher != before), 60)
     page.wait_for_selector('#world[data-state="danger"]', timeout=WAIT_MS)
     assert page.inner_text("#world") == f"Robot at {robot[0].removeprefix('http://')}: moving"
-    assert "its own looks" in page.inner_text("#robot-cameras-note")
+    until(lambda: "its own looks" in page.inner_text("#robot-cameras-note"), 10)
     assert len(addresses(page)) == 4
     page.screenshot(path=ARTIFACTS / "robot-moves.png")
     robot[2].clear()
