@@ -4,9 +4,10 @@ Where the table looks as it is known (`check_table`), `osfcore.estimation.first_
 tells, it is asked first, and its answer taken if the loss at its end is low or the image model at its poses the usual
 one: under a high lamp and beside one object exposure, ambient light and table explain each other. Otherwise an image
 model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for
-linear pictures and once for sRGB ones; what leaves less unexplained is tried first, and the other one too if the loss
-at its end is high: then the lower one decides. Pictures and fields are made to agree, and the usual estimator finds
-poses and lamp. With these the image model is fitted once more, and Gauss-Newton does the last millimetres.
+linear pictures and once for sRGB ones. What leaves less unexplained is tried first; the other one too if the loss at
+its end is high or the estimate doubted: then the lower loss decides. Pictures and fields are made to agree, and the
+usual estimator finds poses and lamp. From these the image model is searched for once more, and refined in turn with
+poses and lamp (Gauss-Newton) until the lamp stands still.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from osfcore.progress import Progress
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
 _TINT = 0.1  # weight of the gains' spread over the colours: lamps are nearly white
 _LEAST_GAIN, _MOST_GAIN = 0.05, 20.0  # beyond, pictures show nothing, or nothing else
-_ROUNDS, _ITERATIONS = 2, 2
+_ROUNDS, _ITERATIONS = 3, 2  # of image model and poses in turn, at most; of Gauss-Newton in each
+_STILL_RAD = np.deg2rad(1.0)  # a lamp that moves less in a round has been found
 _SETTLED = 2e-4  # photometric loss; pictures decoded wrongly ended at 3e-4 and more
 
 
@@ -68,10 +70,10 @@ def estimate_first(
     calibrator = Calibrator(models, observation.names)
     if verdict == "unclear":
         last = yield from all_but_last(estimate_usual(models, observation, rng, config))
-        assert last.estimate is not None
-        if last.loss < _SETTLED and last.estimate.trusted:
+        if _is_settled(last):
             yield last
             return
+        assert last.estimate is not None
         params = SceneParameters.of(last.estimate.state, observation.pusher)
         views = views_of(observation, _COARSE_SIDE, samples=2)
         if calibrator.refine(views, params, 1.0, hold_light=True).model.is_usual:
@@ -84,12 +86,17 @@ def estimate_first(
         if found:  # and leaves much unexplained
             yield replace(found[0], estimate=None)
         found.append((yield from all_but_last(_steps(models, calibrator, one, rng, config))))
-        if found[-1].loss < _SETTLED:
+        if _is_settled(found[-1]):
             break
     if found:
-        yield min(found, key=lambda last: last.loss)
+        yield min(found, key=lambda last: (not _is_settled(last), last.loss))
     else:
         yield from estimate_usual(models, observation, rng, config)
+
+
+def _is_settled(last: EstimateStep) -> bool:
+    """Whether nothing speaks for another image model."""
+    return last.loss < _SETTLED and last.estimate is not None and last.estimate.trusted
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -132,7 +139,7 @@ def _steps(
     models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, rng: np.random.Generator, config: FirstFrameConfig
 ) -> Iterator[EstimateStep]:
     """The usual estimator on pictures and models that agree, then both once more."""
-    model, linear, more = rough.found.model, rough.observation, _ROUNDS * _ITERATIONS
+    model, linear, more = rough.found.model, rough.observation, (_ROUNDS + 1) * _ITERATIONS
     usual = estimate_usual(adapted(models, linear.names, model), model.normalized(linear), rng, config)
     before = next(usual)
     for step in usual:
@@ -148,22 +155,38 @@ def _steps(
 def _polished(
     models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, estimate: EstimatedState, reporter: StepReporter
 ) -> Iterator[EstimateStep]:
-    """Image model, poses and lamp in turn."""
-    model, linear = rough.found.model, rough.observation
+    """Image model, poses and lamp in turn, until the lamp stands still.
+
+    The image model is searched for once more first: the one that rough poses have led to may be far off.
+    """
+    linear = rough.observation
     at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
-    middle, fine = (views_of(linear, side, samples=2) for side in (_COARSE_SIDE, FINE_SIDE))
-    for number, (views, is_light_held) in enumerate(((middle, False), (fine, True)), 1):
-        found = calibrator.refine(views, at.params, model.ambient, hold_light=is_light_held)
-        model = found.model
-        fitting, normal = adapted(models, linear.names, model), model.normalized(linear)
-        sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
-        at = GaussNewtonState.at(replace(at.params, light=found.light))
-        for step in gauss_newton(fitting, sharp, at, iterations=_ITERATIONS, light=soft):
-            at = step
-            yield reporter.refinement("Exposure and table", at)
-        if number == _ROUNDS:
-            fit = evaluate_fit(fitting, sharp, at.params)
-            rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
-            sure = estimate_with_uncertainty(at.params, at.normals, fit, rivals, allowed=relative_allowance(fit))
-            last = reporter.finish(at, sure)
-            yield replace(last, image_model=replace(model, encoding=rough.encoding))
+    small, middle, fine = (views_of(linear, side, samples=2) for side in (_ROUGH_SIDE, _COARSE_SIDE, FINE_SIDE))
+    found = calibrator.search(small, middle, at.params)
+    for _ in range(_ROUNDS):
+        before = at.params.light
+        at = yield from _aligned(models, linear, found, at, reporter)
+        if at.params.light @ before > np.cos(_STILL_RAD):
+            break
+        found = calibrator.refine(fine, at.params, found.model.ambient, hold_light=False)
+    found = calibrator.refine(fine, at.params, found.model.ambient, hold_light=True)
+    at = yield from _aligned(models, linear, found, at, reporter)
+    model = replace(found.model, encoding=rough.encoding)
+    sharp = views_of(found.model.normalized(linear), FINE_SIDE, samples=2)
+    fit = evaluate_fit(adapted(models, linear.names, model), sharp, at.params)
+    rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
+    sure = estimate_with_uncertainty(at.params, at.normals, fit, rivals, allowed=relative_allowance(fit))
+    yield replace(reporter.finish(at, sure), image_model=model)
+
+
+def _aligned(
+    models: ObjectModels, linear: Observation, found: Calibration, at: GaussNewtonState, reporter: StepReporter
+) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+    """Gauss-Newton on poses and lamp, from the calibration's lamp, with models and pictures made to agree by it."""
+    fitting, normal = adapted(models, linear.names, found.model), found.model.normalized(linear)
+    sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
+    at = GaussNewtonState.at(replace(at.params, light=found.light))
+    for step in gauss_newton(fitting, sharp, at, iterations=_ITERATIONS, light=soft):
+        at = step
+        yield reporter.refinement("Exposure and table", at)
+    return at

@@ -32,7 +32,7 @@ _ROUNDS, _SHRINKING = 6, 0.6
 _SURVIVORS = 4
 _TRUNCATED = 0.25  # of the pictures' mean brightness: shadows that are elsewhere, and wrong sides of objects
 _OPAQUE, _CLEAR = 0.9, 0.05  # shares of pixels that count as an object's, and as the table's
-_SATURATED = 0.985
+_SATURATED, _DARK = 0.985, 1e-6  # of full scale; where pictures are black, errors are relative to this
 _OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
 
 
@@ -137,7 +137,7 @@ class Calibrator:
         ambient, bare = whole.rgb[0] - direct, empty - lit
         opacity = whole.opacity[0].sum(axis=1)
         masks = np.zeros_like(opacity) if views.masks is None else views.masks.sum(axis=1)
-        exposed = views.images.max(axis=-1) < _SATURATED * views.images.max()
+        exposed = views.images.max(axis=-1) < _SATURATED
         objects = (opacity > _OPAQUE) & exposed
         if views.masks is not None:
             objects &= masks > _OPAQUE
@@ -181,10 +181,11 @@ class _Pixels:
             if not kind.any():
                 continue
             seen, ambient, own = self.seen[kind], self.ambient[kind], direct[:, kind]
-            most = _TRUNCATED * float(seen.mean())
+            brightness = max(float(seen.mean()), _DARK)
+            most = _TRUNCATED * brightness
             for number, r in enumerate(ambients):
                 error = np.abs(_fit(np.float32(r) * ambient + own, seen, most)[1])
-                costs[:, number] += np.minimum(error, most).mean(axis=(1, 2)) / seen.mean()
+                costs[:, number] += np.minimum(error, most).mean(axis=(1, 2)) / brightness
         return costs
 
     def gains(self, direct: Float32[np.ndarray, "P 3"], ambient: float) -> tuple[np.ndarray, np.ndarray]:

@@ -78,8 +78,9 @@ def test_poses_and_light_of_an_srgb_picture_of_another_table_at_another_exposure
     found = steps[-1].image_model
     assert found.encoding == "srgb"
     np.testing.assert_allclose([*found.gain, found.ambient], [*OTHER.gain, OTHER.ambient], rtol=0.15)
-    assert [step.progress.done for step in steps] == list(range(1, len(steps) + 1))
-    assert {step.progress.total for step in steps} == {len(steps)}
+    done = [step.progress.done for step in steps]
+    assert done == sorted(set(done))
+    assert {step.progress.total for step in steps} == {done[-1]}
     assert [step.estimate is None for step in steps] == [True] * (len(steps) - 1) + [False]
 
 

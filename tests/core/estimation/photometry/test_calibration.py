@@ -66,6 +66,17 @@ def test_what_lies_beyond_the_table_is_measured_and_tells_nothing_else(models, t
     assert walled.model.ambient == plain.model.ambient
 
 
+def test_a_lit_table_that_is_brighter_than_all_else_is_not_taken_for_saturated(models, truth):
+    bright = ImageModel(np.full(3, 0.3), 1.0, np.full(3, 2.0))
+    high = scene({name: truth.pose(name) for name in NAMES}, (0.3, 0.3, 0.9))
+    views = views_of(taken(models, high, bright), 64, samples=2)
+    right = params_of(high)
+    near = replace(right, positions=right.positions + [0.004, -0.004, 0.0])
+    found = Calibrator(models, NAMES).refine(views, near, 1.0, hold_light=True)
+    np.testing.assert_allclose(found.model.table, bright.table, rtol=0.05)
+    assert found.model.ambient == pytest.approx(bright.ambient, rel=0.1)
+
+
 def test_a_wrong_pose_leaves_more_unexplained(models, truth, pictures):
     calibrator, views = Calibrator(models, NAMES), views_of(pictures, 64)
     right = params_of(truth)
