@@ -1,7 +1,8 @@
 """Uncertainty of an estimate: standard deviations from Gauss-Newton's normal matrices, doubts from residuals.
 
 The covariance of a block is s^2 (J^T W J)^-1 with s^2 the mean squared residual, inflated by factors that were
-calibrated on other scenes, because errors of neighbouring pixels are correlated and fields err as well.
+calibrated on other scenes, because errors of neighbouring pixels are correlated and fields err as well. For an object
+s^2 is at most a share of its own mean squared residual: grain of a wooden table says little of how well it is known.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from osfcore.render.types import SceneBatch
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
+_MOST_SPREAD = 0.5  # s^2, of an object's mean squared residual; on tables as they are known it is 0.15 at most
 MAX_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
 _RELATIVE_RESIDUAL = 0.5  # of the object's contrast, where masks bear out the pose; wrong ones were at 0.66 and more
 _ALLOWANCE, _MOST_USUAL = 1.25, 0.1  # times what is usual, which is no more than this [radiance]
@@ -176,7 +178,7 @@ def estimate_with_uncertainty(
         The estimate.
     """
     count = len(params.names)
-    deviations = _deviations(normals, fit.spread, count)
+    deviations = _deviations(normals, _spreads(fit), count)
     poses = deviations[: POSE * count].reshape(count, 2, 3)
     position = _POSITION_FACTOR * np.sqrt((poses[:, 0] ** 2).mean(axis=1))
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
@@ -191,10 +193,16 @@ def estimate_with_uncertainty(
     return EstimatedState(params.state(), position, rotation, light, doubts, "; ".join(doubtful))
 
 
-def _deviations(normals: Sequence[np.ndarray], spread: float, count: int) -> np.ndarray:
+def _spreads(fit: FitQuality) -> Float[np.ndarray, "N+1"]:
+    """s^2 for each object and for the light [radiance^2]."""
+    own = np.where(fit.pixels.sum(axis=0) < _MIN_PIXELS, np.inf, _MOST_SPREAD * object_residuals(fit) ** 2)
+    return np.append(np.minimum(own, fit.spread), fit.spread)
+
+
+def _deviations(normals: Sequence[np.ndarray], spreads: Float[np.ndarray, "N+1"], count: int) -> np.ndarray:
     """Standard deviations of all parameters; very large where the images do not constrain one."""
     widths, found, start = difference_steps(count), [], 0
-    for normal in normals:
+    for normal, spread in zip(normals, spreads, strict=True):
         own = widths[start : start + len(normal)]
         start += len(normal)
         scaled = normal * np.outer(own, own)

@@ -35,7 +35,7 @@ def end(models, truth, views):
 
 def fit_of(count=1, **change) -> FitQuality:
     residuals, pixels, each = np.full((2, count), 0.01), np.full((2, count), 50.0), np.ones(count)
-    return replace(FitQuality(residuals, pixels, 0.1 * each, 0.3 * each, each, 0.01, 1e-4), **change)
+    return replace(FitQuality(residuals, pixels, 0.1 * each, 0.3 * each, each, 0.01, 1e-5), **change)
 
 
 def params(count=1) -> SceneParameters:
@@ -124,7 +124,7 @@ def test_each_doubt_is_told():
         "its silhouette covers its masks by 60% only": ({"overlap": np.array([0.6])}, {}, 1e6),
         "its images differ from what was rendered by 0.10": ({"residuals": np.full((2, 1), 0.1)}, {}, 1e6),
         "another orientation explains the images as well": ({}, {0: 1.01}, 1e6),
-        "its pose is known to 150 mm and 6 deg only": ({}, {}, 1.0),
+        "its pose is known to 47 mm and 2 deg only": ({}, {}, 1.0),
     }
     for words, (change, rivals, scale) in cases.items():
         estimate = estimate_with_uncertainty(params(), normals(1, scale), fit_of(**change), rivals)
@@ -150,13 +150,25 @@ def test_all_doubts_make_the_reason():
 def test_deviations_are_those_of_least_squares():
     """They grow with the error of a pixel, and shrink with the root of the curvature."""
     first = estimate_with_uncertainty(params(), normals(), fit_of(), {})
-    noisier = estimate_with_uncertainty(params(), normals(), fit_of(spread=4e-4), {})
+    noisier = estimate_with_uncertainty(params(), normals(), fit_of(spread=4e-5), {})
     sharper = estimate_with_uncertainty(params(), normals(1, 1e8), fit_of(), {})
     for name in ("position_std", "rotation_std", "light_std"):
         here = getattr(first, name)
         np.testing.assert_allclose(getattr(noisier, name), 2 * here, rtol=1e-3)
         np.testing.assert_allclose(getattr(sharper, name), here / 10, rtol=1e-3)
-    assert first.position_std[0] == pytest.approx(15 * 1e-3 * 1e-2, rel=1e-2)
+    assert first.position_std[0] == pytest.approx(15 * 1e-3 * 1e-5**0.5, rel=1e-2)
+
+
+def test_a_grainy_table_says_little_of_how_well_an_object_is_known():
+    """Up to a share of the object's own squared residual its surroundings count, beyond that no more."""
+    own = object_residuals(fit_of())[0] ** 2
+    told = [
+        estimate_with_uncertainty(params(), normals(), fit_of(spread=share * own), {}) for share in (0.1, 0.5, 5, 50)
+    ]
+    deviations = np.array([(e.position_std[0], e.rotation_std[0]) for e in told])
+    np.testing.assert_allclose(deviations[0], np.sqrt(0.1 / 0.5) * deviations[1])
+    np.testing.assert_allclose(deviations[2:], deviations[[1, 1]])
+    np.testing.assert_allclose([e.light_std for e in told], told[0].light_std * np.sqrt([1, 5, 50, 500]))
 
 
 def test_what_nothing_tells_about_is_not_known():
