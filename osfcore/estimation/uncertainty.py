@@ -193,13 +193,13 @@ def estimate_with_uncertainty(
     return EstimatedState(params.state(), position, rotation, light, doubts, "; ".join(doubtful))
 
 
-def _spreads(fit: FitQuality) -> Float[np.ndarray, "N+1"]:
-    """s^2 for each object and for the light [radiance^2]."""
+def _spreads(fit: FitQuality) -> Float[np.ndarray, "B"]:
+    """s^2 of each block, the objects and last the light [radiance^2]."""
     own = np.where(fit.pixels.sum(axis=0) < _MIN_PIXELS, np.inf, _MOST_SPREAD * object_residuals(fit) ** 2)
     return np.append(np.minimum(own, fit.spread), fit.spread)
 
 
-def _deviations(normals: Sequence[np.ndarray], spreads: Float[np.ndarray, "N+1"], count: int) -> np.ndarray:
+def _deviations(normals: Sequence[np.ndarray], spreads: Float[np.ndarray, "B"], count: int) -> np.ndarray:
     """Standard deviations of all parameters; very large where the images do not constrain one."""
     widths, found, start = difference_steps(count), [], 0
     for normal, spread in zip(normals, spreads, strict=True):
