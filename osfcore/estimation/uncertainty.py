@@ -25,7 +25,7 @@ from osfcore.render.types import SceneBatch
 _POSITION_FACTOR = 15.0
 _ROTATION_FACTOR = 10.0
 _LIGHT_FACTOR = 12.0
-_MOST_SPREAD = 0.5  # s^2, of an object's mean squared residual; on tables as they are known it is 0.15 at most
+_MOST_SPREAD = 0.5  # s^2, of an object's mean squared residual; on the known table 0.15 at most in six goal images
 MAX_RESIDUAL = 0.04  # radiance, root of mean square over an object's pixels
 _RELATIVE_RESIDUAL = 0.5  # of the object's contrast, where masks bear out the pose; wrong ones were at 0.66 and more
 _ALLOWANCE, _MOST_USUAL = 1.25, 0.1  # times what is usual, which is no more than this [radiance]
