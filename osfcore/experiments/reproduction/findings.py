@@ -40,13 +40,14 @@ def _gap_of(cell: MeasuredCell, key: str) -> Mapping[str, Any]:
 
 def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float) -> str:
     """Ours against another method; who is better is said where p, corrected for all comparisons, is below 5 %."""
-    gap = _gap_of(other, key)
-    low, high = (100 * end for end in gap["interval"])
-    better = "ours is better" if gap["difference"] < 0 else "ours is worse"
+    gap = _gap_of(other, key)  # the other one minus ours
+    low, high = (-100 * end for end in reversed(gap["interval"]))
+    lead = -gap["difference"]
+    better = "ours is better" if lead > 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
         f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
-        f"{_percent(other, key)}, which is {100 * gap['difference']:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
+        f"{_percent(other, key)}, which is {100 * lead:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
         f"McNemar p = {gap['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
 

@@ -76,7 +76,7 @@ def test_findings_compare_methods_on_the_same_tasks(reported):
     compared = [line for line in told if "ours and" in line]
     assert len(compared) == 2 * 4  # by both kinds of success
     assert any(
-        "ours and visual foresight" in line and "50 % against 0 %, which is -50 points" in line for line in compared
+        "ours and visual foresight" in line and "50 % against 0 %, which is +50 points" in line for line in compared
     )
     assert all("no difference is shown" in line for line in compared)  # two tasks cannot show any
     assert any("mean 6D pose distance" in line for line in told)
