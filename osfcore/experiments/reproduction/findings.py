@@ -42,7 +42,7 @@ def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float)
     """Ours against another method; who is better is said where p, corrected for all comparisons, is below 5 %."""
     gap = _gap_of(other, key)  # the other one minus ours
     low, high = (-100 * end for end in reversed(gap["interval"]))
-    lead = -gap["difference"]
+    lead = 0.0 - gap["difference"]  # never -0
     better = "ours is better" if lead > 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
