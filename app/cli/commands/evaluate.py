@@ -125,8 +125,10 @@ class EvaluateMpcCommand(ParallelEvaluation):
     """Futures are compared with the goal's poses, or rendered and compared with the goal image."""
     oracle: bool = True
     """Also measure the planner that is told the truth."""
-    oracle_samples: int = 96
+    oracle_samples: int = 192
     """Sequences of actions in each round of its plans."""
+    oracle_tries: int = 8
+    """Episodes that it has at most for each task, of which the best counts; the last with the simulator's pushes."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
         from osfcore.control.episode_settings import EpisodeSettings
@@ -141,8 +143,9 @@ class EvaluateMpcCommand(ParallelEvaluation):
         plan = {key: value for key, value in asked.items() if value is not None}
         config = EvaluateMpc(
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,
-            self.factor, self.cost, self.names, self.oracle, EpisodeSettings(plan=PlanSettings(**plan)),
-            replace(ORACLE_PLAN, samples=self.oracle_samples), GaussianPlanSettings(**plan), ForesightSettings(**plan),
+            self.factor, self.cost, self.names, self.oracle, self.oracle_tries,
+            EpisodeSettings(plan=PlanSettings(**plan)), replace(ORACLE_PLAN, samples=self.oracle_samples),
+            GaussianPlanSettings(**plan), ForesightSettings(**plan),
         )  # fmt: skip
         return evaluate_mpc(config, fields, assets, executor)
 
@@ -265,7 +268,7 @@ def _show_mpc(folder: Path, result: dict[str, Any]) -> None:
     print(f"These end {ends} from their goals, from {_number(result['start_mm_mean'])} mm.")
     if result["oracle_success_2cm"] is not None:
         print(
-            f"Told the truth, the same planner: {_percent(result['oracle_success_tight'])} and "
+            f"Told the truth, the same planner at its best: {_percent(result['oracle_success_tight'])} and "
             f"{_percent(result['oracle_success_2cm'])}, {_number(result['oracle_final_mm_mean'])} mm."
         )
     distances = [_number(result[f"{who}pose6d_symmetric_mean"], 3) for who in ("", "noaction_")]

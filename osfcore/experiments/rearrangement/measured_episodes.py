@@ -30,7 +30,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.image_file import to_uint8
-from osfcore.metrics.success import RearrangementTask, score_of
+from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.mppi import GaussianPlanSettings
@@ -84,13 +84,24 @@ class MeasuredEpisodes:
         ended = log.follow(run_visual_foresight(*given))
         return self._scored(drawn, ended, {**log.summary(), "predicted": dict(_NO_ERRORS)})
 
-    def oracle(self, number: int, settings: EpisodeSettings) -> TaskResult:
-        """A task for the planner that is told the truth."""
+    def oracle(self, number: int, settings: EpisodeSettings, tries: int) -> TaskResult:
+        """The best of several tries of the planner at a task with true poses; the simulator can be set back.
+
+        They end with the first that succeeds. The last has the simulator as its dynamics, which takes far longer than
+        the learned model, and plans before every second action.
+        """
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
-        rng = stream_rng(self.tasks.seed, Stream.ORACLE, number)
-        ended = run_told_the_truth(drawn.task, self.assets, models, settings, rng)
-        return self._scored(drawn, ended, {})
+        slow = replace(settings, replan_every=2, plan=replace(settings.plan, begins_m=0.0))
+        ends: list[Ended] = []
+        for count in range(1, tries + 1):
+            rng, is_last = stream_rng(self.tasks.seed, Stream.ORACLE, number, count), count == tries
+            given = drawn.task, self.assets, models, slow if is_last else settings, rng
+            ends.append(run_told_the_truth(*given, knows_pushes=is_last))
+            if self._score(drawn.task, ends[-1].state).is_tight():
+                break
+        best = max(ends, key=lambda end: _quality(self._score(drawn.task, end.state)))
+        return self._scored(drawn, best, {"tries": len(ends)})
 
     def _drawn(self, number: int) -> DrawnTask:
         drawn = draw_task(self.assets, self.tasks, number)
@@ -102,11 +113,18 @@ class MeasuredEpisodes:
 
     def _scored(self, drawn: DrawnTask, ended: Ended, figures: dict[str, Any]) -> TaskResult:
         task = drawn.task
-        symmetries = {name: self.assets.info(name).symmetry for name in task.start.names}
-        score, nothing = (score_of(task, state, symmetries) for state in (ended.state, task.start))
+        score, nothing = (self._score(task, state) for state in (ended.state, task.start))
         told = {"score": score.to_json(), "noaction": nothing.to_json(), "rejected": dict(drawn.rejected), **figures}
         label = f"{task.number}: {score.moved_mm:.0f} mm"
         return TaskResult(told, (Comparison(label, to_uint8(ended.goal), to_uint8(ended.image)),))
+
+    def _score(self, task: RearrangementTask, state: SceneState) -> RearrangementScore:
+        return score_of(task, state, {name: self.assets.info(name).symmetry for name in task.start.names})
+
+
+def _quality(score: RearrangementScore) -> tuple[bool, bool, float]:
+    """What makes one end better than another."""
+    return score.is_tight(), score.is_success(), -score.pose6d_symmetric
 
 
 class _Log:

@@ -87,6 +87,7 @@ class MpcReport:
             "final_mm_median": _rounded(np.median(final), 2),
             "final_deg_median": _rounded(np.median([score.moved_deg for score in scores]), 2),
             "start_mm_mean": _rounded(np.mean([score.moved_mm for score in nothing]), 1),
+            "oracle_success_tight_by_try": self._by_try() if self.oracle else None,
             "oracle_final_mm_mean": _mean_of([score.moved_mm for score in self.told_truth]),
             "seconds_robot_median": self._robot_s(),
             **{f"{told}_s_median": self._median(f"{key}_s") for told, key in _STAGES.items()},
@@ -98,6 +99,14 @@ class MpcReport:
             "by_object": _by_object(scores),
             "rejected_layouts": self._rejected(),
         }
+
+    def _by_try(self) -> list[float]:
+        """The oracle's share of tight successes after one try, after two, and so on: whether more still help."""
+        pairs = [
+            (score.is_tight(), one.figures["tries"]) for score, one in zip(self.told_truth, self.oracle, strict=True)
+        ]
+        most = max(tries for _, tries in pairs)
+        return [_mean([is_tight and tries <= count for is_tight, tries in pairs]) for count in range(1, most + 1)]
 
     def _by_moved(self, key: str) -> dict[str, float]:
         counts = sorted({len(score.moved) for score in self.shipped})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -23,7 +24,7 @@ from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
 from osfcore.paper.mppi import GaussianPlanSettings
-from osfcore.planning.mppi import MPPIPlanner
+from osfcore.planning.mppi import MPPIPlanner, Rollout
 from osfcore.planning.pose_cost import PoseCost, PoseGoal
 from osfcore.planning.push_proposals import PushProposals
 from osfcore.world.simulated_dynamics import SimulatedPushes
@@ -106,36 +107,40 @@ def run_told_the_truth(
     models: SceneModels,
     settings: EpisodeSettings,
     rng: np.random.Generator,
+    *,
+    knows_pushes: bool,
 ) -> Ended:
-    """How the same planner leaves the table, with true poses and with the simulator as its dynamics.
+    """How the same planner leaves the table with true poses.
 
     Args:
         task: with the true goal.
         assets: meshes, for the simulator.
-        models: of which only shapes and symmetries play a part.
+        models: of which only shapes, symmetries and pushes play a part.
         settings: of which only steps, plans and what counts as arrived play a part.
         rng: of the plans.
+        knows_pushes: whether the simulator is its dynamics, and not the learned model.
     """
-    world, dynamics = Tabletop(assets), SimulatedPushes({name: assets.load(name) for name in task.start.names})
-    try:
+    with contextlib.ExitStack() as stack:
+        world = stack.enter_context(contextlib.closing(Tabletop(assets)))
+        rollout: Rollout = models.pushes.rollout
+        if knows_pushes:
+            meshes = {name: assets.load(name) for name in task.start.names}
+            rollout = stack.enter_context(contextlib.closing(SimulatedPushes(meshes))).rollout
         image = _goal_image(world, task)
         world.restore(task.start)
-        _push_there(world, dynamics, task, models, settings, rng)
+        _push_there(world, rollout, task, models, settings, rng)
         return _ended(world, image)
-    finally:
-        dynamics.close()
-        world.close()
 
 
 def _push_there(
     world: Tabletop,
-    dynamics: SimulatedPushes,
+    rollout: Rollout,
     task: RearrangementTask,
     models: SceneModels,
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> None:
-    planner = MPPIPlanner(dynamics.rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
+    planner = MPPIPlanner(rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
     goal, number = _moved_goal(task), 0
     while number < settings.steps:
         state = world.truth()

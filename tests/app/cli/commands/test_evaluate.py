@@ -172,7 +172,7 @@ def runs(monkeypatch):
         yield Ended(task.goal, image, image)
 
     monkeypatch.setattr(mpc, "run_from_images", ours)
-    monkeypatch.setattr(mpc, "run_told_the_truth", lambda task, *_: Ended(task.goal, image, image))
+    monkeypatch.setattr(mpc, "run_told_the_truth", lambda task, *_, **__: Ended(task.goal, image, image))
     monkeypatch.setattr(mpc, "load_scene_models", lambda *_: SimpleNamespace(symmetries={}))
     return made
 

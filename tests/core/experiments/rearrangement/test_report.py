@@ -45,7 +45,9 @@ def result(moved=1, mm=5.0, deg=3.0, *, others=0.0, **figures) -> TaskResult:
 
 
 OURS = (result(), result(2, 15.0, 20.0), result(3, 40.0, 1.0), result(1, 10.0, 1.0, others=30.0))
-ORACLE = (result(mm=1.0), result(2, mm=3.0), result(3, mm=1.0, deg=90.0), result(mm=50.0))
+ORACLE = (
+    result(mm=1.0, tries=1), result(2, mm=3.0, tries=3), result(3, mm=1.0, deg=90.0, tries=4), result(mm=50.0, tries=4)
+)  # fmt: skip
 
 
 def test_figures_are_means_and_medians_over_tasks():
@@ -63,6 +65,7 @@ def test_figures_are_means_and_medians_over_tasks():
     assert (told["replan_s_median"], told["episode_s_median"]) == (1.0, 60.0)
     assert (told["first_mm_median"], told["first_deg_median"], told["light_deg_median"]) == (0.5, 0.4, 1.5)
     assert (told["oracle_success_2cm"], told["oracle_success_tight"]) == (0.75, 0.5)
+    assert told["oracle_success_tight_by_try"] == [0.25, 0.25, 0.5, 0.5]
     assert told["oracle_final_mm_mean"] == 13.75
     assert (told["noaction_success_2cm"], told["start_mm_mean"]) == (0.0, 100.0)
     assert (told["own_pushes"], told["own_pushes_mean_mm_4"], told["own_pushes_median_deg_4"]) == (8, 3.5, 1.5)

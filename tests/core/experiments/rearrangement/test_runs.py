@@ -160,9 +160,10 @@ def test_an_episode_that_is_left_closes_its_world(task, library, models, eyes, w
     assert is_closed(worlds[0])
 
 
-def test_who_is_told_the_truth_comes_nearer(task, library, models, worlds):
+@pytest.mark.parametrize("knows_pushes", [True, False])
+def test_who_is_told_the_truth_comes_nearer(task, library, models, worlds, knows_pushes):
     settings = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16))
-    ended = run_told_the_truth(task, library, models, settings, np.random.default_rng(0))
+    ended = run_told_the_truth(task, library, models, settings, np.random.default_rng(0), knows_pushes=knows_pushes)
     before, after = (score_of(task, state, models.symmetries).moved_mm for state in (task.start, ended.state))
     assert before > 70
     assert after < before / 2
@@ -173,13 +174,14 @@ def test_who_is_told_the_truth_comes_nearer(task, library, models, worlds):
 
 
 def test_no_more_actions_than_there_may_be(task, library, models, worlds):
-    run_told_the_truth(task, library, models, replace(QUICK, steps=3, replan_every=2), np.random.default_rng(0))
+    settings = replace(QUICK, steps=3, replan_every=2)
+    run_told_the_truth(task, library, models, settings, np.random.default_rng(0), knows_pushes=True)
     assert worlds[0].acted == 3
 
 
 def test_what_is_at_its_goal_is_left_alone(task, library, models, worlds):
     done = replace(task, goal=replace(task.start, pusher=None))
-    ended = run_told_the_truth(done, library, models, QUICK, np.random.default_rng(0))
+    ended = run_told_the_truth(done, library, models, QUICK, np.random.default_rng(0), knows_pushes=True)
     assert worlds[0].acted == 0
     assert score_of(done, ended.state, models.symmetries).moved_mm == pytest.approx(0, abs=0.01)
     np.testing.assert_allclose(ended.image, ended.goal, atol=1e-3)
