@@ -154,6 +154,6 @@ def browser(live):
 @pytest.fixture
 def shown(live, browser):
     _, scene = live.request("POST", "/api/scenes", {"seed": 1, "objects": [BOX, BOTTLE]})
-    until(lambda: browser.below("/objects") == {BOX, BOTTLE})
+    until(lambda: browser.table_agrees(scene))  # and so all nodes, which come first, are what they shall be
     yield scene
     live.request("DELETE", f"/api/scenes/{scene['id']}")
