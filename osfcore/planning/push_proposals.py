@@ -2,7 +2,7 @@
 
 Random velocities touch an object in one of eight sequences, so sampling alone rarely finds a path around an object, let
 alone pushes of three objects one after another. A proposal is a whole sequence of actions for an order of stages
-(`push_order`): a collision-free path (`path_planning`) to an object, one or two pushes toward its pose
+(`push_order`): a collision-free path (`path_planning`) to an object, up to three pushes toward its pose
 (`push_sequences`) or a straight one toward its place (`push_primitives`), then the same for the next stage, as if this
 one had succeeded.
 """

@@ -1,6 +1,6 @@
 """Factors of variation, one at a time: worlds that differ in one thing from what the method takes for granted.
 
-The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 10
+The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 5
 deg and more above the table; a table of one known colour; exact calibration; linear images without noise; exact masks;
 friction as the dynamics were trained on; objects that they were trained on. `mild_together` are many factors at once,
 each of them small.

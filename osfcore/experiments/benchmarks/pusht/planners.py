@@ -56,7 +56,7 @@ class Planner(Protocol):
 
 
 class OurPlanner:
-    """MPPI with push proposals, as it ships."""
+    """MPPI with straight push proposals; as it ships, but that plans are not recombined nor judged over begins."""
 
     def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
         self._futures, self._goal, self._rng = _Futures(problem.step), problem.goal, rng
