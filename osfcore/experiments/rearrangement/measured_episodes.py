@@ -93,14 +93,15 @@ class MeasuredEpisodes:
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
         slow = replace(settings, replan_every=2, plan=replace(settings.plan, begins_m=0.0))
-        ends: list[Ended] = []
+        ends: list[tuple[RearrangementScore, Ended]] = []
         for count in range(1, tries + 1):
             rng, is_last = stream_rng(self.tasks.seed, Stream.ORACLE, number, count), count == tries
             given = drawn.task, self.assets, models, slow if is_last else settings, rng
-            ends.append(run_told_the_truth(*given, knows_pushes=is_last))
-            if self._score(drawn.task, ends[-1].state).is_tight():
+            end = run_told_the_truth(*given, knows_pushes=is_last)
+            ends.append((self._score(drawn.task, end.state), end))
+            if ends[-1][0].is_tight():
                 break
-        best = max(ends, key=lambda end: _quality(self._score(drawn.task, end.state)))
+        _, best = max(ends, key=lambda tried: _quality(tried[0]))
         return self._scored(drawn, best, {"tries": len(ends)})
 
     def _drawn(self, number: int) -> DrawnTask:
