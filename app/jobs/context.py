@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import queue
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from app.processes.messages.job_messages import CancelJob, ChangeJob, PauseJob, ResumeJob, SceneCommand, StepJob
 from app.processes.messages.scene_messages import Act, ObserveScene, TakeView
+from app.processes.process_client import ProcessUnavailable
 from app.processes.process_server import Answer
+from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
 
 _LOOKS_EVERY_S = 0.05
+_ANSWER_S = 300.0  # the service gives its simulation three minutes, and others may be served first
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -43,10 +48,12 @@ class JobControl:
 
     Args:
         send: takes messages to the service.
+        answer_s: how long the service may take to answer `ask` [s].
     """
 
-    def __init__(self, send: Callable[[object], None]) -> None:
-        self._send = send
+    def __init__(self, send: Callable[[object], None], answer_s: float = _ANSWER_S) -> None:
+        self._send, self._answer_s = send, answer_s
+        self._numbers = itertools.count()
         self._may_run = threading.Event()
         self._may_run.set()
         self._is_cancelled = threading.Event()
@@ -98,13 +105,29 @@ class JobControl:
         """Have something done with the scene that this job drives, and wait for the answer.
 
         Raises:
-            OsfError: what the simulation raised, or ProcessUnavailable if it is not there now.
+            ProcessUnavailable: if the simulation is not there now, or the service does not answer in time.
+            OsfError: what the simulation raised, or because the job was cancelled meanwhile.
         """
-        self._send(SceneCommand(command))
-        answer = self._answers.get()
+        number, latest = next(self._numbers), time.monotonic() + self._answer_s
+        self._send(SceneCommand(command, number))
+        answer = self._answer_to(number)
+        while answer is None:
+            if self._is_cancelled.is_set():
+                raise OsfError("This job was cancelled while it waited for the simulation.")
+            if time.monotonic() > latest:
+                raise ProcessUnavailable("service", f"did not answer this job within {self._answer_s:g} s")
+            answer = self._answer_to(number)
         if answer.error is not None:
             raise answer.error
         return answer.value
+
+    def _answer_to(self, number: int) -> Answer | None:
+        """The answer to a question, if it comes in a moment; one that came too late for its own is dropped."""
+        with contextlib.suppress(queue.Empty):
+            while (answer := self._answers.get(timeout=_LOOKS_EVERY_S)).number != number:
+                pass
+            return answer
+        return None
 
     def take(self, order: object) -> None:
         """Take an order, or the answer to `ask`."""

@@ -40,10 +40,17 @@ def in_words(job: Job) -> str:
 
 
 class WrongJobState(OsfError):
-    """An order that does not fit the state that a job is in."""
+    """An order that does not fit the state that a job is in.
 
-    def __init__(self, job: Job, wanted: str) -> None:
-        super().__init__(f"This {in_words(job)} is {job.state}, so it cannot be {wanted}.")
+    Args:
+        job: as it is.
+        wanted: what it was to be, as in "cancelled".
+        is_over: whether its process takes no orders any more, although what has become of the job is not known yet.
+    """
+
+    def __init__(self, job: Job, wanted: str, *, is_over: bool = False) -> None:
+        state = "no longer takes orders because it is ending" if is_over else f"is {job.state}"
+        super().__init__(f"This {in_words(job)} {state}, so it cannot be {wanted}.")
 
 
 class TrainingAlready(OsfError):

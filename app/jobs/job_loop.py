@@ -19,7 +19,7 @@ from app.jobs.job_table import JobTable
 from app.jobs.outcomes import JobStopped, Outcome, after
 from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep, SceneCommand
 from app.processes.messages.scene_messages import Command
-from app.processes.process_server import Answer
+from app.processes.process_server import Answer, InternalError
 from app.storage.database import now_utc
 from app.storage.durable import sync_tree
 from app.storage.field_files import clear_workshop
@@ -171,14 +171,22 @@ class JobLoop:
 
         In a thread of its own: the simulation may hang, and the job must be heard, and cancelled, meanwhile.
         """
+        try:
+            was_sent = run.order(self._answer_to(run, asked))
+        except Exception as error:  # whatever it is, the job must not wait for ever
+            _log.exception("%s that a job asked for could not be done", type(asked.command).__name__)
+            was_sent = run.order(Answer(asked.number, error=InternalError("service's answer to this job", error)))
+        if not was_sent and not run.is_cancelled:
+            _log.warning("a job that takes no orders any more was not told what it had asked for")
+
+    def _answer_to(self, run: JobProcess, asked: SceneCommand) -> Answer:
         scene = self._table[run.id].params.get("scene")
         try:
             if self._serve is None or asked.command.id != scene:
                 raise UnknownName("scene of this job", asked.command.id, [str(scene)])
-            answer = Answer(0, self._serve(asked.command))
+            return Answer(asked.number, self._serve(asked.command))
         except OsfError as error:
-            answer = Answer(0, error=error)
-        run.order(answer)
+            return Answer(asked.number, error=error)
 
     def _rest(self, run: JobProcess) -> None:
         """The job has come to the end of a round, and waits."""

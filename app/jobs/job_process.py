@@ -63,9 +63,9 @@ class JobProcess:
         """Whether it was told to stop."""
         return self._cancel_at < math.inf
 
-    def order(self, message: object) -> None:
-        """Send an order or an answer; does nothing once the process has ended."""
-        self._client.notify(message)
+    def order(self, message: object) -> bool:
+        """Send an order or an answer; returns False if the process has ended or does not listen."""
+        return self._client.notify(message)
 
     def cancel(self, grace_s: float) -> None:
         """Tell it to stop, and to wait no longer than `grace_s` until it has. Calling it again does nothing."""

@@ -232,7 +232,7 @@ class Jobs:
 
         Raises:
             UnknownName: if there is no such job.
-            WrongJobState: if it is not running.
+            WrongJobState: if it is not running, or is just ending.
         """
         return self._switch(job, "running", "paused", PauseJob())
 
@@ -241,7 +241,7 @@ class Jobs:
 
         Raises:
             UnknownName: if there is no such job.
-            WrongJobState: if it is not paused.
+            WrongJobState: if it is not paused, or is just ending.
         """
         return self._switch(job, "paused", "running", ResumeJob())
 
@@ -250,7 +250,7 @@ class Jobs:
 
         Raises:
             UnknownName: if there is no such job.
-            WrongJobState: if it is not paused.
+            WrongJobState: if it is not paused, or is just ending.
         """
         return self._switch(job, "paused", "running", StepJob())
 
@@ -259,22 +259,25 @@ class Jobs:
 
         Raises:
             UnknownName: if there is no such job.
-            WrongJobState: if it neither runs nor pauses.
+            WrongJobState: if it neither runs nor pauses, or is just ending.
         """
         with self._changed:
             known = self.get(job)
             if known.state not in ("running", "paused") or self._loop.run is None or self._loop.run.is_cancelled:
                 raise WrongJobState(known, "changed")
-            self._loop.run.order(ChangeJob(params))
+            if not self._loop.run.order(ChangeJob(params)):
+                raise WrongJobState(known, "changed", is_over=True)
             self._table.set(replace(self._table[job], params={**known.params, **params}))
             return self.get(job)
 
     def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
         with self._changed:
             known = self.get(job)
+            wanted = "paused" if after == "paused" else "resumed"
             if known.state != before or self._loop.run is None or self._loop.run.is_cancelled:
-                raise WrongJobState(known, "paused" if after == "paused" else "resumed")
-            self._loop.run.order(order)
+                raise WrongJobState(known, wanted)
+            if not self._loop.run.order(order):
+                raise WrongJobState(known, wanted, is_over=True)
             self._loop.run.clock.switch(is_running=after == "running")
             self._table.set(replace(self._table[job], state=after, eta_s=None))
             return self.get(job)

@@ -47,9 +47,10 @@ class JobStep:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneCommand:
-    """Something to be done with the scene that a job drives. Answered by an Answer, numbered 0."""
+    """Something to be done with the scene that a job drives. Answered by an Answer of the same number."""
 
     command: Act | ObserveScene | TakeView
+    number: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,5 @@
 import os
+import pickle
 import queue
 import signal
 import threading
@@ -20,6 +21,7 @@ from app.processes.messages.job_messages import (
     StepJob,
 )
 from app.processes.messages.scene_messages import TakeImage
+from app.processes.process_server import InternalError
 from app.storage.database import CannotStore, Store
 from app.storage.field_files import workshop
 from osfcore.errors import UnknownName
@@ -261,6 +263,7 @@ class PlayedJob:
         self._outcome = None
         self._is_over = False
         self.is_cancelled = False
+        self.listens = True
 
     def start(self, job, data_dir, folder, on_event):
         self.id, self.clock, self.send = job.id, JobClock(), on_event
@@ -275,7 +278,9 @@ class PlayedJob:
         return self._orders.get(timeout=10)
 
     def order(self, message):
-        self._orders.put(message)
+        if self.listens:
+            self._orders.put(pickle.loads(pickle.dumps(message)))  # as through a pipe
+        return self.listens
 
     def cancel(self, grace_s):
         self.is_cancelled = True
@@ -359,6 +364,28 @@ def test_what_a_job_asks_for_is_done_with_its_own_scene_only(played, open_jobs):
     played.send(SceneCommand(TakeImage("s2", "goal", 32)))
     assert "s2" in str(played.recv().error)
     assert [command.id for command in asked] == ["s1", "s1"]
+
+
+@pytest.mark.parametrize("served", [lambda: {}["no such key"], lambda: threading.Lock()])
+def test_what_cannot_be_answered_is_logged_and_told_to_the_job_that_waits(played, open_jobs, caplog, served):
+    jobs, _ = open_jobs(serve=lambda _: served(), start_process=played.start)
+    job = jobs.submit("episode", {"scene": "s1"})
+    until_state(jobs, job, "running")
+    played.send(SceneCommand(TakeImage("s1", "goal", 32), 7))
+    answer = played.recv()
+    assert (answer.number, type(answer.error)) == (7, InternalError)
+    assert [record.exc_info is not None for record in caplog.records] == [True]
+
+
+@pytest.mark.parametrize("order", ["pause", "change"])
+def test_an_order_that_reaches_nobody_is_refused_and_changes_nothing(played, open_jobs, order):
+    jobs, _ = open_jobs(start_process=played.start)
+    job = jobs.submit("episode", {"scene": "s1"})
+    running = until_state(jobs, job, "running")
+    played.listens = False
+    with pytest.raises(WrongJobState):
+        jobs.pause(job.id) if order == "pause" else jobs.change(job.id, {"settings": {}})
+    assert jobs.get(job.id) == running
 
 
 def begun(jobs, kind="episode"):

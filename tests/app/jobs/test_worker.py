@@ -20,10 +20,10 @@ from app.processes.messages.job_messages import (
     StepJob,
 )
 from app.processes.messages.scene_messages import TakeImage
-from app.processes.process_client import ProcessClient
+from app.processes.process_client import ProcessClient, ProcessUnavailable
 from app.processes.process_server import Answer, InternalError, child_main
 from app.processes.request_queue import Request
-from osfcore.errors import UnknownName
+from osfcore.errors import OsfError, UnknownName
 from tests.app.conftest import until
 
 TABLE = {"images": 60, "size": 16, "seed": 0}
@@ -127,9 +127,25 @@ def test_a_job_asks_for_what_it_wants_done_with_its_scene():
     assert control.ask(command) == b"picture"
     assert [type(message) for message in sent] == [SceneCommand]
     assert sent[0].command == command
-    control.take(Answer(0, error=UnknownName("scene", "s1", [])))
+    control.take(Answer(sent[0].number + 1, error=UnknownName("scene", "s1", [])))
     with pytest.raises(UnknownName, match="no scene"):
         control.ask(command)
+
+
+def test_a_job_that_nobody_answers_stops_waiting_and_takes_no_late_answer_for_another():
+    sent = []
+    control, command = JobControl(sent.append, answer_s=0.0), TakeImage("s1", "goal", 32)
+    with pytest.raises(ProcessUnavailable):
+        control.ask(command)
+    control.take(Answer(sent[0].number, b"too late"))
+    control.take(Answer(sent[0].number + 1, b"picture"))
+    assert control.ask(command) == b"picture"
+
+
+def test_a_job_that_is_cancelled_stops_waiting_for_an_answer():
+    control = JobControl(lambda _: control.take(CancelJob()), answer_s=float("inf"))
+    with pytest.raises(OsfError):
+        control.ask(TakeImage("s1", "goal", 32))
 
 
 @dataclasses.dataclass(frozen=True)
