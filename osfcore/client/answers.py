@@ -124,7 +124,7 @@ class _Running(Entry):
     """
 
     id: str
-    status: Literal["queued", "running", "paused", "done", "failed", "cancelled"]
+    status: Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
     stage: str | None
     done: int
     total: int
@@ -135,7 +135,7 @@ class _Running(Entry):
     @property
     def is_over(self) -> bool:
         """Whether nothing more comes."""
-        return self.status in ("done", "failed", "cancelled")
+        return self.status not in ("queued", "running", "paused")
 
 
 class Episode(_Running):

@@ -71,7 +71,7 @@ def list_all(
     after: AfterJob = None,
     search: Annotated[str, Query(**sized(SEARCH), description="Words that name or objects hold, all of them.")] = "",
     outcome: Annotated[
-        Literal["reached", "out of steps", "refused", "cancelled", "failed"] | None,
+        Literal["reached", "out of steps", "refused", "cancelled", "failed", "interrupted"] | None,
         Query(description="Only those that ended so."),
     ] = None,
 ) -> EpisodeList:

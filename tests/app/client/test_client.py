@@ -2,6 +2,7 @@
 
 import json
 import re
+from typing import get_args
 
 import httpx2
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from app.api.app_factory import create_app
-from osfcore.client import Client, ServiceError
+from app.jobs.job import FINISHED, State
+from osfcore.client import Client, Episode, Estimate, Health, ServiceError
+from osfcore.client.client import Mode
 from osfcore.client.connection import Connection
 from osfcore.errors import InvalidInput
 from osfcore.geometry.light import Light
@@ -56,6 +59,63 @@ def judge_answer(answer):
     if "json" in kind:
         answer.read()
         check(told[kind]["schema"], answer.json())
+
+
+def resolved(schema, root):
+    """What a schema refers to, or itself."""
+    if "$ref" in schema:
+        _, *path = schema["$ref"].split("/")
+        schema = root
+        for part in path:
+            schema = schema[part]
+    return schema
+
+
+def choices(schema, root):
+    """The schemas one of which a value must fit."""
+    schema = resolved(schema, root)
+    return [one for option in schema["anyOf"] for one in choices(option, root)] if "anyOf" in schema else [schema]
+
+
+def takes_all(ours, theirs, where):
+    """That one schema allows every value that another one allows; both with what their references point into."""
+    (our_schema, our_root), (their_schema, their_root) = ours, theirs
+    our_choices = choices(our_schema, our_root)
+    for told in choices(their_schema, their_root):
+        kind = told.get("type")
+        fitting = [one for one in our_choices if one.get("type") in (kind, "number" if kind == "integer" else kind)]
+        assert fitting, f"{where} may be {told}, which is not known here"
+        (known,) = fitting
+        if "enum" in known or "const" in known:
+            values = set(told.get("enum", [told.get("const")]))
+            assert values <= set(known.get("enum", [known.get("const")])), where
+        for part in ("items", "additionalProperties"):
+            if isinstance(known.get(part), dict):
+                takes_all((known[part], our_root), (told[part], their_root), f"{where}, each")
+        assert set(known.get("required", ())) <= set(told.get("required", ())), where
+        for name, member in known.get("properties", {}).items():
+            takes_all((member, our_root), (told["properties"][name], their_root), f"{where}, {name}")
+
+
+@pytest.mark.parametrize(
+    ("kind", "path"),
+    [(Health, "/api/health"), (Episode, "/api/episodes/{episode}"), (Estimate, "/api/estimates/{estimate}")],
+)
+def test_every_answer_that_the_schema_allows_is_understood(kind, path):
+    ours = kind.model_json_schema()
+    theirs = SCHEMA["paths"][path]["get"]["responses"]["200"]["content"]["application/json"]["schema"]
+    takes_all((ours, ours), (theirs, SCHEMA), kind.__name__)
+
+
+def test_work_is_over_in_the_states_in_which_the_service_has_finished_it():
+    fields = {"id": "e1", "stage": None, "done": 0, "total": 0, "note": "", "eta_s": None, "error": None}
+    over = {state: Estimate(**fields, status=state, estimate=None).is_over for state in get_args(State)}
+    assert over == {state: state in FINISHED for state in get_args(State)}
+
+
+def test_the_modes_of_an_estimate_are_those_of_the_service():
+    known = resolved(SCHEMA["components"]["schemas"]["EstimateIn"]["properties"]["mode"], SCHEMA)
+    assert set(known["enum"]) == set(get_args(Mode))
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from app.episodes.file_names import (
     VIDEO_FILE,
 )
 from app.episodes.frames import HEIGHT, TILE_PX, WIDTH, frame, part_of
+from app.jobs.job import FINISHED
 from app.processes.messages.scene_messages import ComposedGoal
 from app.services.episode_results import FILES, NoTrajectory
 from app.services.episodes import AskedEpisode, EpisodeGoesOn, Episodes, GoalUnknown, NoGoal, flat, nested
@@ -432,6 +433,13 @@ def test_every_file_can_be_downloaded_and_read(service, done, tmp_path):
     assert [picture.shape for picture in pictures] == [(HEIGHT, WIDTH, 3)] * 3
     assert len(files[RECORDING_FILE]) > 1000
     is_problem(service.get(f"/api/episodes/{episode['id']}/files/none.txt"), 404)
+
+
+@pytest.mark.parametrize("state", [state for state in FINISHED if state != "done"])
+def test_episodes_are_listed_by_every_state_in_which_they_can_end(service, state):
+    listed = service.get("/api/episodes", params={"outcome": state})
+    assert listed.status_code == 200
+    assert {one["status"] for one in listed.json()["episodes"]} <= {state}
 
 
 def test_it_has_a_name_that_can_be_changed_and_found(service, done):
