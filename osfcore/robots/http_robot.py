@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 from urllib.parse import quote
 
@@ -58,6 +61,7 @@ class HttpRobot:
         self._url, self._names = url.rstrip("/"), names
         # Names of proxies in the environment are not for a robot beside the computer.
         self._http = httpx2.Client(timeout=timeout_s, trust_env=False)
+        self._idle, self._under_way = threading.Condition(), 0
         try:
             told = decode(RobotJson, self._json("GET", "robot"), f"answer of {self._url}/robot")
             self._cameras = tuple(_camera(entry) for entry in told.cameras)
@@ -117,8 +121,13 @@ class HttpRobot:
         self._json("POST", "stop")
 
     def close(self) -> None:
-        """Release the sockets."""
-        self._http.close()
+        """Wait for requests under way, such as a stop from another thread, then release the sockets.
+
+        Timeouts bound the wait. Closing at once would abort a stop, and leak the socket of one that still connects.
+        """
+        with self._idle:
+            self._idle.wait_for(lambda: not self._under_way)
+            self._http.close()
 
     def _masks(self) -> dict[tuple[str, str], bytes]:
         keys = [(camera.name, name) for camera in self._cameras for name in self._names]
@@ -136,12 +145,24 @@ class HttpRobot:
 
     def _answer(self, method: str, path: str, body: object = None) -> bytes:
         try:
-            answer = self._http.request(method, f"{self._url}/{path}", json=body)
+            with self._one_more_under_way():
+                answer = self._http.request(method, f"{self._url}/{path}", json=body)
         except (httpx2.TransportError, httpx2.InvalidURL, RuntimeError) as error:  # RuntimeError once it is closed
             raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
         if not answer.is_success:
             raise RobotRefused(self._url, _detail(answer) or f"{answer.status_code} to {method} /{path}")
         return answer.content
+
+    @contextlib.contextmanager
+    def _one_more_under_way(self) -> Iterator[None]:
+        with self._idle:
+            self._under_way += 1
+        try:
+            yield
+        finally:
+            with self._idle:
+                self._under_way -= 1
+                self._idle.notify_all()
 
 
 def _camera(entry: CameraJson) -> SentCamera:
