@@ -114,4 +114,4 @@ def test_the_command_of_the_docs_makes_an_episode_of_its_parts(installed, data_d
 
 def test_its_estimators_hold_the_light(installed, data_dir):
     parts = parts_of(PartNames(estimator="daylight", planner="shooting", cost="last"), data_dir)
-    np.testing.assert_allclose(parts.estimators.first.held_light, (0, 0, 1))
+    np.testing.assert_allclose(parts.estimators.first.held_light, (0, 0, 1), atol=1e-12)

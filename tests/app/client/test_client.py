@@ -156,7 +156,7 @@ def test_light_and_poses_are_as_given(osf, live):
     light = Light(np.array([0.6, 0.0, 0.8]))
     scene = osf.new_scene([BOX], poses=poses, light=light)
     np.testing.assert_allclose(scene.state.light.direction, light.direction, atol=1e-9)
-    np.testing.assert_allclose(scene.state.pose(BOX).position, poses[BOX].position)
+    np.testing.assert_allclose(scene.state.pose(BOX).position, poses[BOX].position, atol=1e-9)
     live.request("DELETE", f"/api/scenes/{scene.id}")
 
 

@@ -94,11 +94,11 @@ def test_every_topic_has_its_schema(read):
 
 def test_frames_are_where_the_episode_had_things(read):
     times_s, positions, quaternions = poses(read, BOX)
-    np.testing.assert_allclose(times_s, 0.2 * np.arange(STEPS + 1))
+    np.testing.assert_allclose(times_s, 0.2 * np.arange(STEPS + 1), atol=1e-12)
     np.testing.assert_allclose(positions[:, 0], 0.03 * np.arange(STEPS + 1), atol=1e-6)
     np.testing.assert_allclose(quaternions, np.tile(np.roll(TURN, -1), (STEPS + 1, 1)), atol=1e-6)
     thought_s, thought, _ = poses(read, f"estimate/{BOX}")
-    np.testing.assert_allclose(thought_s, [0, 0.2 * STEPS])
+    np.testing.assert_allclose(thought_s, [0, 0.2 * STEPS], atol=1e-12)
     np.testing.assert_allclose(thought[:, 0], [0.001, 0.091], atol=1e-6)
     np.testing.assert_allclose(poses(read, f"goal/{BOX}")[1][0], at(0.1).position[0], atol=1e-6)
     np.testing.assert_allclose(poses(read, "pusher")[1], np.tile([-0.1, 0.1, 0.06], (STEPS + 1, 1)), atol=1e-6)
@@ -111,7 +111,7 @@ def test_the_goal_camera_looks_along_its_z_at_what_it_shows(read):
     seen = Rotation.from_quat(quaternion[0]).inv().apply(np.array([0, 0, 0.04]) - position[0])
     pixel = np.array(calibration.K).reshape(3, 3) @ (seen / seen[2])
     np.testing.assert_allclose(pixel[:2], (32, 32), atol=1e-6)
-    np.testing.assert_allclose(np.array(calibration.P).reshape(3, 4)[:, :3], camera.intrinsics)
+    np.testing.assert_allclose(np.array(calibration.P).reshape(3, 4)[:, :3], camera.intrinsics, atol=1e-12)
     assert (calibration.width, calibration.height) == (64, 64)
 
 

@@ -68,7 +68,7 @@ def test_every_state_is_there_for_its_time(library, tmp_path, count):
         ("/pusher", [Pose(s.pusher, np.array([1.0, 0, 0, 0])) for s in states]),
     ):
         times, places = zip(*told(content, node, "position")[-count:], strict=True)
-        np.testing.assert_allclose(times, STEP_S * np.arange(count))
+        np.testing.assert_allclose(times, STEP_S * np.arange(count), atol=1e-12)
         np.testing.assert_allclose(places, [pose.position for pose in poses], atol=1e-9)
     turns = [turn for t, turn in told(content, "/objects/009_gelatin_box", "wxyz") if t > 0]
     assert len(turns) == count - 1

@@ -64,7 +64,7 @@ def test_as_many_objects_as_asked_shall_lie_elsewhere_and_the_world_is_back_at_i
         plain.arrange(order.seed)
         start = begin.world.truth()
         assert same(start, plain.truth())
-        np.testing.assert_allclose(start.pusher, plain.truth().pusher)
+        np.testing.assert_allclose(start.pusher, plain.truth().pusher, atol=1e-12)
         shift = np.linalg.norm(begin.truth.poses.position - start.poses.position, axis=1)
         far = {name for name, distance in zip(start.names, shift, strict=True) if distance > 0.05}
         assert far == set(begin.moved)

@@ -116,7 +116,7 @@ def test_pushes_are_replayed_in_real_time_after_the_looks(trajectory):
     glance_s = clock.looks_s - LOOK_S["first"]  # the goal was found at once
     assert 0 < glance_s < LOOK_S["goal"]
     spent = np.diff(clock.step_s)
-    np.testing.assert_allclose(spent, [PLAN_S + actions * STEP_S + REST_S for actions in (1, 2, 1)])
+    np.testing.assert_allclose(spent, [PLAN_S + actions * STEP_S + REST_S for actions in (1, 2, 1)], atol=1e-12)
     assert clock.step_s[0] == clock.looks_s
     assert clock.length_s == clock.step_s[-1]
 

@@ -46,7 +46,7 @@ def test_along_passes_every_waypoint_within_limits(waypoints, speed):
 
 def test_a_fast_diagonal_keeps_to_the_limit_of_each_axis():
     actions = along(np.zeros(2), np.array([[0.12, 0.0]]), 1.0)
-    np.testing.assert_allclose(actions, [[0.3, 0, 0], [0.3, 0, 0]])
+    np.testing.assert_allclose(actions, [[0.3, 0, 0], [0.3, 0, 0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_paths_that_lead_nowhere_or_too_far_are_refused(waypoints, words):
 
 
 def test_the_way_ends_where_the_reach_does():
-    np.testing.assert_allclose(way(np.array([0.3, 0]), straight(0, 0.3, 3))[:, 0], [0.3, 0.35, 0.35, 0.35])
+    np.testing.assert_allclose(way(np.array([0.3, 0]), straight(0, 0.3, 3))[:, 0], [0.3, 0.35, 0.35, 0.35], atol=1e-12)
 
 
 def test_toward_the_nearest():

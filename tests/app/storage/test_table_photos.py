@@ -37,7 +37,7 @@ def test_a_photo_is_read_as_it_was_kept(store):
     assert (read.source, read.notes, read.job, read.scene) == ("board", ("A note.",), "j", "s")
     np.testing.assert_array_equal(read.K, K)
     for pose in (read.T_world_camera, read.T_table_photo):
-        np.testing.assert_allclose(pose.matrix(), BOARD.matrix())
+        np.testing.assert_allclose(pose.matrix(), BOARD.matrix(), atol=1e-12)
     assert (store.sent("p1").read_bytes(), store.picture("p1").read_bytes()) == (b"sent", b"shown")
 
 
@@ -85,4 +85,4 @@ def test_an_object_marked_again_keeps_its_place_among_the_others():
 def test_a_smaller_picture_has_the_camera_of_the_photo():
     camera = record().camera(BOARD, 320)
     assert (camera.width, camera.height) == (320, 240)
-    np.testing.assert_allclose(camera.intrinsics, [[300, 0, 160], [0, 305, 120], [0, 0, 1]])
+    np.testing.assert_allclose(camera.intrinsics, [[300, 0, 160], [0, 305, 120], [0, 0, 1]], atol=1e-12)

@@ -75,7 +75,7 @@ def test_it_is_the_same_once_written_and_read(prepared):
     read = prepared_from_json(json.loads(json.dumps(prepared_to_json(prepared))))
     for mine, theirs in ((prepared.first, read.first), (prepared.goal, read.goal)):
         np.testing.assert_allclose(mine.residuals, theirs.residuals, atol=1e-6)
-        np.testing.assert_allclose(mine.estimate.state.poses.position, theirs.estimate.state.poses.position)
+        np.testing.assert_allclose(mine.estimate.state.poses.position, theirs.estimate.state.poses.position, atol=1e-12)
         assert mine.estimate.state.names == theirs.estimate.state.names
 
 

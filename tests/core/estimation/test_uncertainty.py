@@ -57,7 +57,7 @@ def test_a_right_guess_is_trusted(models, views, end):
     assert estimate.position_std.max() < 0.003
     assert estimate.rotation_std.max() < np.deg2rad(2)
     assert 0 < estimate.light_std < np.deg2rad(3)
-    np.testing.assert_allclose(estimate.state.poses.position, end.params.positions)
+    np.testing.assert_allclose(estimate.state.poses.position, end.params.positions, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_fit_of_the_truth_is_perfect(models, truth):
     own = own_views(models, params_of(truth), default_cameras(48)[:2], FINE)
     fit = evaluate_fit(models, own, params_of(truth))
     np.testing.assert_array_equal(fit.residuals, 0)
-    np.testing.assert_allclose(fit.overlap, 1)
+    np.testing.assert_allclose(fit.overlap, 1, atol=1e-12)
     np.testing.assert_allclose(fit.pixels, own.masks.sum(axis=(2, 3)), rtol=1e-5)
     assert fit.surroundings == fit.spread == 0
     assert evaluate_fit(models, replace(own, masks=None), params_of(truth)).overlap.tolist() == [1, 1]
@@ -166,8 +166,8 @@ def test_a_grainy_table_says_little_of_how_well_an_object_is_known():
         estimate_with_uncertainty(params(), normals(), fit_of(spread=share * own), {}) for share in (0.1, 0.5, 5, 50)
     ]
     deviations = np.array([(e.position_std[0], e.rotation_std[0]) for e in told])
-    np.testing.assert_allclose(deviations[0], np.sqrt(0.1 / 0.5) * deviations[1])
-    np.testing.assert_allclose(deviations[2:], deviations[[1, 1]])
+    np.testing.assert_allclose(deviations[0], np.sqrt(0.1 / 0.5) * deviations[1], atol=1e-12)
+    np.testing.assert_allclose(deviations[2:], deviations[[1, 1]], atol=1e-12)
     np.testing.assert_allclose([e.light_std for e in told], told[0].light_std * np.sqrt([1, 5, 50, 500]))
 
 
@@ -202,7 +202,9 @@ def test_residuals_that_are_allowed_are_not_doubted(allowed, is_doubted):
 
 
 def test_what_is_usual_is_allowed_up_to_a_bound():
-    np.testing.assert_allclose(allowed_residuals(np.array([0.0, 0.04, 0.1, 0.5])), [0.0, 0.05, 0.125, 0.125])
+    np.testing.assert_allclose(
+        allowed_residuals(np.array([0.0, 0.04, 0.1, 0.5])), [0.0, 0.05, 0.125, 0.125], atol=1e-12
+    )
 
 
 def test_the_level_is_of_what_an_object_shows(models, views, truth):
@@ -219,7 +221,7 @@ def test_the_level_is_of_what_an_object_shows(models, views, truth):
 def test_a_goal_may_be_brighter_or_dimmer_than_the_scene():
     """What is off by the same share in another light is nothing new, however much that is in radiance."""
     usual = relative_residuals(fit_of(residuals=np.full((2, 1), 0.03)))
-    np.testing.assert_allclose(usual, 0.1)
+    np.testing.assert_allclose(usual, 0.1, atol=1e-12)
     for brighter in (0.5, 1.0, 3.0):
         for times, is_misfit in ((1.9, False), (2.1, True)):
             fit = fit_of(residuals=np.full((2, 1), 0.03 * brighter * times), level=np.array([0.3 * brighter]))
@@ -228,7 +230,9 @@ def test_a_goal_may_be_brighter_or_dimmer_than_the_scene():
 
 def test_a_goal_is_not_doubted_for_what_all_fields_err_by_nor_believed_where_everything_is_off():
     fit = fit_of(4, level=np.array([0.5, 0.1, 0.3, 0.3]))
-    np.testing.assert_allclose(goal_allowance(fit, np.array([0.0, 0.0, 2.0, np.nan])), [0.04, 0.02, 0.18, 0.04])
+    np.testing.assert_allclose(
+        goal_allowance(fit, np.array([0.0, 0.0, 2.0, np.nan])), [0.04, 0.02, 0.18, 0.04], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(

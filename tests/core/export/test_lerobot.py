@@ -41,7 +41,7 @@ def test_statistics_of_images_are_those_of_their_colours():
     image = np.broadcast_to(np.array([0, 51, 255], np.uint8), (4, 8, 8, 3))
     found = image_statistics(image)
     assert found["count"].tolist() == [4]
-    np.testing.assert_allclose(found["mean"], np.array([0, 0.2, 1]).reshape(3, 1, 1))
+    np.testing.assert_allclose(found["mean"], np.array([0, 0.2, 1]).reshape(3, 1, 1), atol=1e-12)
     np.testing.assert_allclose(found["std"], np.zeros((3, 1, 1)), atol=1e-12)
 
 

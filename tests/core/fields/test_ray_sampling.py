@@ -63,10 +63,10 @@ def test_the_smallest_opacity_over_views_is_found():
     alphas[1][:, 16:] = 0.8  # right half, which for a camera at +y is x < 0
     points = np.float32([[0.1, 0, 0], [-0.1, 0, 0], [5, 5, 5]])
     least, framed = shares_of_views(points, cameras, alphas, 0)
-    np.testing.assert_allclose(least, [0.2, 0.5, 1.0])  # who is in no view is carved by none
+    np.testing.assert_allclose(least, [0.2, 0.5, 1.0], atol=1e-12)  # who is in no view is carved by none
     assert framed.tolist() == [True, True, False]
     forgiving, _ = shares_of_views(points, cameras, alphas, 1)
-    np.testing.assert_allclose(forgiving, [0.5, 0.8, 1.0])
+    np.testing.assert_allclose(forgiving, [0.5, 0.8, 1.0], atol=1e-12)
 
 
 def test_many_points_at_once_are_as_single_ones():

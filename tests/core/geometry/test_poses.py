@@ -73,7 +73,7 @@ def test_batches_broadcast():
     batch = Pose(np.arange(6.0).reshape(2, 3), quaternion_exp(np.array([[0, 0, 0.5], [0.2, 0, 0]])))
     one = batch[1]
     assert_same_pose((one @ batch)[0], one @ batch[0])
-    np.testing.assert_allclose(one.apply(np.zeros((5, 3))), np.tile(one.position, (5, 1)))
+    np.testing.assert_allclose(one.apply(np.zeros((5, 3))), np.tile(one.position, (5, 1)), atol=1e-12)
     assert Pose.identity(4).matrix().shape == (4, 4, 4)
 
 

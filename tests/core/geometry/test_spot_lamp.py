@@ -22,9 +22,9 @@ def angles_deg(of: SpotLamp, points: np.ndarray) -> np.ndarray:
 
 def test_direction_and_distance_are_those_of_its_position():
     one = lamp((0.0, 0.3, 0.4))
-    np.testing.assert_allclose(one.direction, [0, 0.6, 0.8])
+    np.testing.assert_allclose(one.direction, [0, 0.6, 0.8], atol=1e-12)
     assert one.distance == pytest.approx(0.5)
-    np.testing.assert_allclose(one.distant.direction, one.direction)
+    np.testing.assert_allclose(one.distant.direction, one.direction, atol=1e-12)
 
 
 @given(scale=st.floats(0.3, 3.0))

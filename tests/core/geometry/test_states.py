@@ -15,11 +15,11 @@ OVERHEAD = Light(np.array([0.0, 0, 1]))
 
 def test_default_cameras_are_where_the_conventions_say():
     for camera, position in zip(default_cameras(), CAMERA_POSITIONS, strict=True):
-        np.testing.assert_allclose(camera.T_world_camera.position, position)
-        np.testing.assert_allclose(camera.project(np.array(SCENE_CENTRE)), [64, 64])
+        np.testing.assert_allclose(camera.T_world_camera.position, position, atol=1e-12)
+        np.testing.assert_allclose(camera.project(np.array(SCENE_CENTRE)), [64, 64], atol=1e-12)
         assert np.rad2deg(camera.fov_y_rad) == pytest.approx(45)
         assert (camera.width, camera.height) == (128, 128)
-    np.testing.assert_allclose(goal_camera().T_world_camera.position, (0, -0.45, 0.8))
+    np.testing.assert_allclose(goal_camera().T_world_camera.position, (0, -0.45, 0.8), atol=1e-12)
 
 
 def test_camera_axes_are_opencv():
@@ -42,15 +42,15 @@ def test_rays_go_back_through_projected_points(x, y, z):
 def test_a_resized_camera_sees_the_same():
     point = np.array([0.1, -0.05, 0.1])
     small, large = goal_camera(64), goal_camera(64).resized(256, 256)
-    np.testing.assert_allclose(4 * small.project(point), large.project(point))
-    np.testing.assert_allclose(large.intrinsics, goal_camera(256).intrinsics)
+    np.testing.assert_allclose(4 * small.project(point), large.project(point), atol=1e-12)
+    np.testing.assert_allclose(large.intrinsics, goal_camera(256).intrinsics, atol=1e-12)
 
 
 def test_a_camera_straight_above_has_an_upright_image():
     camera = Camera.look_at("above", (0, 0, 1), (0, 0, 0), size=64)
     matrix = camera.T_world_camera.matrix()[:3, :3]
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-9)
-    np.testing.assert_allclose(camera.project(np.zeros(3)), [32, 32])
+    np.testing.assert_allclose(camera.project(np.zeros(3)), [32, 32], atol=1e-12)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 1, 1)])
@@ -59,7 +59,7 @@ def test_cameras_look_along_any_direction(position, up):
     camera = Camera.look_at("any", position, (0, 0, 0), size=64, up=up)
     matrix = camera.T_world_camera.matrix()[:3, :3]
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-9)
-    np.testing.assert_allclose(camera.project(np.zeros(3)), [32, 32])
+    np.testing.assert_allclose(camera.project(np.zeros(3)), [32, 32], atol=1e-12)
 
 
 @given(azimuth=st.floats(-np.pi, np.pi), elevation=st.floats(np.deg2rad(5.001), np.pi / 2))

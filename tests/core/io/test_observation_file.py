@@ -39,11 +39,11 @@ def assert_same(a: Observation, b: Observation):
         np.testing.assert_array_equal(a.masks, b.masks)
     assert (a.pusher is None) == (b.pusher is None)
     if a.pusher is not None:
-        np.testing.assert_allclose(a.pusher, b.pusher)
+        np.testing.assert_allclose(a.pusher, b.pusher, atol=1e-12)
     assert [c.name for c in a.cameras] == [c.name for c in b.cameras]
     for mine, other in zip(a.cameras, b.cameras, strict=True):
         np.testing.assert_allclose(mine.T_world_camera.matrix(), other.T_world_camera.matrix(), atol=1e-9)
-        np.testing.assert_allclose(mine.intrinsics, other.intrinsics)
+        np.testing.assert_allclose(mine.intrinsics, other.intrinsics, atol=1e-12)
         assert (mine.width, mine.height) == (other.width, other.height)
 
 

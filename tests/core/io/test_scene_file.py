@@ -28,10 +28,10 @@ def test_scene_survives_its_file(tmp_path):
     scene = read_scene(path)
     assert scene.state.names == STATE.names
     np.testing.assert_allclose(scene.state.poses.matrix(), STATE.poses.matrix(), atol=1e-12)
-    np.testing.assert_allclose(scene.state.light.position, STATE.light.position)
+    np.testing.assert_allclose(scene.state.light.position, STATE.light.position, atol=1e-12)
     for a, b in zip(scene.cameras, default_cameras(), strict=True):
         np.testing.assert_allclose(a.T_world_camera.matrix(), b.T_world_camera.matrix(), atol=1e-9)
-        np.testing.assert_allclose(a.intrinsics, b.intrinsics)
+        np.testing.assert_allclose(a.intrinsics, b.intrinsics, atol=1e-12)
 
 
 def test_pusher_and_cameras_may_be_missing():

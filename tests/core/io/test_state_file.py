@@ -46,7 +46,7 @@ def assert_same_scene(a: SceneState, b: SceneState):
     np.testing.assert_allclose(a.light.position, b.light.position, atol=1e-12)
     assert (a.pusher is None) == (b.pusher is None)
     if a.pusher is not None:
-        np.testing.assert_allclose(a.pusher, b.pusher)
+        np.testing.assert_allclose(a.pusher, b.pusher, atol=1e-12)
 
 
 @given(estimated=states())

@@ -26,7 +26,7 @@ def test_a_window_looks_along_the_same_rays():
     pixel, own = K @ point, window.intrinsics @ point
     frame = window.frame
     scale = np.array([frame.width, frame.height]) / [frame.right - frame.left, frame.bottom - frame.top]
-    np.testing.assert_allclose(own[:2] / own[2], (pixel[:2] / pixel[2] - [frame.left, frame.top]) * scale)
+    np.testing.assert_allclose(own[:2] / own[2], (pixel[:2] / pixel[2] - [frame.left, frame.top]) * scale, atol=1e-12)
 
 
 def test_what_another_object_may_hide_is_not_known():
@@ -49,7 +49,9 @@ def test_an_object_within_the_photo_is_not_cut():
 
 def test_distances_to_a_straight_border():
     distances = signed_distance(rectangle(0, 96, 0, 64))
-    np.testing.assert_allclose(distances[50], np.concatenate([np.arange(64, 0, -1) - 0.5, -(np.arange(64) + 0.5)]))
+    np.testing.assert_allclose(
+        distances[50], np.concatenate([np.arange(64, 0, -1) - 0.5, -(np.arange(64) + 0.5)]), atol=1e-12
+    )
 
 
 def test_an_object_without_a_mask_is_told():

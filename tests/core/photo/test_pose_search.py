@@ -11,7 +11,7 @@ from tests.core.photo.conftest import NAME
 
 def test_super_fibonacci_rotations_are_everywhere():
     spiral = super_fibonacci(3000)
-    np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), 1, atol=1e-12)
     asked = Rotation.random(200, random_state=1).as_quat(scalar_first=True)
     nearest = np.array([rotation_angle(spiral, q).min() for q in asked])
     assert np.rad2deg(nearest.max()) < 20
@@ -34,14 +34,14 @@ def test_steps_are_taken_along_the_cameras_axes(taken):
     steps = np.array([[0.01, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
     poses = moved(taken.pose, window, steps)
     np.testing.assert_allclose(poses.position[0] - taken.pose.position, [0.01, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(poses.position[1], taken.pose.position)
-    np.testing.assert_allclose(rotation_angle(poses.quaternion[1], taken.pose.quaternion), 0.2)
+    np.testing.assert_allclose(poses.position[1], taken.pose.position, atol=1e-12)
+    np.testing.assert_allclose(rotation_angle(poses.quaternion[1], taken.pose.quaternion), 0.2, atol=1e-12)
 
 
 def test_the_given_pose_is_among_those_around_it(taken):
     window = object_windows([taken.photo], NAME, 44)[0]
     poses = poses_around(taken.pose, window, 20, np.random.default_rng(0))
-    np.testing.assert_allclose(poses.position[0], taken.pose.position)
+    np.testing.assert_allclose(poses.position[0], taken.pose.position, atol=1e-12)
 
 
 def test_distinct_poses_are_the_best_and_differ():

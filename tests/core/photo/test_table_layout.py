@@ -32,8 +32,8 @@ def test_objects_keep_their_distances_and_heights():
     objects = [standing(0.1, 0.0), standing(-0.1, 0.05, 2.0)]
     T = place_on_table(camera, objects)
     before, after = (np.array([pose.position for pose in poses]) for poses in (objects, [T @ o for o in objects]))
-    np.testing.assert_allclose(np.linalg.norm(after[0] - after[1]), np.linalg.norm(before[0] - before[1]))
-    np.testing.assert_allclose(after[:, 2], before[:, 2])
+    np.testing.assert_allclose(np.linalg.norm(after[0] - after[1]), np.linalg.norm(before[0] - before[1]), atol=1e-12)
+    np.testing.assert_allclose(after[:, 2], before[:, 2], atol=1e-12)
 
 
 def test_the_top_of_a_photo_from_straight_above_is_ahead():

@@ -203,8 +203,10 @@ def test_a_push_that_works_from_one_place_alone_is_not_chosen_unless_rollouts_ar
     settings = PlanSettings(samples=64, horizon=12, noise_m=0.0, begins_m=begins_m)
     planner = MPPIPlanner(slippery, Straight(0.05, *[0.04] * 20), settings)
     first = planned(planner, start, goal_of(start, (0.12, 0.0)))[0]
-    np.testing.assert_allclose(first.actions, np.broadcast_to([speed, 0.0, 0.0], (12, 3)))
-    np.testing.assert_allclose(first.best.positions[0, -1, 0, 0], start.poses.position[0, 0] + 12 * STEP_S * speed)
+    np.testing.assert_allclose(first.actions, np.broadcast_to([speed, 0.0, 0.0], (12, 3)), atol=1e-12)
+    np.testing.assert_allclose(
+        first.best.positions[0, -1, 0, 0], start.poses.position[0, 0] + 12 * STEP_S * speed, atol=1e-12
+    )
 
 
 def test_a_plan_that_hesitates_is_hurried(start):

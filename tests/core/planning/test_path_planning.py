@@ -90,10 +90,10 @@ def test_actions_keep_the_limits_and_lead_along_the_way(seed, horizon):
 
 def test_actions_take_as_long_as_the_slower_axis_and_then_rest():
     actions = actions_along(np.array([[0.0, 0.0], [0.12, 0.03]]), 4)
-    np.testing.assert_allclose(actions[:2], [[0.3, 0.075, 0]] * 2)
+    np.testing.assert_allclose(actions[:2], [[0.3, 0.075, 0]] * 2, atol=1e-12)
     np.testing.assert_allclose(actions[2:], 0, atol=1e-12)
     half = actions_along(np.array([[0.0, 0.0], [0.12, 0.03]]), 4, np.array([0.5]))
-    np.testing.assert_allclose(half, [[0.15, 0.0375, 0]] * 4)
+    np.testing.assert_allclose(half, [[0.15, 0.0375, 0]] * 4, atol=1e-12)
 
 
 @given(seed=st.integers(0, 10**6))

@@ -29,9 +29,9 @@ def futures(*last, turn: float = 0.0, steps: int = 3) -> Rollouts:
 
 def test_what_is_not_moved_is_to_stay():
     goal = PoseGoal.of(STATE, {"a": THERE})
-    np.testing.assert_allclose(goal.offsets_m(STATE), [[0, 0.2], [0, 0]])
+    np.testing.assert_allclose(goal.offsets_m(STATE), [[0, 0.2], [0, 0]], atol=1e-12)
     other = SceneState(("b", "a"), STATE.poses[[1, 0]], STATE.light, STATE.pusher)
-    np.testing.assert_allclose(goal.offsets_m(other), [[0, 0], [0, 0.2]])
+    np.testing.assert_allclose(goal.offsets_m(other), [[0, 0], [0, 0.2]], atol=1e-12)
 
 
 def test_an_object_that_is_not_there_is_told():
@@ -61,7 +61,7 @@ def test_a_goal_that_is_met_costs_nothing():
 
 def test_cost_is_the_distance_on_the_way_and_twice_at_the_end():
     cost = PoseCost(PoseGoal.of(STATE, {"a": THERE}))(futures((0.1, 0.0), (0.1, 0.1), (0.4, 0.2)))
-    np.testing.assert_allclose(cost, [0.6, 0.3, 0.9])
+    np.testing.assert_allclose(cost, [0.6, 0.3, 0.9], atol=1e-12)
 
 
 @pytest.mark.parametrize(("turn", "counted"), [(0.3, 0.3), (-1.1, 1.1), (np.pi, np.pi), (1.5 * np.pi, 0.5 * np.pi)])

@@ -66,7 +66,7 @@ def test_pushes_begin_clear_of_the_object_on_all_sides_and_lead_into_it():
     outcomes = table()
     outside = np.linalg.norm(np.maximum(np.abs(outcomes.starts) - [0.05, 0.02], 0), axis=1)
     assert outside.min() > PUSHER_RADIUS_M
-    np.testing.assert_allclose(np.linalg.norm(outcomes.directions, axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(outcomes.directions, axis=1), 1, atol=1e-12)
     sides = [outcomes.starts[:, axis] * sign > half for axis, half in ((0, 0.05), (1, 0.02)) for sign in (-1, 1)]
     assert all(side.sum() >= 10 for side in sides)
     path = outcomes.starts[:, None] + outcomes.lengths[:, None] * outcomes.directions[:, None]
@@ -78,7 +78,7 @@ def test_motions_are_told_around_the_centre_of_mass_for_every_length():
     outcomes = table()
     assert (np.diff(outcomes.lengths) > 0).all()
     np.testing.assert_allclose(outcomes.centres, outcomes.lengths[:, None] * outcomes.directions[:, None], atol=1e-12)
-    np.testing.assert_allclose(outcomes.quaternions, np.broadcast_to(UPRIGHT, outcomes.quaternions.shape))
+    np.testing.assert_allclose(outcomes.quaternions, np.broadcast_to(UPRIGHT, outcomes.quaternions.shape), atol=1e-12)
 
 
 def test_every_push_is_predicted_from_its_own_place():
@@ -89,7 +89,7 @@ def test_every_push_is_predicted_from_its_own_place():
         return carried(state, actions, before, pushers)
 
     outcomes = table(recorded)
-    np.testing.assert_allclose(seen[0], outcomes.starts + ORIGIN)
+    np.testing.assert_allclose(seen[0], outcomes.starts + ORIGIN, atol=1e-12)
 
 
 def test_without_a_predictor_there_are_no_pushes_but_a_loop_around_the_object():

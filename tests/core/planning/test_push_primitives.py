@@ -58,7 +58,7 @@ def test_without_chance_a_push_leads_straight_through_the_middle(length, width, 
 
 def test_a_push_of_a_box_ends_where_its_near_side_should_be():
     pushes = straight_pushes(box(0.05, 0.03), np.array([0.1, 0.0]), 1, None)
-    np.testing.assert_allclose(pushes.ends, [[-0.05 - PUSHER_RADIUS_M + 0.1, 0.0]])
+    np.testing.assert_allclose(pushes.ends, [[-0.05 - PUSHER_RADIUS_M + 0.1, 0.0]], atol=1e-12)
 
 
 @given(by=angle, direction=angle, seed=seeds)

@@ -70,8 +70,8 @@ def test_what_succeeded_in_two_futures_is_done_in_one():
 def test_a_stage_ends_where_it_has_taken_most_from_the_cost():
     rollouts = pulled(np.array([pulling(("a", 0.24))]))  # twice as far as the goal
     (stage,) = push_stages(rollouts, object_costs(rollouts, GOAL))[0]
-    np.testing.assert_allclose(stage.start, np.array(PLACES["a"]) + HANDLE)
-    np.testing.assert_allclose(stage.end, stage.start + STEP_S * stage.actions[:, :2].sum(axis=0))
+    np.testing.assert_allclose(stage.start, np.array(PLACES["a"]) + HANDLE, atol=1e-12)
+    np.testing.assert_allclose(stage.end, stage.start + STEP_S * stage.actions[:, :2].sum(axis=0), atol=1e-12)
     np.testing.assert_allclose(stage.pose.position, GOAL.pose("a").position, atol=1e-9)
     assert stage.gain == pytest.approx(0.12)
 

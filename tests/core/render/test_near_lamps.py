@@ -248,7 +248,7 @@ def test_a_device_draws_the_same():
 
 def test_lamps_are_counted_and_the_published_renderer_knows_none():
     one = SceneBatch.of(state({}), LAMP)
-    np.testing.assert_allclose(one.lights[0], LAMP.direction)
+    np.testing.assert_allclose(one.lights[0], LAMP.direction, atol=1e-12)
     with pytest.raises(InvalidInput, match="number of lamps of a batch is 2, but it must be 1, one for each scene"):
         replace(one, spots=(LAMP, LAMP))
     with pytest.raises(InvalidInput, match="published renderer is a lamp at a finite distance"):

@@ -28,7 +28,7 @@ def test_every_field_is_found_where_the_starts_say():
         np.testing.assert_array_equal(packed.macro[blocks : blocks + np.prod(macro)].reshape(macro), field.macro)
         numbers = packed.cells[cells : cells + np.prod(cell)].reshape(cell)
         np.testing.assert_array_equal(networks[first_network + numbers], field.networks[field.cells])
-        np.testing.assert_allclose(scale, [*field.origin, field.voxel])
+        np.testing.assert_allclose(scale, [*field.origin, field.voxel], atol=1e-12)
         np.testing.assert_array_equal(ambient, field.ambient)
         # Density is interpolated, so it reaches one voxel beyond the last occupied corner.
         np.testing.assert_allclose(extent[:3], field.extent[0] - field.voxel, atol=1e-6)

@@ -48,7 +48,7 @@ def test_an_observation_becomes_a_state_near_the_truth(scene, data_dir, tmp_path
     assert np.abs(estimate.state.poses.position - truth.poses.position).max() < 0.01
     assert np.rad2deg(rotation_angle(estimate.state.poses.quaternion, truth.poses.quaternion)).max() < 5
     assert np.rad2deg(np.arccos(np.clip(estimate.state.light.direction @ truth.light.direction, -1, 1))) < 5
-    np.testing.assert_allclose(estimate.state.pusher, truth.pusher)
+    np.testing.assert_allclose(estimate.state.pusher, truth.pusher, atol=1e-12)
     assert sorted(path.name for path in sheets.iterdir()) == [f"comparison_{view}.png" for view in range(4)]
     with Image.open(sheets / "comparison_0.png") as sheet:
         assert sheet.size[1] > 3 * 64

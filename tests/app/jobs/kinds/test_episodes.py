@@ -184,7 +184,7 @@ def test_a_goal_image_is_read_from_the_inputs_as_its_own_camera_saw_it(place, st
     def explained(_models, observation, *_):
         np.testing.assert_allclose(observation.images[0], image, atol=1 / 255)
         assert observation.cameras[0].name == "mine"
-        np.testing.assert_allclose(observation.cameras[0].intrinsics, camera.intrinsics)
+        np.testing.assert_allclose(observation.cameras[0].intrinsics, camera.intrinsics, atol=1e-12)
         state = stage.world.truth()
         yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 

@@ -72,9 +72,9 @@ def test_all_steps_are_told_and_kept_and_the_result_is_a_state_file(place, asked
     assert [(k["step"], k["stage"], k["note"], k["loss"]) for k in kept] == [
         (t.step, t.stage, t.note, t.loss) for t in told
     ]
-    np.testing.assert_allclose([state_of_step(k).poses.position[0, 0] for k in kept], [0.3, 0.2, 0.1])
+    np.testing.assert_allclose([state_of_step(k).poses.position[0, 0] for k in kept], [0.3, 0.2, 0.1], atol=1e-12)
     found = read_estimated(place.folder / STATE)
-    np.testing.assert_allclose(found.state.poses.position, state().poses.position)
+    np.testing.assert_allclose(found.state.poses.position, state().poses.position, atol=1e-12)
     assert not np.isfinite(found.rotation_std[0])
 
 
@@ -92,7 +92,7 @@ def test_the_estimator_gets_the_observation_and_the_prior_but_never_the_truth(pl
     (inputs / "truth.json").write_text("whoever reads this fails")
     list(estimate_job(FIRST, place))
     assert asked["observation"].names == (MUSTARD,)
-    np.testing.assert_allclose(asked["observation"].pusher, [0.2, 0, 0.06])
+    np.testing.assert_allclose(asked["observation"].pusher, [0.2, 0, 0.06], atol=1e-12)
     assert asked["others"][0].random() == stream_rng(5, Stream.FIRST_FRAME).random()
     write_estimated(inputs / "prior.json", believed(state(0.07)))
     for mode, count in (("next", 3), ("goal", 1)):

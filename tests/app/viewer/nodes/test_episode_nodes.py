@@ -112,7 +112,7 @@ def test_estimates_follow_without_words_and_doubted_objects_have_another_colour(
     assert not driver.shows(f"/episode/estimate/tried/{BOX}")
     assert not np.array_equal(box.batched_colors, can.batched_colors)
     assert driver.below(f"/episode/estimate/verdict/{BOX}") == set()
-    np.testing.assert_allclose(driver.node("/episode/estimate/light").position, AT * LIGHT.position)
+    np.testing.assert_allclose(driver.node("/episode/estimate/light").position, AT * LIGHT.position, atol=1e-12)
 
 
 def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(drawing, driver):
@@ -122,7 +122,7 @@ def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(dr
     assert is_green(ways.colors[0, 0])
     assert is_red(ways.colors[-1, 1])
     assert ways.points[0, 0, 2] > ways.points[-1, 0, 2]  # cheap ones lie above dear ones
-    np.testing.assert_allclose(ways.points[0, 1], ways.points[1, 0])
+    np.testing.assert_allclose(ways.points[0, 1], ways.points[1, 0], atol=1e-12)
     np.testing.assert_allclose(best.points[[0, -1], [0, 1], 0], [-0.2, 0.0], atol=1e-6)
     assert best.points[..., 2].max() < 0.02  # on the table
     drawing.show_plan(sketch(ways=3, moments=4))

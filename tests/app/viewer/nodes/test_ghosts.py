@@ -121,8 +121,8 @@ def test_between_two_rows_it_is_halfway_and_beyond_the_ends_it_stays():
         (2, [10, 11]),
         (9, [10, 11]),
     ):
-        np.testing.assert_allclose(between(rows, step), expected)
-    np.testing.assert_allclose(between(rows[:1], 0.7), [0, 1])
+        np.testing.assert_allclose(between(rows, step), expected, atol=1e-12)
+    np.testing.assert_allclose(between(rows[:1], 0.7), [0, 1], atol=1e-12)
 
 
 def test_a_pose_between_two_is_one_whatever_the_signs_of_their_quaternions():

@@ -117,7 +117,7 @@ def test_letting_go_moves_the_draft(composing):
     composing.drag(BOX, (0.3, -0.1, 0.1), quarter())
     until(lambda: composing.moved)
     pose = composing.moved[0][BOX]
-    np.testing.assert_allclose(pose.position, [0.3, -0.1, 0.1])
+    np.testing.assert_allclose(pose.position, [0.3, -0.1, 0.1], atol=1e-12)
     assert rotation_angle(pose.quaternion, quaternion_multiply(quarter(), LYING)) < 1e-6
     until(lambda: same(composing.at(BOX), pose))
     handles = composing.gui.node(f"/goal/objects/{BOX}")
@@ -133,7 +133,7 @@ def test_whatever_a_browser_sends_height_and_tilt_stay(composing, turn):
     composing.drag(BOX, (0.3, 0.0, 7.0), turn)
     until(lambda: composing.moved)
     pose = composing.moved[0][BOX]
-    np.testing.assert_allclose(pose.position, [0.3, 0.0, 0.1])
+    np.testing.assert_allclose(pose.position, [0.3, 0.0, 0.1], atol=1e-12)
     assert rotation_angle(pose.quaternion, LYING) < 1e-6
     until(lambda: same(composing.at(BOX), pose))
     composing.drag(BOX, (np.inf, 0.0, 0.1))
@@ -163,14 +163,14 @@ def test_what_a_hand_holds_follows_the_hand_until_its_move_is_answered(composing
     composing.drag(CAN, (0.0, -0.2, 0.05))
     until(lambda: len(composing.moved) == 1)
     until(lambda: composing.panel.is_idle)
-    np.testing.assert_allclose(composing.at(BOX).position, [0.3, 0.3, 0.1])  # not where the draft has it
+    np.testing.assert_allclose(composing.at(BOX).position, [0.3, 0.3, 0.1], atol=1e-12)  # not where the draft has it
     composing.answers.clear()
     composing.drag(BOX, (0.3, 0.2, 0.1), None, "end")
     composing.drag(BOX, (0.3, 0.1, 0.1), None, "start", "update")  # grabbed again, before the first move is answered
     composing.answers.set()
     until(lambda: composing.draft.revision == 2)
     until(lambda: composing.panel.is_idle)
-    np.testing.assert_allclose(composing.at(BOX).position, [0.3, 0.1, 0.1])
+    np.testing.assert_allclose(composing.at(BOX).position, [0.3, 0.1, 0.1], atol=1e-12)
     composing.drag(BOX, (0.3, 0.0, 0.1), None, "end")
     until(lambda: composing.draft.revision == 3)
     elsewhere = Pose(np.array([0.0, 0.1, 0.1]), LYING)

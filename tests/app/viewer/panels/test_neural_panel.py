@@ -157,12 +157,12 @@ def test_the_light_and_the_view_are_followed(room, browser):
     room.light = Light(np.array([1.0, 0, 0.5]))
     room.panel.scene_moved()
     order = room.renderer.answer(1)
-    np.testing.assert_allclose(order.state.light.direction, room.light.direction)
+    np.testing.assert_allclose(order.state.light.direction, room.light.direction, atol=1e-12)
     assert not order.is_sharp
     browser.camera.position = np.array([0.0, 0, 2.0])
     browser.camera.update(None)
     order = room.renderer.answer(2)
-    np.testing.assert_allclose(order.camera.T_world_camera.position, [0, 0, 2])
+    np.testing.assert_allclose(order.camera.T_world_camera.position, [0, 0, 2], atol=1e-12)
 
 
 def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
@@ -170,7 +170,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
     room.panel.switch(browser.client_id, is_on=True)
     order = room.renderer.answer(0)
     assert order.state.names == (B,)
-    np.testing.assert_allclose(order.state.poses.position, [[0.1, 0, 0.1]])
+    np.testing.assert_allclose(order.state.poses.position, [[0.1, 0, 0.1]], atol=1e-12)
     until(lambda: browser.hides() == {"/table", "/pusher", "/shadows", f"/objects/{B}"})
     assert f"the {A}" in browser.notifications[0].body
     room.fields = {A, B}  # it was trained meanwhile

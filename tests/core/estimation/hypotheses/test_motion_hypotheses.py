@@ -26,7 +26,7 @@ def test_who_was_not_shoved_stays(truth):
     params = params_of(truth)
     positions = joint_push_hypotheses(params, [1], PUSH)
     np.testing.assert_array_equal(positions[:, 0], np.tile(params.positions[0], (3, 1)))
-    np.testing.assert_allclose(positions[:, 1] - params.positions[1], np.outer([0, 0.5, 1], PUSH))
+    np.testing.assert_allclose(positions[:, 1] - params.positions[1], np.outer([0, 0.5, 1], PUSH), atol=1e-12)
 
 
 def test_many_objects_share_one_share(plain):
@@ -34,7 +34,7 @@ def test_many_objects_share_one_share(plain):
     positions = joint_push_hypotheses(params_of(state), range(5), PUSH)
     shifts = positions - params_of(state).positions
     assert len(positions) == 3
-    np.testing.assert_allclose(shifts, np.repeat(shifts[:, :1], 5, axis=1))
+    np.testing.assert_allclose(shifts, np.repeat(shifts[:, :1], 5, axis=1), atol=1e-12)
 
 
 def test_a_ball_rolls_without_slipping(plain):
@@ -85,7 +85,7 @@ def test_a_ball_may_have_rolled_any_way(plain):
     across = np.array([-along[1], along[0], 0.0])
     axis = rotate(params.quaternions[0] * [1, -1, -1, -1], across)  # of the roll, in the ball
     np.testing.assert_allclose(rotate(tried.quaternion, axis), np.tile(across, (18, 1)), atol=1e-12)
-    np.testing.assert_allclose(tried.quaternion[0], params.quaternions[0])
+    np.testing.assert_allclose(tried.quaternion[0], params.quaternions[0], atol=1e-12)
 
 
 def test_what_stands_on_a_face_does_not_roll(models, truth):

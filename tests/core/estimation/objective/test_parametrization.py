@@ -60,7 +60,7 @@ def test_translations_add_and_rotations_are_about_the_worlds_axes(seed):
     change[POSE : POSE + 3], change[POSE + 3 : 2 * POSE] = shift, turn = 0.1 * rng.normal(size=(2, 3))
     moved = params.updated(change)
     np.testing.assert_array_equal(moved.positions[0], params.positions[0])
-    np.testing.assert_allclose(moved.positions[1], params.positions[1] + shift)
+    np.testing.assert_allclose(moved.positions[1], params.positions[1] + shift, atol=1e-12)
     np.testing.assert_allclose(moved.quaternions[0], params.quaternions[0], atol=1e-15)
     wanted = quaternion_multiply(quaternion_exp(turn), params.quaternions[1])
     np.testing.assert_allclose(rotation_angle(moved.quaternions[1], wanted), 0, atol=1e-7)

@@ -43,7 +43,7 @@ def test_the_centre_and_the_radius_are_those_of_the_solid(box):
 
 
 def test_every_way_is_turned_about_the_vertical(box):
-    np.testing.assert_allclose(np.linalg.norm(box.quaternions, axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(box.quaternions, axis=1), 1, atol=1e-12)
     for own in box.quaternions.reshape(6, 4, 4):
         turns = rotation_angle(own, own[0])
         np.testing.assert_allclose(np.sort(turns), np.array([0, 1, 1, 2]) * np.pi / 2, atol=1e-6)
@@ -84,7 +84,7 @@ def test_real_objects_lie_in_a_few_ways(models):
 
 def test_the_sphere_is_even():
     directions = fibonacci_sphere(500)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(directions.mean(axis=0), 0, atol=5e-3)
     np.testing.assert_allclose(directions.T @ directions / 500, np.eye(3) / 3, atol=5e-3)
     cosines = directions @ directions.T - 2 * np.eye(500)

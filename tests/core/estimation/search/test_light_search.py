@@ -41,7 +41,7 @@ def test_where_the_guess_has_its_light_plays_no_part(models, truth):
     other = params.updated(np.array([0] * 12 + [0.6, -0.4]))
     a, b = found(models, truth, params), found(models, truth, other)
     np.testing.assert_array_equal(a, b)
-    np.testing.assert_allclose(np.linalg.norm(a), 1)
+    np.testing.assert_allclose(np.linalg.norm(a), 1, atol=1e-12)
 
 
 def test_the_right_light_is_hardly_beaten_and_a_wrong_one_clearly(models, truth):

@@ -81,7 +81,7 @@ def test_every_planning_image_has_moved_an_object(library):
     movers = (moved[:, 0] > 0).sum(axis=-1)
     assert set(movers) == {1, 2}
     assert {tuple(m) for m in (moved[:, 0] > 0)} >= {(True, False, False), (False, True, False), (False, False, True)}
-    np.testing.assert_allclose(np.linalg.norm(batch.quaternions, axis=-1), 1)
+    np.testing.assert_allclose(np.linalg.norm(batch.quaternions, axis=-1), 1, atol=1e-12)
 
 
 def test_what_cannot_be_measured_is_told(solids, library, tmp_path):

@@ -25,7 +25,7 @@ def test_windows_hold_the_step_before_their_start_and_all_that_follows():
     assert windows.positions.shape[1] == LONGEST + 2
     assert windows.actions.shape[1] == LONGEST
     np.testing.assert_array_equal(windows.positions[0, 0], windows.positions[0, 1])  # nothing is known before
-    np.testing.assert_allclose(np.diff(windows.positions[1, :, 0, 0]), 0.01)
+    np.testing.assert_allclose(np.diff(windows.positions[1, :, 0, 0]), 0.01, atol=1e-12)
     assert (windows.on_table == LONGEST).all()
 
 

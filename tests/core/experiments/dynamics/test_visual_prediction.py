@@ -41,7 +41,7 @@ def test_states_follow_the_rollout(prediction, tmp_path):
     states = predicted_states(VisualPrediction(state, rollouts, actions, 0, default_cameras()[0], tmp_path))
     assert len(states) == 3
     np.testing.assert_array_equal(states[0].poses.position, state.poses.position)
-    np.testing.assert_allclose(states[2].pusher[:2], state.pusher[:2] + 0.2 * actions[0, :, :2].sum(axis=0))
+    np.testing.assert_allclose(states[2].pusher[:2], state.pusher[:2] + 0.2 * actions[0, :, :2].sum(axis=0), atol=1e-12)
 
 
 def test_predicted_pictures_lie_beside_the_simulators(prediction, renderer, library, tmp_path):

@@ -68,7 +68,7 @@ def test_errors_are_what_was_done_to_the_truth(truth, assets):
     assert found.light_deg == pytest.approx(0, abs=1e-6)
     assert (found.seconds, found.trusted, found.is_right) == (3.0, True, True)
     shift, turn = pose_errors(believed(truth, (0.003, 0, -0.004), (0, 0.06, 0)).state, truth, assets)
-    np.testing.assert_allclose(shift, [5, 0])
+    np.testing.assert_allclose(shift, [5, 0], atol=1e-12)
     np.testing.assert_allclose(turn, [np.rad2deg(0.06), 0], atol=1e-6)
 
 

@@ -54,7 +54,7 @@ def test_a_name_is_wrong(cases):
 def test_images_are_black_or_saturated(cases):
     assert cases["black images"][0].observation.images.max() == 0
     case, sound = cases["saturated images"]
-    np.testing.assert_allclose(case.observation.images, np.clip(8 * sound.observation.images, 0, 1))
+    np.testing.assert_allclose(case.observation.images, np.clip(8 * sound.observation.images, 0, 1), atol=1e-12)
     assert (case.observation.images == 1).mean() > 0.3
 
 

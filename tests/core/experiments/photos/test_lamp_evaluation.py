@@ -40,7 +40,7 @@ def test_the_same_seed_draws_the_same_photographs(library):
     one, two = (lamp_scene(library, library.names(), 3, 0, 1, is_near=True, is_wooden=False) for _ in range(2))
     np.testing.assert_array_equal(one.photos[0].image, two.photos[0].image)
     assert one.photos[0].on_table
-    np.testing.assert_allclose(one.direction, one.spot.direction)
+    np.testing.assert_allclose(one.direction, one.spot.direction, atol=1e-12)
 
 
 @pytest.mark.slow

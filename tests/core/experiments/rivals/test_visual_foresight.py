@@ -109,7 +109,7 @@ def test_the_predictor_is_told_both_frames_and_the_action_between_them():
         np.testing.assert_array_equal(context[1], now.image)
         np.testing.assert_array_equal(between, before.action)
         assert actions.shape == (48, 4, 3)
-        np.testing.assert_allclose(actions[0, :3], before.plan.actions[1:])  # warm-started
+        np.testing.assert_allclose(actions[0, :3], before.plan.actions[1:], atol=1e-12)  # warm-started
     assert len(world.actions) == 3
 
 
@@ -122,7 +122,7 @@ def test_costs_are_squared_differences_from_the_goal_summed_over_steps():
 
     planner = VisualForesight(Constant(), np.zeros((SIDE, SIDE, 3)), SETTINGS)
     plan = planner.plan(np.zeros((2, SIDE, SIDE, 3)), None, np.random.default_rng(0))
-    np.testing.assert_allclose(plan.costs, 4 * 0.25)
+    np.testing.assert_allclose(plan.costs, 4 * 0.25, atol=1e-12)
     assert np.abs(plan.actions).max() < MAX_SPEED_M_S  # equal costs: the mean of all
 
 
@@ -165,5 +165,5 @@ def test_a_task_is_done_in_the_simulator_from_its_goal_image_alone(library):
     assert isinstance(ended, Ended)
     assert ended.image.shape == ended.goal.shape == (SIDE, SIDE, 3)
     way = STEP_S * sum(step.action for step in steps)
-    np.testing.assert_allclose(ended.state.pusher, task.start.pusher + way)
+    np.testing.assert_allclose(ended.state.pusher, task.start.pusher + way, atol=1e-12)
     assert np.abs(ended.image - ended.goal).max() > 0.05  # something has to move

@@ -89,4 +89,4 @@ def test_a_stage_goes_on_from_its_state_as_if_nothing_had_happened(rays):
 
 def test_rates_fall_exponentially():
     rates = Rates(1e-2, 1e-4)
-    np.testing.assert_allclose([rates.at(s) for s in (0, 0.5, 1)], [1e-2, 1e-3, 1e-4])
+    np.testing.assert_allclose([rates.at(s) for s in (0, 0.5, 1)], [1e-2, 1e-3, 1e-4], atol=1e-12)

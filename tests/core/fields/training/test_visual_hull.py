@@ -48,7 +48,7 @@ def test_the_unit_of_length_does_not_matter(many, tmp_path, scale):
 
 def test_several_sets_are_one_object(many):
     parts = [ImageSet(many.cameras[p], many.light_directions[p], many.rgba[p]) for p in (slice(9), slice(9, None))]
-    np.testing.assert_allclose(silhouette_box(*parts), silhouette_box(many))
+    np.testing.assert_allclose(silhouette_box(*parts), silhouette_box(many), atol=1e-12)
 
 
 def test_a_silhouette_cut_by_the_border_does_not_cut_the_object(tmp_path):

@@ -89,7 +89,7 @@ def test_both_quaternions_of_an_orientation_look_the_same():
     found = node_features(given, action)
     torch.testing.assert_close(found, node_features(given._replace(quaternion=-given.quaternion), action))
     assert (found[..., 3] >= 0).all()
-    np.testing.assert_allclose(found[:, 1:, 3:7].abs(), given.quaternion.abs())
+    np.testing.assert_allclose(found[:, 1:, 3:7].abs(), given.quaternion.abs(), atol=1e-12)
 
 
 def test_the_first_node_is_the_pusher():

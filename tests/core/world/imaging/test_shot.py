@@ -21,8 +21,8 @@ def test_samples_fill_the_chosen_pixels_evenly():
     pixels[7, 3] = pixels[20, 30] = True
     (samples,) = shot(samples=2).sampled(pixels)
     assert samples.rows.tolist() == [7, 20]
-    np.testing.assert_allclose(samples.points[:4], [[3.25, 7.25], [3.75, 7.25], [3.25, 7.75], [3.75, 7.75]])
-    np.testing.assert_allclose(samples.means(samples.points), [[3.5, 7.5], [30.5, 20.5]])
+    np.testing.assert_allclose(samples.points[:4], [[3.25, 7.25], [3.75, 7.25], [3.25, 7.75], [3.75, 7.75]], atol=1e-12)
+    np.testing.assert_allclose(samples.means(samples.points), [[3.5, 7.5], [30.5, 20.5]], atol=1e-12)
 
 
 def test_many_pixels_come_in_several_parts_and_none_twice():

@@ -86,7 +86,7 @@ def test_coverage_is_that_of_the_goal():
     live = world()
     live.reset(0)
     assert 0 <= live.coverage() < live.success_coverage == 0.95
-    np.testing.assert_allclose(live.goal, [256, 256, np.pi / 4])
+    np.testing.assert_allclose(live.goal, [256, 256, np.pi / 4], atol=1e-12)
     here = live.coverage()
     assert live.act(np.zeros(2)) == pytest.approx(here, abs=0.2)
 
@@ -108,5 +108,5 @@ def test_what_is_missing_is_told(monkeypatch):
 
 def test_a_drifting_pusher_meets_nothing():
     after = drift(BESIDE[None], np.array([[0.3, -0.1]]))
-    np.testing.assert_allclose(after[0, :4], [221 + 60, 301 - 20, 300, -100])
+    np.testing.assert_allclose(after[0, :4], [221 + 60, 301 - 20, 300, -100], atol=1e-12)
     np.testing.assert_array_equal(after[0, 4:], BESIDE[4:])
