@@ -12,7 +12,7 @@ from app.episodes.part_names import parts_of
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import EpisodeOrder, SimulatedTable, given
 from osfcore.control.closed_loop import Episode
-from osfcore.control.events import ActionExecuted, Event
+from osfcore.control.events import ActionExecuted, Event, Stepped
 from osfcore.control.scene_models import load_scene_models
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.objects.asset_library import AssetLibrary
@@ -25,7 +25,7 @@ class EpisodeStep:
 
     Attributes:
         done: actions executed.
-        total: actions at most.
+        total: actions at most, as known so far.
         note: what is being done.
         event: what just happened, if anything did.
         report: with the last step only.
@@ -61,6 +61,7 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         for event in Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run():
             record.take(event)
             done = event.number if isinstance(event, ActionExecuted) else done
+            total = event.steps if isinstance(event, Stepped) else total
             note = note_of(event) or note
             yield EpisodeStep(done, total, note, event)
         yield EpisodeStep(done, total, "Writing video and recording")

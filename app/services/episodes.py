@@ -28,7 +28,7 @@ from osfcore.geometry.poses import unit_quaternion
 from osfcore.io.files import write_atomically
 from osfcore.io.scene_file import camera_to_json
 from osfcore.paper.method import Method
-from osfcore.paper.mppi import GaussianPlanSettings
+from osfcore.paper.mppi import STEPS, GaussianPlanSettings
 
 KIND, CLIP_KIND = "episode", "clip"
 _MOST_NAMES = 1000  # that a new one is compared with
@@ -303,7 +303,7 @@ def defaults(method: Method) -> dict[str, Any]:
         return flat(EpisodeSettings())
     plan = GaussianPlanSettings()
     own = {key: only for key, (_, only) in _FIXED.items()} | {key: getattr(plan, key) for key in _PLAN}
-    return {**flat(EpisodeSettings()), **own}
+    return {**flat(EpisodeSettings(STEPS)), **own}
 
 
 def flat(settings: EpisodeSettings) -> dict[str, Any]:

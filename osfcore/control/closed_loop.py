@@ -56,6 +56,8 @@ _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
 _RETREAT = 2  # actions away from the objects, before a search
+_DISTURBANCES = frozenset({"lamp", "object", "found", "camera", "brightness"})  # after which steps are counted anew
+_RENEWALS = 10  # at most: something that flickers must not keep a robot going for ever
 
 
 class Episode:
@@ -94,6 +96,7 @@ class Episode:
         self._planner = self._parts.planner(PlannerInputs(models.dynamics.rollout, proposals, settings.plan))
         self._start, self._prepared, self._how = start, prepared, self._parts.estimators
         self._number, self._is_stalled = 0, False
+        self._counted_from, self._renewals = 0, 0  # actions before those that count toward settings.steps
         self._progress, self._sight = monitor.ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
         self._searches = 0
@@ -241,7 +244,7 @@ class Episode:
         assert state.pusher is not None
         away = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
         direction = away / max(float(np.abs(away).max()), 1e-6)
-        for _ in range(min(_RETREAT, self.settings.steps - self._number)):
+        for _ in range(min(_RETREAT, self._left())):
             yield self._execute(np.array([*(0.2 * direction), 0.0]))
 
     # The goal
@@ -276,9 +279,8 @@ class Episode:
     # Planning and acting
 
     def _plan(self) -> Iterator[Event]:
-        left = self.settings.steps - self._number
         plan = self.settings.plan
-        self._planner.settings = replace(plan, horizon=min(plan.horizon, left))
+        self._planner.settings = replace(plan, horizon=min(plan.horizon, self._left()))
         self._goal = nearest_symmetric_goal(self._goal, self._estimate.state, self._models.symmetries)
         rounds = self._planner.plan(self._estimate.state, self._goal, self._cost(), self._rng, self._before)
         for one in self._timer.steps("plan", rounds):
@@ -290,7 +292,7 @@ class Episode:
 
     def _act(self) -> Iterator[Event]:
         state = self._estimate.state
-        actions = self._planner.nominal(min(self.settings.replan_every, self.settings.steps - self._number))
+        actions = self._planner.nominal(min(self.settings.replan_every, self._left()))
         futures = self._models.dynamics.rollout(state, actions[None], self._before)
         for action in actions:
             yield self._execute(action)
@@ -314,7 +316,7 @@ class Episode:
                 names = ", ".join(np.array(self._estimate.state.names)[rolled])
                 return "reached", f"Everything is in its place, but on another side than in the goal: {names}."
             return "reached", f"The table looks like the goal{'' if self._number else ' already'}."
-        if self._number >= self.settings.steps:
+        if self._left() <= 0:
             where = f"up to {100 * far.max():.1f} cm away and turned by up to {np.rad2deg(turned.max()):.0f}°"
             return "out of steps", f"All {self._number} pushes are done; from their places objects are {where}."
         return None
@@ -326,14 +328,22 @@ class Episode:
         rendered = self._rendered(estimate.state, self._camera, self._light)
         cost = float(((rendered - self._image) ** 2).mean())
         taken = self._timer.taken()
-        return Stepped(self._number, self.settings.steps, estimate, far, turned, cost, rendered, taken)
+        return Stepped(
+            self._number, self._counted_from + self.settings.steps, estimate, far, turned, cost, rendered, taken
+        )
 
     def _rendered(self, state: SceneState, camera: Camera, light: Light) -> Float[np.ndarray, "h w 3"]:
         """The scene without the pusher, as the goal image would show it."""
         batch = SceneBatch.of(replace(state, light=light, pusher=None))
         return self._of_goal.models.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
 
+    def _left(self) -> int:
+        """Actions that may still be executed."""
+        return self._counted_from + self.settings.steps - self._number
+
     def _noticed(self, matter: str, text: str, names: tuple[str, ...] = ()) -> Noticed:
+        if matter in _DISTURBANCES and self.settings.renewed and self._renewals < _RENEWALS:
+            self._counted_from, self._renewals = self._number, self._renewals + 1
         return Noticed(self._number, matter, text, names)  # pyright: ignore[reportArgumentType]
 
     def _finished(self, outcome: Outcome, text: str) -> Finished:

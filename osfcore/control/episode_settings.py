@@ -17,7 +17,7 @@ class EpisodeSettings:
     """How an episode goes.
 
     Attributes:
-        steps: actions at most.
+        steps: actions at most, counted anew after each disturbance that is noticed. The paper has 30.
         replan_every: actions executed of each plan (the paper's r).
         cost: "pose" compares futures with the goal's poses, "image" their renderings with the goal image (the paper's).
         plan: how pushes are planned.
@@ -26,9 +26,10 @@ class EpisodeSettings:
         despite_doubts: go on with a goal image that is not explained well.
         reached_m: objects this close to their goals have arrived [m].
         reached_rad: likewise for orientations [rad].
+        renewed: count steps anew after disturbances; off where the number of actions is what is measured.
     """
 
-    steps: int = 30
+    steps: int = 100
     replan_every: int = 1
     cost: CostKind = "pose"
     plan: PlanSettings = field(default_factory=PlanSettings)
@@ -37,6 +38,7 @@ class EpisodeSettings:
     despite_doubts: bool = False
     reached_m: float = 0.008
     reached_rad: float = 0.06
+    renewed: bool = True
 
     def __post_init__(self) -> None:
         """Check the ranges.

@@ -104,7 +104,7 @@ class Stepped:
 
     Attributes:
         number: actions executed so far.
-        steps: at most.
+        steps: actions at most; more once a disturbance was noticed.
         estimate: where everything is now.
         offsets_m: of each object from where it should be, on the table's plane [m]; empty where that is not known.
         offsets_rad: likewise its orientation [rad].

@@ -21,7 +21,7 @@ from osfcore.control.world_protocol import World
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.states import SceneState
-from osfcore.paper.mppi import GaussianMPPI, GaussianPlanSettings
+from osfcore.paper.mppi import STEPS, GaussianMPPI, GaussianPlanSettings
 from osfcore.planning.image_cost import ImageCost
 from osfcore.render.types import PLANNING, SceneBatch
 
@@ -36,7 +36,7 @@ class AlgorithmSettings:
         has_masks: whether there are masks at every step, as in the paper's evaluation; else in the first frame alone.
     """
 
-    steps: int = 30
+    steps: int = STEPS
     plan: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
     has_masks: bool = False
 

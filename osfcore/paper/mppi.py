@@ -21,6 +21,8 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S
 from osfcore.planning.mppi import PlanRound, Rollout
 from osfcore.planning.pose_cost import Cost
 
+STEPS = 30  # T, actions of an episode
+
 
 @dataclass(frozen=True, slots=True)
 class GaussianPlanSettings:

@@ -24,7 +24,7 @@ LOCALHOST = "http://localhost"
 LONG = {"kind": "collect_pushes", "params": {"episodes": 100_000, "steps": 2, "objects": 1}}
 
 
-def until(condition, timeout_s=20.0):
+def until(condition, timeout_s=120.0):
     """Wait until a condition holds; fails the test if it never does."""
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:

@@ -30,7 +30,9 @@ class SettingsIn(Input):
         description='"ours", or "paper": as published, which is slower and knows no goal poses; chosen before an '
         "episode, with a cost of images, a plan for each action, and no changes on the way.",
     )
-    steps: int | None = _between(STEPS, "Actions at most, of 0.2 s each.")
+    steps: int | None = _between(
+        STEPS, "Actions at most, of 0.2 s each, counted anew after each disturbance."
+    )
     replan_every: int | None = _between(STEPS, "Actions executed of each plan.")
     cost: CostKind | None = Field(
         None, description='"pose" compares futures with where things are in the goal image, "image" rendered pixels.'

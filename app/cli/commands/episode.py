@@ -31,8 +31,8 @@ class RunEpisode:
     """Of scene, light, random goal and searches."""
     moved: int | None = None
     """How many objects a random goal moves; from one to all of them without it."""
-    steps: int = 30
-    """Actions at most, of 0.2 s each."""
+    steps: int = 100
+    """Actions at most, of 0.2 s each, counted anew after each disturbance. The paper has 30."""
     replan_every: int = 1
     """Actions executed of each plan."""
     cost: str = "pose"

@@ -119,8 +119,8 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         for change in place.orders.changes():
             loop.settings = settings_of(change["settings"])
         record.take(event)
-        share, left_s = timer.take(event, loop.settings.steps)
-        then = _progress_after(progress, pictures.drawn(event), loop.settings.steps)
+        share, left_s = timer.take(event, progress.total or settings.steps)
+        then = _progress_after(progress, pictures.drawn(event))
         progress = replace(then, share=share, left_s=round(left_s, 1))
         yield progress
         timer.go_on()  # not before a pause is over
@@ -186,15 +186,13 @@ def use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _progress_after(before: EpisodeProgress, event: Event, total: int) -> EpisodeProgress:
+def _progress_after(before: EpisodeProgress, event: Event) -> EpisodeProgress:
     """How far an episode is after an event."""
     from app.episodes.event_notes import note_of, stage_of
     from app.processes.plan_summary import sketch_of
-    from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed, Planning, Stepped
+    from osfcore.control.events import ActionExecuted, Finished, Observed, Planning, Stepped
 
-    is_known = before.total > 0 or isinstance(event, GoalFound | Stepped)
-    total = total if is_known else 0
-    then = replace(before, total=total, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
+    then = replace(before, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
     match event:
         case Observed():  # its images are on the page already
             return replace(then, view=None)
@@ -203,7 +201,7 @@ def _progress_after(before: EpisodeProgress, event: Event, total: int) -> Episod
         case ActionExecuted(number):
             return replace(then, done=number, view=event)
         case Stepped():
-            return replace(then, steps=before.steps + 1, view=event)
+            return replace(then, total=event.steps, steps=before.steps + 1, view=event)
         case Finished(_, outcome, text):
             return replace(then, outcome=outcome, text=text, note=text, view=event)
         case _:

@@ -107,12 +107,14 @@ def _driven(
 
 def _after(progress: RobotProgress, event: Event) -> RobotProgress:
     from app.episodes.event_notes import note_of
-    from osfcore.control.events import ActionExecuted, Finished
+    from osfcore.control.events import ActionExecuted, Finished, Stepped
 
     progress = replace(progress, note=note_of(event) or progress.note)
     match event:
         case ActionExecuted(number):
             return replace(progress, done=number)
+        case Stepped():
+            return replace(progress, total=event.steps)
         case Finished(_, outcome, text):
             return replace(progress, drives="over", outcome=outcome, text=text, note=text)
         case _:

@@ -204,9 +204,9 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
         UnknownName, MissingAssets, InvalidInput, NoRoom: as `evaluate_mpc` does.
     """
     config = replace(config, names=_checked(config, fields, assets))
-    settings = replace(config.settings, cost=config.cost, steps=config.actions)
+    settings = replace(config.settings, cost=config.cost, steps=config.actions, renewed=False)
     told_truth = replace(
-        config.settings, steps=config.actions, plan=config.oracle_plan, reached_rad=_ORACLE_REACHED_RAD
+        config.settings, steps=config.actions, plan=config.oracle_plan, reached_rad=_ORACLE_REACHED_RAD, renewed=False
     )
     episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
     given, own = _circumstances(config, fields, assets)

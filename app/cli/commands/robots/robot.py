@@ -84,8 +84,8 @@ class RobotDriveCommand:
     """Of the pusher [m/s]; actions take longer where it is low."""
     yes: bool = False
     """Do not ask before the first motion."""
-    steps: int = 30
-    """Actions at most."""
+    steps: int = 100
+    """Actions at most, counted anew after each disturbance that is noticed."""
     samples: int = 160
     """Sequences of actions in each of a plan's two rounds."""
     horizon: int = 30

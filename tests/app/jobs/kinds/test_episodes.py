@@ -22,6 +22,7 @@ from app.jobs.worker import KINDS, run_job
 from app.processes.messages.job_messages import RunJob
 from app.processes.plan_summary import PlanSketch
 from osfcore.control import adapted_models, estimators
+from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
@@ -216,7 +217,7 @@ def test_whoever_stops_it_leaves_its_steps_and_nothing_half_written(place, stage
 
 
 def test_settings_in_json_are_checked_like_any(stage):  # noqa: F811
-    assert settings_of({}).steps == 30
+    assert settings_of({}).steps == EpisodeSettings().steps
     assert settings_of(SMALL).plan.samples == 16
     with pytest.raises(InvalidInput, match="horizon"):
         settings_of({"plan": {"horizon": 0}})
