@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -15,6 +14,7 @@ from jaxtyping import Float, UInt8
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.geometry.workspace import STEP_S
+from osfcore.io.files import file_at_once
 from osfcore.io.image_file import to_uint8
 
 TILE_PX, _BAR_PX = 192, 16
@@ -103,25 +103,16 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]]) -> Non
     """
     import imageio_ffmpeg  # here: frames are drawn without it
 
-    partial = path.with_name(f".{path.name}.part.mp4")
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{WIDTH}x{HEIGHT}", "-r", f"{1 / STEP_S:g}", "-i", "-", "-an", "-vcodec", "libx264"]
-    command += ["-pix_fmt", "yuv420p", "-crf", "15", str(partial)]
-    try:
-        partial.touch()  # tells what is wrong with the place, better than ffmpeg does
-        with tempfile.TemporaryFile() as raw:
-            for picture in frames:
-                if picture.shape != (HEIGHT, WIDTH, 3) or picture.dtype != np.uint8:
-                    is_now = f"{picture.dtype} {picture.shape}"
-                    raise InvalidInput("frame of a video", is_now, f"uint8 {(HEIGHT, WIDTH, 3)}")
-                raw.write(picture.tobytes())
-            raw.seek(0)
-            done = subprocess.run(command, stdin=raw, capture_output=True, check=False)
+    command += ["-pix_fmt", "yuv420p", "-crf", "15", "-f", "mp4"]
+    with file_at_once(path) as partial, tempfile.TemporaryFile() as raw:
+        for picture in frames:
+            if picture.shape != (HEIGHT, WIDTH, 3) or picture.dtype != np.uint8:
+                is_now = f"{picture.dtype} {picture.shape}"
+                raise InvalidInput("frame of a video", is_now, f"uint8 {(HEIGHT, WIDTH, 3)}")
+            raw.write(picture.tobytes())
+        raw.seek(0)
+        done = subprocess.run([*command, str(partial)], stdin=raw, capture_output=True, check=False)
         if done.returncode:
             raise CannotWrite(path, "ffmpeg could not encode it")
-        partial.replace(path)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from app.jobs.job import INPUTS
-from app.storage.durable import put_in_place
 from app.storage.schema import CannotStore
+from osfcore.io.files import put_in_place
 
 _TEMPORARY_PREFIX = ".new-"
 
@@ -29,6 +29,8 @@ class JobFolders:
         """Remove what an earlier service left half done."""
         for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
             shutil.rmtree(folder, ignore_errors=True)
+        for folder in self._root.glob("[!.]*"):
+            remove_half_made(folder)
 
     def folder(self, job: str) -> Path:
         """Where a job's outputs are."""
@@ -77,3 +79,13 @@ class JobFolders:
     def remove(self, job: str) -> None:
         """Remove the folder of a job that was not accepted, if it has one."""
         shutil.rmtree(self.folder(job), ignore_errors=True)
+
+
+def remove_half_made(folder: Path) -> None:
+    """Remove from a job's folder what had not got its name yet when whoever made it ended."""
+    for left in folder.glob(".*"):
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):  # on a read-only disk it stays
+                left.unlink()

@@ -21,9 +21,9 @@ from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep,
 from app.processes.messages.scene_messages import Command
 from app.processes.process_server import Answer, InternalError
 from app.storage.database import now_utc
-from app.storage.durable import sync_tree
 from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
+from osfcore.io.files import sync_tree
 
 StartProcess = Callable[[Job, Path, Path, Callable[[object], None]], JobProcess]
 _RETRY_S = 1.0  # after a failure of the loop itself, and of writing what the disk has refused

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from app.episodes.robots.stopped_report import STOPPED, tell_stopped
 from app.jobs.job import Job, ended
+from app.jobs.job_folders import remove_half_made
 from app.processes.messages.job_messages import JobCancelled
 from osfcore.errors import OsfError
 
@@ -57,12 +57,7 @@ def after(job: Job, outcome: Outcome, folder: Path) -> Job:
     if then.state != "done" and not keeps:
         shutil.rmtree(folder, ignore_errors=True)
         return then
-    for left in folder.glob(".*"):  # half-made when it ended
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            with contextlib.suppress(OSError):  # on a read-only disk it stays
-                left.unlink()
+    remove_half_made(folder)
     files = tuple(sorted(path.name for path in folder.glob("[!.]*") if path.is_file()))
     return replace(then, files=files)
 

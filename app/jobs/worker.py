@@ -15,6 +15,7 @@ from app.processes.child_process import end_own_group, import_quietly, own_group
 from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep, RunJob
 from app.processes.process_server import ProcessServer
 from osfcore.errors import OsfError
+from osfcore.io.files import file_at_once
 
 STEP_INTERVAL_S = 0.1
 
@@ -181,8 +182,7 @@ def _extras(step: object) -> dict[str, Any]:
 
 def _pack(folder: Path) -> None:
     """Put a folder into one ZIP beside it, for downloading; PNGs do not shrink, so they are only stored."""
-    partial = folder.with_name(f".{folder.name}.zip")
-    with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
+    place = folder.with_name(f"{folder.name}.zip")
+    with file_at_once(place) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
         for path in sorted(folder.rglob("*")):
             archive.write(path, path.relative_to(folder.parent))
-    partial.replace(folder.with_name(f"{folder.name}.zip"))

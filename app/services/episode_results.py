@@ -23,9 +23,9 @@ from app.episodes.file_names import (
 from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
 from app.jobs.job import Job
 from app.services.runner import Runner
-from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName, shown
+from osfcore.errors import InvalidInput, OsfError, UnknownName, shown
 from osfcore.geometry.states import SceneState
-from osfcore.io.files import read_json
+from osfcore.io.files import file_at_once, read_json
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import Entry, decode
 from osfcore.io.scene_file import StateJson
@@ -160,14 +160,9 @@ class EpisodeResults:
 
 def _pack(path: Path, files: list[Path]) -> None:
     """Put files into a zip, which takes its name only when it is whole."""
-    partial = path.with_name(f".{path.name}")
-    try:
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in files:
-                archive.write(file, file.name)
-        partial.replace(path)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+    with file_at_once(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in files:
+            archive.write(file, file.name)
 
 
 class _Step(Entry):

@@ -20,10 +20,9 @@ from pydantic import Field, StrictInt
 from starlette.concurrency import run_in_threadpool
 
 from app.storage.database import CannotStore, now_utc
-from app.storage.durable import put_in_place
 from app.storage.uploads import Examiner, save
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
-from osfcore.io.files import read_json
+from osfcore.io.files import put_in_place, read_json
 from osfcore.io.json_codec import Text, decode
 
 _ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"

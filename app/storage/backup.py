@@ -17,11 +17,10 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from app.storage.database import now_utc
-from app.storage.durable import put_in_place, sync, sync_tree
 from app.storage.schema import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.io.archives import ArchiveKind, unpack
-from osfcore.io.files import folder_at_once, read_json
+from osfcore.io.files import file_at_once, folder_at_once, read_json
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.output_paths import check_place
 
@@ -68,21 +67,19 @@ def back_up(data_dir: Path, out: Path) -> Manifest:
     check_place(out)
     if not any((data_dir / name).exists() for name in (FILE, *FOLDERS)):
         raise CorruptFile(data_dir, "there is no such data directory, or nothing is stored there")
-    partial, database = (out.with_name(f".{out.name}.{os.getpid()}{suffix}") for suffix in ("", ".sqlite3"))
+    database = out.with_name(f".{out.name}.{os.getpid()}.sqlite3")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(partial, "w") as archive:  # not packed: images, weights and meshes hardly shrink
-            manifest = _fill(archive, data_dir, database)
-        put_in_place(partial, out)
+        # Not packed: images, weights and meshes hardly shrink.
+        with file_at_once(out) as partial, zipfile.ZipFile(partial, "w") as archive:
+            return _fill(archive, data_dir, database)
     except OSError as error:
         raise CannotWrite(out, error.strerror or str(error)) from error
     except sqlite3.DatabaseError as error:
         raise CannotWrite(out, str(error)) from error
     finally:
-        for left in (partial, database):
-            with contextlib.suppress(OSError):
-                left.unlink(missing_ok=True)
-    return manifest
+        with contextlib.suppress(OSError):
+            database.unlink(missing_ok=True)
 
 
 def restore(archive: Path, data_dir: Path) -> Manifest:
@@ -107,10 +104,8 @@ def restore(archive: Path, data_dir: Path) -> Manifest:
         manifest = _checked(archive, folder)
         try:
             (folder / MANIFEST).unlink()
-            sync_tree(folder)
         except OSError as error:
             raise CannotWrite(data_dir, error.strerror or str(error)) from error
-    sync(data_dir.parent)
     return manifest
 
 

@@ -17,11 +17,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from app.storage.durable import sync, sync_tree
 from app.storage.usage import folder_bytes
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
-from osfcore.io.files import write_atomically
+from osfcore.io.files import sync, sync_tree, write_atomically
 
 _ORDER = "order.json"
 _TEMPORARY_PREFIX = ".writing-"
@@ -50,7 +49,7 @@ def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
         if not (place / _ORDER).is_file() or (place / _ORDER).read_bytes() != text.encode():
             clear_workshop(data_dir, name)
             place.mkdir(parents=True)
-            (place / _ORDER).write_bytes(text.encode())
+            write_atomically(place / _ORDER, text.encode())
     except OSError as error:
         raise CannotWrite(place, error.strerror or str(error)) from error
     return place
@@ -131,7 +130,6 @@ def install_published(made: Path, weights: Path) -> None:
         CannotWrite: if the disk is full or the folder cannot be written.
     """
     try:
-        weights.parent.mkdir(parents=True, exist_ok=True)
         for name in (METRICS_FILE, FIELD_FILE):  # what is looked for comes last
             write_atomically(weights.with_suffix(Path(name).suffix), (made / name).read_bytes())
     except OSError as error:

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from app.storage.durable import put_in_place
 from app.storage.schema import CannotStore
 from osfcore.errors import CorruptFile, OsfError, UnknownName
+from osfcore.io.files import put_in_place
 
 _TEMPORARY_PREFIX = ".new-"
 
@@ -120,7 +120,7 @@ class RecordFolders(Generic[Record]):
                     if data is None:
                         (self._root / name / file).unlink(missing_ok=True)
                     else:
-                        (folder / file).replace(self._root / name / file)
+                        put_in_place(folder / file, self._root / name / file)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from app.storage.durable import put_in_place, sync
 from osfcore.errors import CorruptFile, OsfError
+from osfcore.io.files import put_in_place, sync
 
 FILE = "service.sqlite3"
 _APPLICATION_ID = 0x4F534631  # "OSF1"

@@ -10,6 +10,7 @@ from typing import Any
 import httpx2
 
 from osfcore.errors import OsfError
+from osfcore.io.files import file_at_once
 
 _QUIET_S = 60.0  # without a byte before a stream counts as lost; a service that works sends something sooner
 _RECONNECTS = 5  # in a row, without an event between them
@@ -86,16 +87,17 @@ class Connection:
         return self._answer("GET", path, query).content
 
     def download(self, path: str, to: Path) -> Path:
-        """Write a file to disk piece by piece.
+        """Write a file to disk piece by piece; it is there when it is whole.
 
         Raises:
             ServiceError: if there is none or no answer.
+            CannotWrite: if the disk refuses.
         """
         with self._told(), self._http.stream("GET", path) as answer:
             if answer.is_error:
                 answer.read()
             _check(answer)
-            with to.open("wb") as file:
+            with file_at_once(to) as partial, partial.open("wb") as file:
                 for chunk in answer.iter_bytes():
                     file.write(chunk)
         return to

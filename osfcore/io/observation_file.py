@@ -25,7 +25,7 @@ from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName, 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import MAX_OBJECTS, Observation
 from osfcore.io.files import is_text, read_json, reading_png, write_json
-from osfcore.io.image_file import to_uint8, write_png
+from osfcore.io.image_file import encode_png, to_uint8
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.scene_file import CameraJson, PointJson, camera_to_json
 
@@ -68,16 +68,26 @@ def read_observation(folder: Path) -> Observation:
 def write_observation(folder: Path, observation: Observation) -> None:
     """Write an observation; the folder counts as one only when everything is there.
 
+    Images are written through to the disk by whoever puts the folder in place (see `osfcore.io.files`): one by one that
+    would take longer than rendering them, and many a folder only brings them from one process to another.
+
     Raises:
         InvalidInput: if arrays, cameras and names do not fit each other.
         CannotWrite: if the disk refuses.
     """
     _check(observation)
-    folder, path = Path(folder), Path(folder) / OBSERVATION_FILE
+    folder = Path(folder)
     try:
-        path.unlink(missing_ok=True)  # an older one would describe a mixture
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / OBSERVATION_FILE).unlink(missing_ok=True)  # an older one would describe a mixture
+        content = _write_images(folder, observation)
     except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+        raise CannotWrite(folder, error.strerror or str(error)) from error
+    write_json(folder / OBSERVATION_FILE, content)
+
+
+def _write_images(folder: Path, observation: Observation) -> dict[str, Any]:
+    """Write images and masks; return what tells of them and of the rest."""
     content: dict[str, Any] = {
         "cameras": [camera_to_json(camera) for camera in observation.cameras],
         "images": {},
@@ -87,11 +97,10 @@ def write_observation(folder: Path, observation: Observation) -> None:
     }
     for view, camera in enumerate(observation.cameras):
         content["images"][camera.name] = f"image_{view}.png"
-        pixels = to_uint8(observation.images[view])
-        write_png(folder / f"image_{view}.png", pixels)
+        (folder / f"image_{view}.png").write_bytes(encode_png(to_uint8(observation.images[view])))
     if observation.masks is not None:
         content["masks"] = _write_masks(folder, observation, observation.masks)
-    write_json(path, content)
+    return content
 
 
 def _write_masks(
@@ -103,7 +112,8 @@ def _write_masks(
         seen = [number for number in range(len(observation.names)) if masks[view, number].any()]
         files[camera.name] = {observation.names[number]: f"mask_{view}_{number}.png" for number in seen}
         for number in seen:
-            write_png(folder / f"mask_{view}_{number}.png", masks[view, number].astype(np.uint8) * 255)
+            mask = masks[view, number].astype(np.uint8) * 255
+            (folder / f"mask_{view}_{number}.png").write_bytes(encode_png(mask))
     return files
 
 

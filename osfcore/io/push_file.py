@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import fcntl
+import glob
 import json
-import os
 import shutil
 import zipfile
 from collections.abc import Mapping
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.io.files import file_at_once, write_atomically
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,7 +114,7 @@ class EpisodeFolder:
 
     def _adopt(self, settings: Mapping[str, object]) -> None:
         """Clean up after a killed run and make sure that it had the same settings."""
-        for leftover in self._folder.glob("*.tmp"):
+        for leftover in (*self._folder.glob(".*"), *self._out.parent.glob(f".{glob.escape(self._out.name)}.*")):
             leftover.unlink()
         text = json.dumps(dict(settings), sort_keys=True)
         path = self._folder / "settings.json"
@@ -124,9 +125,7 @@ class EpisodeFolder:
                 "continued with the same settings, or its folder removed",
             )
         if not path.exists():
-            temporary = path.with_suffix(".tmp")
-            temporary.write_text(text)
-            temporary.rename(path)
+            write_atomically(path, text.encode())
         self._settings = text
 
     def path(self, index: int) -> Path:
@@ -138,14 +137,15 @@ class EpisodeFolder:
         return frozenset(int(path.stem) for path in self._folder.glob("*.npz") if _is_whole(path))
 
     def combine(self, count: int) -> None:
-        """Write episodes 0 to count - 1 into the HDF5 file, then remove the folder."""
-        temporary = self._out.with_name(self._out.name + ".tmp")
-        with h5py.File(temporary, "w") as file:
+        """Write episodes 0 to count - 1 into the HDF5 file, then remove the folder.
+
+        Raises:
+            CannotWrite: if the disk refuses.
+        """
+        with file_at_once(self._out) as partial, h5py.File(partial, "w") as file:
             file.attrs["settings"] = self._settings
             for index in range(count):
                 _to_group(file.create_group(f"{index:07d}"), load_episode(self.path(index)))
-            file.flush()
-        os.replace(temporary, self._out)
         shutil.rmtree(self._folder)
 
 
@@ -159,14 +159,14 @@ def _is_whole(path: Path) -> bool:
 
 
 def save_episode(path: Path, episode: PushEpisode) -> None:
-    """Write one episode; the file appears complete or not at all."""
+    """Write one episode; the file appears complete or not at all.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
     arrays = _arrays(episode)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
+    with file_at_once(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, names=np.array(episode.names), seed=episode.seed, **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def load_episode(path: Path) -> PushEpisode:

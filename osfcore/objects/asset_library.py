@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, MissingAssets, UnknownName
+from osfcore.io.files import sync, sync_tree
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
 from osfcore.objects.asset import ObjectAsset, ObjectGeometry, ObjectInfo, RestingPoses, TexturedMesh
@@ -188,8 +189,7 @@ class AssetLibrary:
                     "crc32": checks,
                 }
                 (folder / _FACTS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-                for path in (*folder.iterdir(), folder):
-                    _sync(path)
+                sync_tree(folder)
                 self._put(folder, self.root / asset.info.name)
 
     def remove(self, name: str) -> None:
@@ -206,7 +206,7 @@ class AssetLibrary:
         try:
             with self._temporary(name) as trash:
                 os.rename(self.root / name, trash / "old")
-            _sync(self.root)
+            sync(self.root)
         except OSError as error:
             raise CannotWrite(self.root, error.strerror or str(error)) from error
 
@@ -266,7 +266,7 @@ class AssetLibrary:
         while not _renamed(folder, place):  # another process may put the same object there at any moment
             with self._temporary(place.name) as trash, contextlib.suppress(FileNotFoundError):
                 os.rename(place, trash / "old")
-        _sync(self.root)
+        sync(self.root)
 
 
 def _renamed(folder: Path, place: Path) -> bool:
@@ -315,11 +315,3 @@ def _write_arrays(path: Path, asset: ObjectAsset) -> None:
             resting_quaternions=asset.resting.quaternions.astype(float),
             resting_probabilities=asset.resting.probabilities.astype(float),
         )
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from osfcore.errors import CorruptFile, FetchFailed
+from osfcore.io.files import put_in_place
 
 MAX_BYTES = 300_000_000
 TIMEOUT_S = 30.0
@@ -121,7 +122,8 @@ def _save(answer: http.client.HTTPResponse, path: Path, max_bytes: int, address:
                     file.write(chunk)
         if expected is not None and size != int(expected):
             raise ConnectionError(f"{size} of {expected} bytes arrived")
-        part.replace(path)
+        with raising_fetch_failed(address, path.parent):
+            put_in_place(part, path)
     finally:
         part.unlink(missing_ok=True)
 

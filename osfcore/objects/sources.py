@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName
+from osfcore.io.files import put_in_place
 from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
 from osfcore.objects.download import download, pip_download, raising_fetch_failed, temporary_folder, unpack
 from osfcore.progress import Progress
@@ -125,7 +126,7 @@ class WheelSource:
             raise FetchFailed(self.label, f"its SHA-256 is {digest} instead of {self.SHA256}")
         with raising_fetch_failed(self.label, self._cache):
             self._cache.mkdir(parents=True, exist_ok=True)
-            path.replace(self.wheel)
+            put_in_place(path, self.wheel)
 
     def files(self, name: str, folder: Path) -> MeshFiles:
         """Mesh and texture of one object, taken out of the wheel."""
@@ -255,7 +256,8 @@ class UrlSource:
         for address in (f"{self._base}/{path.name}", f"{self._base}/{name}/{path.name}"):
             with temporary_folder(self._cache, name) as folder:
                 if download(address, folder / path.name):
-                    (folder / path.name).replace(path)
+                    with raising_fetch_failed(address, self._cache):
+                        put_in_place(folder / path.name, path)
                     return path
         return None
 

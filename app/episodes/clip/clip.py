@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from osfcore.errors import CannotWrite, OsfError
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from osfcore.io.files import as_mapping, read_json, reading_png
+from osfcore.io.files import as_mapping, file_at_once, read_json, reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging.ray_tracer import RayTracer
@@ -125,26 +124,21 @@ def write_clip(
     Raises:
         CannotWrite: if it cannot be encoded or written.
     """
-    partial = path.with_name(f".{path.stem}.part.mp4")
     film = _Film(trajectory, goal, meshes, facts, executor)
-    encoder = imageio_ffmpeg.write_frames(
-        str(partial), (WIDTH, HEIGHT), fps=FPS, codec="libx264", macro_block_size=2, ffmpeg_log_level="error",
-        output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
-    )  # fmt: skip
-    try:
-        partial.touch()  # tells what is wrong with the place, better than ffmpeg does
-        encoder.send(None)
-        for number, frame in enumerate(film.frames()):
-            encoder.send(np.ascontiguousarray(frame))
-            yield ClipStep(number + 1, film.count)
-        encoder.close()
-        partial.replace(path)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or "it could not be encoded") from error
-    finally:
-        encoder.close()
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+    with file_at_once(path) as partial:
+        encoder = imageio_ffmpeg.write_frames(
+            str(partial), (WIDTH, HEIGHT), fps=FPS, codec="libx264", macro_block_size=2, ffmpeg_log_level="error",
+            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart", "-f", "mp4"],
+        )  # fmt: skip
+        try:
+            encoder.send(None)
+            for number, frame in enumerate(film.frames()):
+                encoder.send(np.ascontiguousarray(frame))
+                yield ClipStep(number + 1, film.count)
+        except OSError as error:
+            raise CannotWrite(path, error.strerror or "it could not be encoded") from error
+        finally:
+            encoder.close()
 
 
 class _Film:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,6 +112,6 @@ def _write_pictures(folder: Path, out: Path) -> None:
         tiles[part] = [part_of(frame, part) for frame in (frames[:1] if part == "goal" else frames)]
     for part, images in tiles.items():
         strip = np.concatenate([image[:TILE_PX, :TILE_PX] for image in images])
-        path = out / f"{part}.webp"
-        Image.fromarray(strip).save(path, "WEBP", quality=_QUALITY, method=6)
-        write_atomically(path, path.read_bytes())
+        data = io.BytesIO()
+        Image.fromarray(strip).save(data, "WEBP", quality=_QUALITY, method=6)
+        write_atomically(out / f"{part}.webp", data.getvalue())

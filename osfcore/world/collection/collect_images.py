@@ -8,8 +8,6 @@ object's frame. Every image has its own view and its own light, drawn independen
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +30,7 @@ from osfcore.geometry.cameras import (
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
+from osfcore.io.files import folder_at_once
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
@@ -145,7 +144,7 @@ def collect_table(config: CollectTable) -> Iterator[Progress]:
 
 
 def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -> Iterator[Progress]:  # noqa: ANN001
-    """Write both splits into a folder beside `out`, which takes its name only when everything is there."""
+    """Write both splits into a folder, which takes its name only when everything is there."""
     image_side(size)
     if not MIN_IMAGES <= images <= MAX_IMAGES:
         raise InvalidInput("number of images", images, f"between {MIN_IMAGES} and {MAX_IMAGES}")
@@ -154,32 +153,24 @@ def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -
     out = out.absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise CannotWrite(out, error.strerror or str(error)) from error
     test = max(TEST_IMAGES, images // 8)
     counts: dict[Split, int] = {"train": images - test, "test": test}
     done = 0
     try:
-        for part, (split, count) in enumerate(counts.items()):
-            rng = stream_rng(seed, Stream.COLLECTED_IMAGES, part)
-            folder = partial / split
-            folder.mkdir(parents=True)
-            annotations = []
-            for number in range(count):
-                camera, light, rgba = shoot(rng, number, count)
-                annotations.append(_save(folder / f"{number:04d}.png", camera, light, rgba))
-                done += 1
-                yield Progress(done, images, f"Image {done} of {images} of {what}")
-            (folder / "anno.json").write_text(json.dumps(annotations))
-        partial.chmod(0o755)  # temporary folders are private
-        partial.rename(out)  # replaces an empty folder
+        with folder_at_once(out) as partial:
+            for part, (split, count) in enumerate(counts.items()):
+                rng = stream_rng(seed, Stream.COLLECTED_IMAGES, part)
+                folder = partial / split
+                folder.mkdir(parents=True)
+                annotations = []
+                for number in range(count):
+                    camera, light, rgba = shoot(rng, number, count)
+                    annotations.append(_save(folder / f"{number:04d}.png", camera, light, rgba))
+                    done += 1
+                    yield Progress(done, images, f"Image {done} of {images} of {what}")
+                (folder / "anno.json").write_text(json.dumps(annotations))
     except OSError as error:
         raise CannotWrite(out, error.strerror or str(error)) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray, "h w 4"]) -> dict[str, object]:

@@ -223,6 +223,20 @@ def test_another_programs_answer_is_told_as_such():
         osf.health()
 
 
+def test_a_download_that_breaks_off_leaves_the_older_file(tmp_path):
+    def half():
+        yield b"half"
+        raise httpx2.ReadError("cut")
+
+    known = {"id": "e1", "stage": None, "done": 1, "total": 1, "note": "", "eta_s": None, "error": None}
+    facts = {"name": "e", "scene": "s", "outcome": None, "text": None, "steps": [], "files": ["video.mp4"]}
+    episode = Episode(**known, **facts, status="done")
+    (tmp_path / "video.mp4").write_bytes(b"older")
+    with talking_to(lambda _: httpx2.Response(200, content=half())) as osf, pytest.raises(ServiceError):
+        osf.download(episode, "video.mp4", tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"video.mp4": b"older"}
+
+
 def test_an_episode_is_followed_over_a_broken_network(table, osf):
     waiting = osf.episode({name: table.state.pose(name) for name in table.state.names})
     known = {**_fields(next(waiting)), "id": "e1"}

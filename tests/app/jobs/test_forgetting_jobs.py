@@ -1,6 +1,7 @@
 import pytest
 
 from app.jobs.job import Job, WrongJobState, ended, job_fields
+from app.jobs.job_folders import JobFolders
 from app.jobs.registry import Jobs
 from app.storage.database import CannotStore, Store
 from osfcore.errors import UnknownName
@@ -80,3 +81,12 @@ def test_what_a_kill_left_half_removed_goes_at_the_next_start(jobs, store, tmp_p
     assert list((tmp_path / "collections").iterdir()) == []
     again.forget("done")
     assert again.all() == ()
+
+
+def test_what_a_killed_service_left_half_made_in_the_folder_of_a_job_goes_at_the_next_start(tmp_path):
+    folders = JobFolders(tmp_path)
+    (folders.folder("j") / ".seen").mkdir(parents=True)
+    for name in ("report.json", ".video.mp4.0123"):
+        (folders.folder("j") / name).write_text("x")
+    folders.sweep()
+    assert [path.name for path in folders.folder("j").iterdir()] == ["report.json"]

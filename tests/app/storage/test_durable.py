@@ -4,28 +4,32 @@ from pathlib import Path
 import pytest
 
 from app.jobs.job_folders import JobFolders
-from app.storage.durable import put_in_place
 from app.storage.field_files import install
 from app.storage.goal_store import GoalStore
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from osfcore.io.files import folder_at_once, put_in_place, write_atomically
 from tests.app.storage.test_goal_store import PNG, goal
 
 
 @pytest.fixture
 def synced(monkeypatch):
     """What was written to the disk and what was renamed, in order: inodes, and names of places."""
-    found, fsync, rename = [], os.fsync, Path.rename
+    found, fsync = [], os.fsync
 
     def noting_fsync(descriptor):
         found.append(os.fstat(descriptor).st_ino)
         fsync(descriptor)
 
-    def noting_rename(self, target):
-        found.append(Path(target).name)
-        return rename(self, target)
+    def noting(rename):
+        def noting_rename(self, target):
+            found.append(Path(target).name)
+            return rename(self, target)
+
+        return noting_rename
 
     monkeypatch.setattr(os, "fsync", noting_fsync)
-    monkeypatch.setattr(Path, "rename", noting_rename)
+    monkeypatch.setattr(Path, "rename", noting(Path.rename))
+    monkeypatch.setattr(Path, "replace", noting(Path.replace))
     return found
 
 
@@ -48,6 +52,26 @@ def test_everything_is_on_the_disk_before_its_name_is(tmp_path, synced):
     (tmp_path / "file").write_text("x")
     put_in_place(tmp_path / "file", tmp_path / "places" / "f")
     assert is_safe(synced, tmp_path / "places" / "f")
+
+
+def test_files_and_folders_of_the_core_outlive_a_power_failure(tmp_path, synced):
+    for _ in range(2):  # anew, and over an older one
+        synced.clear()
+        write_atomically(tmp_path / "new" / "report.json", b"{}")
+        assert is_safe(synced, tmp_path / "new" / "report.json")
+    with folder_at_once(tmp_path / "set") as folder:
+        (folder / "train").mkdir()
+        (folder / "train" / "0000.png").write_bytes(PNG)
+    assert is_safe(synced, tmp_path / "set")
+
+
+def test_a_changed_goal_outlives_a_power_failure(tmp_path, synced):
+    store = GoalStore(tmp_path / "goals", 3)
+    store.keep(goal("a"), PNG)
+    synced.clear()
+    store.replace(goal("a"), PNG)
+    for path in (tmp_path / "goals" / "a").iterdir():
+        assert is_safe(synced, path)
 
 
 def test_goals_outlive_a_power_failure(tmp_path, synced):

@@ -97,7 +97,7 @@ def test_names_that_lead_elsewhere_name_nothing(store, tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("step", "file"), [("mkdir", None), ("write_bytes", "goal.png"), ("write_bytes", "goal.json"), ("rename", None)]
+    ("step", "file"), [("mkdir", None), ("write_bytes", "goal.png"), ("write_bytes", "goal.json"), ("replace", None)]
 )
 def test_a_full_disk_is_told_and_leaves_nothing(store, tmp_path, monkeypatch, step, file):
     store.keep(goal(), PNG)

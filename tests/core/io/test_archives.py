@@ -170,7 +170,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(archive, tmp_path, monkeypatch):
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module.Path, "rename", full)
+    monkeypatch.setattr(module.Path, "replace", full)
     with pytest.raises(CannotWrite, match="No space left"):
         unpack_set(archive, tmp_path / "out")
     assert left_in(tmp_path) == ["set.zip"]

@@ -1,5 +1,8 @@
 import json
+import os
 import struct
+import threading
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.io.files import (
     MAX_JSON_BYTES,
+    file_at_once,
     folder_at_once,
     is_text,
     read_json,
@@ -41,6 +45,62 @@ def test_a_full_disk_leaves_the_older_file(tmp_path, monkeypatch):
         write_json(path, {})
     assert path.read_text() == "older"
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_many_threads_write_one_file_and_readers_see_it_whole(tmp_path):
+    path, size = tmp_path / "a.bin", 200_000
+    write_atomically(path, bytes(size))
+    writers, torn, is_over = 8, [], threading.Event()
+
+    def write(number):
+        for _ in range(10):
+            write_atomically(path, bytes([number]) * size)
+
+    def read():
+        while not is_over.is_set():
+            data = path.read_bytes()
+            if data != data[:1] * size:
+                torn.append(len(data))
+
+    with ThreadPoolExecutor(writers + 2) as pool:
+        readers = [pool.submit(read) for _ in range(2)]
+        written = [pool.submit(write, number) for number in range(writers)]
+        wait(written)
+        is_over.set()
+        for done in (*written, *readers):
+            done.result()
+    assert torn == []
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_files_and_folders_have_the_rights_that_plain_writing_gives(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        (tmp_path / "plain").write_bytes(b"")
+        write_atomically(tmp_path / "atomic", b"")
+        (tmp_path / "plain folder").mkdir()
+        with folder_at_once(tmp_path / "folder"):
+            pass
+    finally:
+        os.umask(before)
+    rights = {path.name: path.stat().st_mode for path in tmp_path.iterdir()}
+    assert rights["atomic"] == rights["plain"]
+    assert rights["folder"] == rights["plain folder"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ZeroDivisionError()])
+def test_nothing_of_a_file_is_left_that_could_not_be_filled(tmp_path, error):
+    path = tmp_path / "a.zip"
+
+    def fill():
+        with file_at_once(path) as partial:
+            partial.write_bytes(b"half")
+            raise error
+
+    with pytest.raises(CannotWrite if isinstance(error, OSError) else ZeroDivisionError):
+        fill()
+    assert list(path.parent.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -91,12 +91,14 @@ def test_combined_file_holds_all_episodes_in_order_and_the_folder_goes(tmp_path)
 
 def test_half_written_episodes_do_not_count(tmp_path):
     with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
-        folder.path(0).with_suffix(".123.tmp").write_bytes(b"half")
+        folder.path(0).with_name(f".{folder.path(0).name}.123").write_bytes(b"half")
+        (tmp_path / ".pushes.h5.123").write_bytes(b"half")
         save_episode(folder.path(1), episode(1))
         folder.path(2).write_bytes(folder.path(1).read_bytes()[:200])  # cut short
     with EpisodeFolder(tmp_path / "pushes.h5", {}) as folder:
         assert folder.finished() == {1}
-    assert not list((tmp_path / "pushes.h5.partial").glob("*.tmp"))
+    assert [path.name for path in tmp_path.iterdir()] == ["pushes.h5.partial"]
+    assert not list((tmp_path / "pushes.h5.partial").glob(".*"))
 
 
 def test_two_collections_do_not_share_a_folder(tmp_path):
