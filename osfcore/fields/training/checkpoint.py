@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.io.files import write_atomically
+from osfcore.io import training_checkpoint
 
 _ARRAYS = ("origin", "index", "rows", "cells", "networks", "ambient")
 
@@ -50,27 +49,26 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, fingerprint: Mapping[st
     field = checkpoint.field
     arrays = {name: torch.from_numpy(np.ascontiguousarray(getattr(field, name))) for name in _ARRAYS}
     content = {
-        "fingerprint": dict(fingerprint),
         "stage": checkpoint.stage,
         "field": {**arrays, "voxel": field.voxel, "hidden": field.hidden},
         "optimiser": checkpoint.optimiser,
         "clock": checkpoint.clock,
         "random": checkpoint.random,
     }
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_atomically(path, buffer.getvalue())
+    training_checkpoint.write_checkpoint(path, dict(fingerprint), content)
 
 
 def read_checkpoint(path: Path, fingerprint: Mapping[str, Any]) -> Checkpoint | None:
-    """The checkpoint of the same run; None if there is none, it is broken, or it belongs to other settings."""
-    try:
-        content = torch.load(path, weights_only=True, map_location="cpu")
-        if content["fingerprint"] != dict(fingerprint):
-            return None
+    """The checkpoint of the same run; None if there is none, it is cut short, or it belongs to other settings.
+
+    Raises:
+        CorruptFile: if it is of this run, but cannot be used.
+    """
+    content = training_checkpoint.read_content(path, dict(fingerprint))
+    if content is None:
+        return None
+    with training_checkpoint.going_on_from(path):
         stored = content["field"]
         arrays = {name: stored[name].numpy() for name in _ARRAYS}
         field = KiloOSF(voxel=stored["voxel"], hidden=stored["hidden"], **arrays)
-    except Exception:
-        return None
-    return Checkpoint(content["stage"], field, content["optimiser"], content["clock"], content["random"])
+        return Checkpoint(content["stage"], field, content["optimiser"], content["clock"], content["random"])

@@ -8,7 +8,6 @@ it, and then from the images. A checkpoint beside the output lets the same comma
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -38,6 +37,7 @@ from osfcore.fields.voxel_shell import first_shell, refine, trim
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_set import ImageSet, read_splits
 from osfcore.io.output_paths import check_weights_place
+from osfcore.io.training_checkpoint import going_on_from
 from osfcore.progress import Progress
 
 _AIMED_BYTES = 2_000_000
@@ -72,7 +72,8 @@ def train_field(config: TrainField, recipe: Recipe | None = None, pace: Pace | N
     Raises:
         InvalidInput: if the settings are out of range, cuda is asked for and not there, or a file of somebody else lies
             where the metrics belong.
-        CorruptFile: if the image set is not sound, or nothing of the object could be learned.
+        CorruptFile: if the image set is not sound, nothing of the object could be learned, or the checkpoint of a
+            killed run cannot be gone on from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
@@ -127,7 +128,8 @@ class _Run:
         saved = read_checkpoint(self._checkpoint_path, self._fingerprint())
         phases = self._phases()
         if saved is not None:
-            name, learner = saved.stage, self._resumed(saved)
+            with going_on_from(self._checkpoint_path):
+                name, learner = saved.stage, self._resumed(saved)
             yield self._report("Going on from a checkpoint")
         else:
             yield self._report("Carving the silhouettes")
@@ -192,23 +194,22 @@ class _Run:
         return min(1.0, self._done_s / (60 * self._config.minutes))
 
     def _descend(self, name: str, stage: _Learner, start: float, end: float) -> Iterator[FieldStep]:
-        began = reported = saved = time.monotonic()
-        already = self._done_s
+        clock, already = self._pace.clock, self._done_s
+        began = reported = saved = clock()
         while (share := self._share()) < end:
             count = self._teacher_recipe().rays if isinstance(stage, NetworkStage) else self._recipe.rays
             rays = self._source.batch(self._rng.choice(self._pixels, count))
             stage.step(rays, (share - start) / (end - start), self._rng, self._generator)
             self._done_steps += 1
-            now = time.monotonic()
+            now = clock()
             self._done_s = already + now - began
             if now - reported > self._pace.report_s:
                 reported = now
                 yield self._look(stage)
-                began += time.monotonic() - now  # looking costs nobody's budget
             if now - saved > self._pace.checkpoint_s:
                 saved = now
                 self._save(name, stage)
-                began += time.monotonic() - now
+            began += clock() - now  # looking and saving cost nobody's budget
 
     def _look(self, stage: _Learner) -> FieldStep:
         budget_s = 60 * self._config.minutes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -60,10 +62,12 @@ class Pace:
     Attributes:
         report_s: between two steps that are told [s].
         checkpoint_s: between two checkpoints [s].
+        clock: tells the time that counts for both and for the budget [s].
     """
 
     report_s: float = 1.0
     checkpoint_s: float = 20.0
+    clock: Callable[[], float] = time.monotonic
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,7 @@ def train_paper_dynamics(config: TrainPaperDynamics, kappas: Mapping[str, float]
 
     Raises:
         InvalidInput: if a number is out of range, the device is not there, or nothing is left to learn from.
-        CorruptFile: if a push file cannot be read.
+        CorruptFile: if a push file cannot be read, or the checkpoint of a killed run cannot be gone on from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
     _check(config)
@@ -207,7 +207,7 @@ class _Run:
 
     def resume(self) -> None:
         """Go on from the checkpoint of the same run, if there is one."""
-        resume_from(self._checkpoint, self._fingerprint(), self._restore, self._device)
+        resume_from(self._checkpoint, self._fingerprint(), self._restore)
 
     def _restore(self, content: dict[str, Any]) -> None:
         self._network.load_state_dict(content["network"])

@@ -28,6 +28,7 @@ from osfcore.fields.training.visual_hull import silhouette_box
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_set import ImageSet, read_splits
 from osfcore.io.output_paths import check_weights_place
+from osfcore.io.training_checkpoint import going_on_from
 from osfcore.paper.fields.distillation import TinyDistillation
 from osfcore.paper.fields.tiny_field import TinyField, first_field, network_size
 from osfcore.paper.fields.tiny_query import TinyQuery
@@ -101,7 +102,7 @@ def train_paper_field(config: TrainPaperField, recipe: PaperFieldRecipe | None =
     Raises:
         InvalidInput: if the settings are out of range, cuda is asked for and not there, or a file of somebody else lies
             where the metrics belong.
-        CorruptFile: if the image set is not sound.
+        CorruptFile: if the image set is not sound, or the checkpoint of a killed run cannot be gone on from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
@@ -141,7 +142,11 @@ class _Run:
     def steps(self) -> Iterator[FieldStep]:
         yield self._report("Reading the images")
         saved = read_checkpoint(self._checkpoint_path, self._fingerprint())
-        name, learner = self._first() if saved is None else self._resumed(saved)
+        if saved is None:
+            name, learner = self._first()
+        else:
+            with going_on_from(self._checkpoint_path):
+                name, learner = self._resumed(saved)
         names = list(self._ends)
         for number in range(names.index(name), len(names)):
             if number > names.index(name):

@@ -122,6 +122,24 @@ def test_a_checkpoint_that_does_not_fit_is_not_gone_on_with(data, tmp_path, shap
     assert [s.done for s in train_dynamics(settings, shapes)][1] == 1
 
 
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("lost", ["best", "rng"])
+def test_a_checkpoint_that_cannot_be_gone_on_from_ends_the_training_and_stays(data, tmp_path, shapes, lost):
+    settings = config(data, tmp_path)
+    begun = train_dynamics(settings, shapes)
+    while next(begun).done < 3:
+        pass
+    begun.close()
+    checkpoint = settings.out.with_suffix(".checkpoint")
+    content = torch.load(checkpoint)
+    torch.save({key: value for key, value in content.items() if key != lost}, checkpoint)
+    kept = checkpoint.read_bytes()
+    with pytest.raises(CorruptFile, match="delete it"):
+        list(train_dynamics(settings, shapes))
+    assert checkpoint.read_bytes() == kept
+    assert not settings.out.exists()
+
+
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(data, tmp_path, shapes):
     for folder, seed in (("a", 0), ("b", 0), ("c", 1)):
         list(train_dynamics(config(data, tmp_path / folder, iterations=2, long_iterations=1, seed=seed), shapes))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.errors import CannotWrite
+from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from osfcore.fields.training.optimization import Rates, Stage
 from tests.core.render.scenes import random_field
@@ -53,8 +53,17 @@ def test_broken_files_are_passed_over(checkpoint, tmp_path):
     for garbage in (b"", b"PK", data[:1000], data[: len(data) // 2], data[:-1], bytes(100)):
         path.write_bytes(garbage)
         assert read_checkpoint(path, MARK) is None
-    torch.save({"fingerprint": MARK}, path)
-    assert read_checkpoint(path, MARK) is None
+
+
+def test_a_checkpoint_of_the_same_run_that_lacks_something_is_told_and_kept(checkpoint, tmp_path):
+    path = tmp_path / "a.partial"
+    write_checkpoint(path, checkpoint, MARK)
+    content = torch.load(path)
+    for lost in ("stage", "field", "optimiser", "clock", "random"):
+        torch.save({key: value for key, value in content.items() if key != lost}, path)
+        with pytest.raises(CorruptFile, match="delete it"):
+            read_checkpoint(path, MARK)
+        assert path.exists()
 
 
 class _Evil:

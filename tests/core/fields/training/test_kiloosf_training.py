@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.fields.field_weights import read_field
@@ -191,6 +192,42 @@ def test_a_field_that_cannot_be_read_back_leaves_the_older_one(block_set, tmp_pa
         run(config)
     assert config.out.read_bytes() == b"older"
     assert not config.out.with_suffix(".json").exists()
+
+
+def test_a_checkpoint_that_cannot_be_gone_on_from_ends_the_training_and_stays(block_set, tmp_path):
+    config = TrainField(block_set, tmp_path / "a.safetensors", iterations=40, device="cpu")
+    for step in train_field(config, QUICK, OFTEN):
+        if step.progress.done >= 3:
+            break
+    partial = config.out.with_suffix(".partial")
+    content = torch.load(partial)
+    torch.save({**content, "optimiser": {"state": {}, "param_groups": []}}, partial)
+    kept = partial.read_bytes()
+    with pytest.raises(CorruptFile, match="delete it"):
+        run(config)
+    assert partial.read_bytes() == kept
+
+
+class Clock:
+    """A clock that goes on by a quarter of a second whenever it is read."""
+
+    def __init__(self):
+        self.now_s = 0.0
+
+    def __call__(self):
+        self.now_s += 0.25
+        return self.now_s
+
+
+@pytest.mark.parametrize(("report_s", "checkpoint_s"), [(0.0, 0.0), (0.0, 1e9), (1e9, 0.0), (1e9, 1e9)])
+def test_only_steps_of_descent_cost_the_budget(block_set, tmp_path, report_s, checkpoint_s):
+    config = TrainField(block_set, tmp_path / "a.safetensors", minutes=0.05, device="cpu")
+    clock = Clock()
+    for number, _ in enumerate(train_field(config, QUICK, Pace(report_s, checkpoint_s, clock))):
+        assert number < 40  # else it goes on for ever
+        clock.now_s += 100.0  # whoever is told takes time
+    assert metrics(config)["iterations"] == 12  # of a quarter of a second, in three seconds
+    assert metrics(config)["minutes"] == 0.05
 
 
 def test_a_broken_checkpoint_is_passed_over(block_set, tmp_path):

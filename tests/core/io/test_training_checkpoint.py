@@ -1,0 +1,61 @@
+import pytest
+import torch
+
+from osfcore.errors import CorruptFile
+from osfcore.io.training_checkpoint import resume_from, write_checkpoint
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "net.checkpoint"
+    write_checkpoint(path, "this run", {"weights": torch.arange(1000.0), "done": 7})
+    return path
+
+
+def test_a_run_goes_on_from_its_own_checkpoint(path):
+    taken = []
+    resume_from(path, "this run", taken.append)
+    assert [(content["done"], float(content["weights"][-1])) for content in taken] == [(7, 999.0)]
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut short", "rubbish", "empty", "of another run", "no checkpoint"])
+def test_a_run_starts_over_where_there_is_nothing_to_go_on_from(path, damage):
+    data = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    elif damage == "of another run":
+        write_checkpoint(path, "another run", {})
+    elif damage == "no checkpoint":
+        torch.save([1, 2], path)
+    else:
+        path.write_bytes({"cut short": data[: len(data) // 2], "rubbish": b"rubbish", "empty": b""}[damage])
+    taken = []
+    resume_from(path, "this run", taken.append)
+    assert taken == []
+
+
+def test_a_checkpoint_that_is_taken_over_by_half_ends_the_run_and_stays(path):
+    taken = []
+
+    def restore(content):
+        taken.append(content["done"])
+        taken.append(content["optimiser"])
+
+    with pytest.raises(CorruptFile, match=r"net.checkpoint .*'optimiser'.* delete it"):
+        resume_from(path, "this run", restore)
+    assert path.exists()
+
+
+def test_a_checkpoint_that_cannot_be_read_is_not_taken_for_none(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(CorruptFile):
+        resume_from(tmp_path / "folder", "this run", print)
+
+
+@pytest.mark.parametrize("error", [MemoryError, torch.OutOfMemoryError])
+def test_a_lack_of_memory_is_not_laid_to_the_checkpoint(path, error):
+    def restore(content):
+        raise error
+
+    with pytest.raises(error):
+        resume_from(path, "this run", restore)
