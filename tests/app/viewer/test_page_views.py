@@ -122,7 +122,7 @@ def test_what_plays_goes_on_when_something_else_of_it_is_looked_at(live, course)
     with Page(live, "page") as page:
         ask(live, "page", replay)
         pusher = until(lambda: page.own("/replay/pusher"))
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 120.0
         while not np.allclose(pusher.position, course.states[-1].pusher, atol=1e-5):
             assert time.monotonic() < deadline  # begun anew each time it would never come to its end
             ask(live, "page", replay, shows="beliefs")

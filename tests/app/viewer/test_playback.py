@@ -70,9 +70,9 @@ def test_a_jump_overtakes_what_waits(sketch, playback):
 def test_far_behind_it_hurries(sketch, playback):
     start = time.monotonic()
     for _ in range(10):
-        playback.note(SceneChanged(record(3), tuple(state(1) for _ in range(20)), 0.05))  # 10 s in all
+        playback.note(SceneChanged(record(3), tuple(state(1) for _ in range(20)), 0.5))  # 100 s in all
     until(lambda: len(sketch.places) == 210)
-    assert time.monotonic() - start < 8
+    assert time.monotonic() - start < 60
 
 
 def test_other_scenes_are_not_drawn(sketch, playback):
