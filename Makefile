@@ -14,7 +14,7 @@ OFFLINE := echo "make: the packages could not be installed; see the lines above 
 
 LATER := 3.12 3.13
 
-.PHONY: demo install dev test test-all test-types test-pythons coverage lint soak bench clean
+.PHONY: demo install dev test test-all test-pythons coverage lint soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch
@@ -43,13 +43,10 @@ $(VENV)/.dev-installed: $(VENV)/.installed
 test: dev
 	$(BIN)/pytest -n 2 --dist loadfile
 
-test-all: dev test-types
-	$(BIN)/pytest -n 2 --dist loadfile -m 'not soak and not e2e'
+# Shapes and types of arrays are checked on the way.
+test-all: dev
+	$(BIN)/python -m pytest -n 2 --dist loadfile -p tests.typecheck -m 'not soak and not e2e'
 	$(BIN)/pytest -m e2e
-
-# Shapes and types of arrays are checked while the tests of the library run.
-test-types: dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile -p tests.typecheck tests/core
 
 # Their packages stay in .cache, five gigabytes each where torch comes with CUDA; from then on 'make test-all' has the test, too.
 test-pythons: dev $(LATER:%=.cache/python%/.installed)

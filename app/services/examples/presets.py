@@ -68,7 +68,7 @@ PRESETS = (
            {"008_pudding_box": (-0.0145, -0.1745), "010_potted_meat_can": (0.0755, 0.0429)}),
     Preset("low-sun", "Low sun", "Light from 15° above the table: shadows longer than the objects.",
            ("009_gelatin_box", "005_tomato_soup_can", "004_sugar_box"), 14, 120, 15,
-           {"009_gelatin_box": (0.1965, 0.0144), "005_tomato_soup_can": (-0.1316, -0.0733)}),
+           {"009_gelatin_box": (0.0203, -0.1412), "005_tomato_soup_can": (0.0984, -0.1046)}),
     Preset("other-light", "Another light", "The photo was taken under a lamp from the other side.",
            ("004_sugar_box", "009_gelatin_box", "006_mustard_bottle"), 15, 40, 30,
            {"009_gelatin_box": (0.0183, -0.0797), "006_mustard_bottle": (-0.0692, 0.103)}, (220, 30)),

@@ -102,6 +102,7 @@ async def sent(response):
     return body
 
 
+@pytest.mark.slow
 def test_downloads_are_whole_while_the_file_is_replaced_and_deleted(client, path):
     over = threading.Event()
 

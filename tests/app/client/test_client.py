@@ -183,6 +183,7 @@ def test_what_is_no_photo_is_told_without_asking_the_service(osf, tmp_path):
             osf.upload_goal(path)
 
 
+@pytest.mark.slow
 def test_predictions_are_futures(osf, table):
     away = table.state.pusher / np.linalg.norm(table.state.pusher[:2]) * [0.2, 0.2, 0]
     rollouts = osf.predict(np.stack([np.tile(away, (3, 1)), np.zeros((3, 3))]))

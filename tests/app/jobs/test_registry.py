@@ -91,6 +91,7 @@ def test_a_job_lives_and_every_change_is_told(open_jobs, store):
     assert [number for number, _ in store.events_after(0)] == numbers
 
 
+@pytest.mark.slow
 def test_waiting_jobs_run_in_order(open_jobs):
     jobs, _ = open_jobs()
     first, second, third = (jobs.submit(*TABLE) for _ in range(3))
@@ -189,6 +190,7 @@ def test_a_scene_is_held_only_by_the_running_job_that_names_it(open_jobs):
     assert jobs.holder("s") is None
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_says_that_it_can_go_on_and_a_cancelled_one_leaves_nothing(open_jobs, data_dir):
     jobs, _ = open_jobs()
     source = {"mesh": "009_gelatin_box", "set": None}
@@ -481,6 +483,7 @@ def test_a_job_whose_simulation_hangs_is_heard_and_cancelled_all_the_same(played
     hangs.set()
 
 
+@pytest.mark.slow
 def test_a_frozen_job_fails_and_the_next_one_runs(open_jobs):
     jobs, _ = open_jobs()
     job, following = jobs.submit(*LONG), jobs.submit(*TABLE)

@@ -32,6 +32,7 @@ def echo():
         client.stop()
 
 
+@pytest.mark.slow
 def test_nobody_who_sends_to_a_frozen_process_waits(echo):
     client = echo()
     assert client.call("here") == "here"
@@ -46,6 +47,7 @@ def test_nobody_who_sends_to_a_frozen_process_waits(echo):
     assert client.process is not frozen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0.0, 0.005, 0.02])
 def test_one_that_freezes_in_the_middle_of_an_answer_is_replaced(echo, delay_s):
     client = echo(keeps_running=True)
@@ -59,6 +61,7 @@ def test_one_that_freezes_in_the_middle_of_an_answer_is_replaced(echo, delay_s):
     assert client.call("again") == "again"
 
 
+@pytest.mark.slow
 def test_one_that_lives_but_answers_nobody_is_replaced(echo):
     client = echo(answer_s=0.5)
     hanging = client.process
@@ -87,6 +90,7 @@ def test_orders_that_nobody_reads_are_refused_in_the_end(echo):
     assert not all(client.notify(b"order") for _ in range(100_000))
 
 
+@pytest.mark.slow
 def test_one_that_cannot_be_started_for_want_of_descriptors_comes_back(echo):
     client, lazy = echo(keeps_running=True), ProcessClient(echo_main, (), "lazy echo")
     client.call("here")

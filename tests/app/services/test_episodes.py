@@ -116,6 +116,7 @@ def left_over(tmp_path):
 # Asking for one
 
 
+@pytest.mark.slow
 def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runner, goals, tmp_path):
     job = episodes.start(AskedEpisode(goal="made", seed=5, settings={"samples": 8}))
     assert (job.kind, job.params["scene"], job.params["names"], job.params["seed"]) == (

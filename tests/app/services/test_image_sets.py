@@ -113,6 +113,7 @@ def test_images_of_the_table_are_told_apart(tmp_path):
         examine(tmp_path / "new")
 
 
+@pytest.mark.slow
 def test_there_is_an_end_to_what_is_kept(sets, archive):
     receive(sets, archive)
     receive(sets, archive)

@@ -66,6 +66,7 @@ def test_the_first_start_shows_a_scene_by_itself(open_runner):
     until(lambda: any(isinstance(event, CurrentScene) for event in runner.events))
 
 
+@pytest.mark.slow
 def test_the_first_scene_is_the_one_that_is_wished_for_where_its_objects_are_there(open_runner, data_dir):
     light = Light.from_angles(1.0, 0.5)
     runner = open_runner(DemoScene((BOX,), 5, light))
@@ -89,6 +90,7 @@ def test_without_objects_there_is_no_scene_until_some_come(open_runner, data_dir
     until(runner.scenes)
 
 
+@pytest.mark.slow
 def test_everything_is_there_after_a_restart(open_runner):
     runner = open_runner(demo_scene=False)
     first = runner.create_scene(names=(BOX,), seed=3)
@@ -105,6 +107,7 @@ def test_everything_is_there_after_a_restart(open_runner):
     assert np.allclose(back.state.poses.position, first.state.poses.position, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_dying_simulation_is_told_and_the_scenes_live_on(open_runner):
     runner = open_runner(demo_scene=False)
     scene = runner.create_scene(names=(BOX,), seed=3)
@@ -201,6 +204,7 @@ def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
             command()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", ["queued", "running", "paused"])
 def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(open_runner, state):
     runner = open_runner(demo_scene=False)

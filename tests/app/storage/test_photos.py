@@ -344,6 +344,7 @@ def test_photos_are_decoded_elsewhere(reader):
         reader.read(b"%PDF-1.7")
 
 
+@pytest.mark.slow
 def test_the_largest_photos_fit_into_the_memory_of_the_process(reader):
     pixels = np.random.default_rng(0).integers(0, 256, (512, 512, 4), np.uint8).repeat(16, axis=0).repeat(16, axis=1)
     photos = {

@@ -116,6 +116,7 @@ def test_a_replay_shows_beliefs_alone_and_goes_on_with_meshes(live, course):
         until(lambda: page.own("/objects") is None)
 
 
+@pytest.mark.slow
 def test_what_plays_goes_on_when_something_else_of_it_is_looked_at(live, course):
     end_s = ReplayClock(course).length_s
     replay = {"story": STORY, "at_s": end_s - 8.0, "plays": True, "speed": 4.0}

@@ -227,6 +227,7 @@ def test_the_image_model_of_the_first_frame_holds_for_later_ones(world, told, mo
     assert "sRGB" in told_of.text
 
 
+@pytest.mark.slow
 def test_by_real_eyes_later_frames_of_odd_pictures_are_right(world):
     """Nobody tells that the cameras encode and expose otherwise; poses are right before and after a push."""
     goal = toward_middle(world)

@@ -49,6 +49,7 @@ def test_it_explains_what_it_was_made_from_and_nothing_else(world, prepared):
     assert not prepared.first.explains(KNOWN.appearance, world.observe())
 
 
+@pytest.mark.slow
 def test_an_episode_takes_what_fits_and_looks_itself_for_the_rest(world, goal, prepared):
     """The can is moved after the preparation: the first frame is estimated anew, the goal image is not."""
     pose = world.truth().pose(CAN)

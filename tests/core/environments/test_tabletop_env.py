@@ -47,6 +47,7 @@ def made(folder):
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("obs", ["poses", "both"])
 def test_gymnasium_finds_nothing_wrong(made, obs):
     env = made(obs=obs, image_side=32, render_mode="rgb_array")

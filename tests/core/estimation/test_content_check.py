@@ -40,6 +40,7 @@ def photo(pixels, names=NAMES):
     return Observation((CAMERA,), pixels[None], names, None, None, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [NAMES, OTHERS])
 @pytest.mark.parametrize("light", [(0.5, 0.3, 0.8), (-0.7, 0.6, 0.3)])
 def test_objects_that_are_there_are_found_and_others_are_missed(models, checker, names, light):

@@ -75,6 +75,7 @@ def angle_deg(a, b):
     return np.rad2deg(np.arccos(np.clip(a @ b, -1, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "cone"), [((0.3, -0.2, 0.4), (60, 75)), ((-0.5, 0.3, 0.35), (14, 22)), ((0.1, 0.6, 0.9), (12, 18))]
 )

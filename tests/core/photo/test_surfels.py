@@ -39,6 +39,7 @@ def test_they_draw_the_silhouette_and_the_depth_of_the_field(surfels, taken):
     assert np.median(np.abs(depth[0] - truth)[common]) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_true_pose_has_a_small_loss(surfels, taken):
     loss = PoseLoss(object_windows([taken.photo], NAME, 60), surfels)
     steps = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.05]])

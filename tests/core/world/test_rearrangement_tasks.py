@@ -42,6 +42,7 @@ def turn(task, name):
     return rotation_angle(task.start.pose(name).quaternion, task.goal.pose(name).quaternion)
 
 
+@pytest.mark.slow
 def test_a_task_is_the_same_again_without_the_others(library, families):
     (again,) = tasks_of(library, "shifted", numbers=[4])
     expected = families["shifted"][4]
@@ -52,6 +53,7 @@ def test_a_task_is_the_same_again_without_the_others(library, families):
     assert np.abs(other.start.light.direction - again.start.light.direction).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_one_two_and_three_objects_move_in_turn(library, families):
     for family in ("shifted", "turned", "relit"):
         assert [len(set(task.moved)) for task in families[family]] == [1, 2, 3, 1, 2, 3]
@@ -166,6 +168,7 @@ def test_where_there_is_no_room_or_no_rest_other_layouts_are_tried_and_counted(l
     assert Counter(drawn.rejected) == {"not at rest": 2}
 
 
+@pytest.mark.slow
 def test_what_never_rests_has_no_task(library, monkeypatch):
     monkeypatch.setattr(module, "came_to_rest", lambda _: False)
     with pytest.raises(NoRoom, match=NAMES[3]):

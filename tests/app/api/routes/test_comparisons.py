@@ -30,6 +30,7 @@ def pixels(answer):
     return np.asarray(Image.open(io.BytesIO(answer.content)).convert("RGB"), float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["0", "1", "2", "3", "goal"])
 def test_what_is_rendered_is_what_the_camera_sees(neural, scene, camera):
     answer = neural.get(f"/api/scenes/{scene}/neural/{camera}.png")

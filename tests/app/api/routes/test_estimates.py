@@ -48,6 +48,7 @@ def first(service, scene):
     return over(service, accepted.headers["location"])
 
 
+@pytest.mark.slow
 def test_a_scene_is_estimated_near_the_truth_that_only_the_simulation_tells(service, scene, first):
     assert (first["status"], first["error"], first["mode"]) == ("done", None, "first")
     assert first["of"] == {"scene": scene["id"], "revision": scene["revision"], "file_name": None}
@@ -86,6 +87,7 @@ def pixels(answer):
     return np.asarray(Image.open(io.BytesIO(answer.content)).convert("RGB"), float)
 
 
+@pytest.mark.slow
 def test_images_of_steps_come_closer_to_what_was_observed(service, scene, first):
     address = f"/api/estimates/{first['id']}/images"
     observed = pixels(service.get(f"{address}/1.png", params={"kind": "observed"}))
@@ -127,6 +129,7 @@ def upload(service, folder, **params):
     return service.post("/api/estimates", params=params, content=zipped(folder), headers=ZIP)
 
 
+@pytest.mark.slow
 def test_an_uploaded_folder_is_estimated_without_errors_against_a_truth(service, folder):
     accepted = upload(service, folder, file_name="mine.zip", seed=3)
     assert accepted.status_code == 202
@@ -220,6 +223,7 @@ def test_one_that_waits_is_cancelled_and_leaves_nothing(service, services, scene
     finished(service, f"/api/jobs/{running['id']}")
 
 
+@pytest.mark.slow
 def test_an_estimate_can_be_followed_to_its_end(live):
     _, made = live.request("POST", "/api/scenes", {"seed": 2, "objects": [MUSTARD], "image_size": 32})
     status, asked = live.request("POST", "/api/estimates")  # no body at all: the scene that is shown

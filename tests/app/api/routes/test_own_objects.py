@@ -101,6 +101,7 @@ def test_a_glb_becomes_an_object_that_scenes_hold_and_that_stays_while_they_do(o
     is_problem(own.get("/api/objects/box"), 404)
 
 
+@pytest.mark.slow
 def test_a_zipped_obj_in_millimetres_keeps_the_texture_that_lies_in_another_folder(own):
     job = added(own, zipped(obj_files()), ZIP, name="red", scale=0.001)
     assert job["state"] == "done", job["error"]

@@ -177,6 +177,7 @@ def test_a_stop_reaches_the_robot_and_ends_the_episode_however_often(service, ro
     assert state(service) == "stopped"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "words"),
     [

@@ -138,6 +138,7 @@ def test_all_seeds_have_the_same_bounds():
     assert {(kind["minimum"], kind["maximum"]) for kind in stated} == {SEED}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEED)
 def test_whoever_takes_a_seed_takes_the_first_and_the_last(service, seed):
     scene = service.post("/api/scenes", json={"seed": seed, "count": 2, "image_size": 16})

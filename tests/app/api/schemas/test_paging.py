@@ -52,6 +52,7 @@ def test_every_list_says_how_many_there_are_and_is_bounded(service, path, key):
         assert "limit" in is_problem(service.get(f"/api/{path}", params={"limit": limit}), 422)["detail"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("path", "key"), LISTS.items())
 def test_pages_of_a_service_put_together_are_its_list(service, scene, path, key):
     for _ in range(2):

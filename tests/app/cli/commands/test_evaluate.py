@@ -30,6 +30,7 @@ def fields_dir(data_dir, library, monkeypatch):
     return data_dir
 
 
+@pytest.mark.slow
 def test_figures_are_the_last_line_as_json(fields_dir, tmp_path, capsys):
     arguments = ["--out", str(tmp_path / "out"), "--data-dir", str(fields_dir), "--names", *SOLIDS[:2], "--tasks", "1"]
     assert main(["eval", "fields", *arguments, "--objects", "2", "--json"]) == 0
@@ -96,6 +97,7 @@ def test_estimators_are_measured(fields_dir, oracle, capsys):
         assert words in shown, words
 
 
+@pytest.mark.slow
 def test_estimators_are_measured_in_pieces(fields_dir, oracle, tmp_path, capsys):
     arguments = ["--data-dir", str(fields_dir), "--out", str(tmp_path), "--names", *SOLIDS, "--tasks", "1",
                  "--workers", "1"]  # fmt: skip

@@ -42,6 +42,7 @@ def refused(capsys, *call):
     return capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_camera_is_calibrated_and_stands_where_the_photo_of_the_table_says(photos, tmp_path, capsys):
     table, out = written(tmp_path, "table.png", T_WORLD_CAMERA, 9), tmp_path / "camera.json"
     result = calibrated(capsys, *photos, "--table", table, "--out", str(out))
@@ -82,6 +83,7 @@ def test_people_are_told_what_was_found_and_what_would_help(photos, tmp_path, ca
     assert "One more photo would make it" in told
 
 
+@pytest.mark.slow
 def test_what_does_not_suffice_is_refused(photos, tmp_path, capsys):
     out = ["--out", str(tmp_path / "camera.json")]
     assert "number of photos of the board is 2" in refused(capsys, *photos[:2], *out)

@@ -247,6 +247,7 @@ def seen_by_the_goal_camera(place, stage, side=16):  # noqa: F811
     return {"poses": None, "camera": camera_to_json(camera)}
 
 
+@pytest.mark.slow
 def test_the_method_as_published_goes_through_the_same_job(place, stage, monkeypatch):  # noqa: F811
     def found(*_, **__):
         state = stage.world.truth()

@@ -253,6 +253,7 @@ def test_where_nothing_ever_happens_all_windows_are_measured(recording, table):
     assert validate(net, table, quiet) == validate(net, table, busy)
 
 
+@pytest.mark.slow
 def test_recordings_in_which_everything_falls_off_the_table_are_told(tmp_path, shapes):
     fallen = []
     for seed in range(13):

@@ -55,6 +55,7 @@ def compared(library, tmp_path_factory):
         yield asked, list(compare_videos(asked, FieldLibrary(None), library))
 
 
+@pytest.mark.slow
 def test_an_episode_is_predicted_by_all_methods(compared):
     asked, steps = compared
     assert [(step.done, step.total) for step in steps] == [(n, 5) for n in range(6)]
@@ -84,6 +85,7 @@ def test_pictures_show_the_first_episode(compared):
     assert (asked.folder / CHART_FILE).exists()
 
 
+@pytest.mark.slow
 def test_what_was_predicted_is_taken_over_method_by_method(compared, library, monkeypatch):
     asked, steps = compared
     measured, real = [], videos.simulate_video

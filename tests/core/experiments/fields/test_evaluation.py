@@ -44,6 +44,7 @@ def refuse(*_args, **_more):
     raise AssertionError("this was measured before")
 
 
+@pytest.mark.slow
 def test_the_report_has_every_object_and_means_over_them(evaluated, solids):
     _, steps = evaluated
     result = json.loads(json.dumps(steps[-1].report.to_json()))

@@ -44,6 +44,7 @@ def metrics(config: TrainField) -> dict:
     return json.loads(config.out.with_suffix(".json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["block", "ball"])
 def test_a_field_learns_shape_colour_and_light_from_images(shape, request, tmp_path):
     config = TrainField(
@@ -72,6 +73,7 @@ def test_a_field_learns_shape_colour_and_light_from_images(shape, request, tmp_p
     np.testing.assert_allclose(size, truth, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_field_without_light_learns_the_mean_over_lights(ball_set, tmp_path):
     lit, unlit = (
         TrainField(ball_set, tmp_path / f"{name}.safetensors", iterations=150, device="cpu", lit=name == "lit")
@@ -86,6 +88,7 @@ def test_a_field_without_light_learns_the_mean_over_lights(ball_set, tmp_path):
     np.testing.assert_allclose(seen[1], seen[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_field(block_set, tmp_path):
     outs = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):

@@ -86,6 +86,7 @@ def test_the_hull_of_a_cup_is_closed(cup):
     assert np.all(density_at(cup[1], INSIDE) > 0)
 
 
+@pytest.mark.slow
 def test_a_cup_is_opened_and_its_walls_stay(cup):
     images, hull = cup
     opened = open_hollows(hull, images, fog_g=-5.5)
@@ -94,6 +95,7 @@ def test_a_cup_is_opened_and_its_walls_stay(cup):
     assert np.all(density_at(opened, FLOOR) > 0)
 
 
+@pytest.mark.slow
 def test_descent_leaves_the_cup_open_and_clears_the_fog(cup):
     images, hull = cup
     opened = open_hollows(hull, images, fog_g=-5.5)

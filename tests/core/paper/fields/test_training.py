@@ -42,6 +42,7 @@ def test_teacher_distillation_and_fine_tuning_learn_a_block(block_set, tmp_path)
     np.testing.assert_allclose(size, np.ptp(painted_block().extent, axis=0), atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", ["teacher", "distil", "fine"])
 def test_a_killed_training_goes_on_where_it_was(block_set, tmp_path, kept):
     """A run that is left within a phase and begun again ends with the weights of an unbroken one."""

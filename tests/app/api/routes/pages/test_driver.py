@@ -5,6 +5,7 @@ from tests.app.api.test_problems import is_problem
 from tests.app.conftest import until
 
 
+@pytest.mark.slow
 def test_pages_come_take_over_and_go(live):
     assert live.request("GET", "/api/driver")[1] == {"driver": None, "visitors": 0}
     with Stream(live, "?visitor=one") as one:

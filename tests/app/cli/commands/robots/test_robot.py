@@ -86,6 +86,7 @@ def test_nobody_there_is_told(capsys):
     assert capsys.readouterr().err.startswith("osf: The robot at http://127.0.0.1:")
 
 
+@pytest.mark.slow
 def test_it_drives_within_its_limits_and_tells_what_it_knows(robot, tmp_path, capsys):
     before = robot[1].truth()
     assert drive(robot[0], tmp_path, "--yes", "--top-speed", "0.42", "--json") == 0

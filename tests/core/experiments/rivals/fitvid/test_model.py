@@ -135,6 +135,7 @@ def test_the_error_is_that_of_the_frames_and_latents_come_from_the_generator():
     assert 0 < float(first.squared_error.detach()) < 4  # four frames, each of a mean over pixels below 1
 
 
+@pytest.mark.slow
 def test_a_short_sequence_can_be_learned_better_than_by_copying():
     network = model(FitVidSettings(side=16, width=4, features=16, hidden=32, latent=2))
     videos = [scene(steps=4, seed=seed) for seed in range(2)]
