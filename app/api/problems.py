@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -76,6 +76,7 @@ STATUS_OF_KIND = {
     "NotFound": 404,
 }
 _MOST_POINTERS = 20  # mistakes that are told of one request
+_LONGEST_TOLD = 1e9  # numbers below this are repeated in a sentence
 _TITLES = {
     400: "Bad request",
     401: "Token needed",
@@ -171,14 +172,52 @@ async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
     assert isinstance(error, RequestValidationError)
     entries = error.errors()
     pointers = [_pointer(entry, error.body) for entry in entries[:_MOST_POINTERS]]
-    first = pointers[0] if pointers else ProblemPointer(pointer="#", detail="unreadable")
-    more = f" (and {len(entries) - 1} more)" if len(entries) > 1 else ""
-    return problem(422, f"{first.pointer or first.parameter}: {first.detail}{more}", pointers)
+    sentence = _sentence(entries[0]) if entries else "The request cannot be read."
+    more = f" There {'is one mistake' if len(entries) == 2 else f'are {len(entries) - 1} mistakes'} more."
+    return problem(422, sentence + (more if len(entries) > 1 else ""), pointers)
 
 
 async def _on_defect(request: Request, error: Exception) -> ProblemResponse:
     _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     return problem(500, f"The service failed on this request ({type(error).__name__}); its log tells more.")
+
+
+_MUST = {
+    "missing": "is missing",
+    "int_type": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "float_parsing": "must be a number",
+    "finite_number": "must be a finite number",
+    "greater_than_equal": "must be at least {ge}",
+    "greater_than": "must be more than {gt}",
+    "less_than_equal": "must be at most {le}",
+    "less_than": "must be less than {lt}",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "string_type": "must be a text",
+    "string_too_short": "must have at least {min_length} characters",
+    "string_too_long": "must have at most {max_length} characters",
+    "too_short": "must have at least {min_length} entries",
+    "too_long": "must have at most {max_length} entries",
+    "list_type": "must be a list",
+    "literal_error": "must be {expected}",
+    "extra_forbidden": "is not known here",
+}  # of the kinds of mistakes that pydantic tells
+
+
+def _sentence(entry: Mapping[str, Any]) -> str:
+    """What is wrong in a request, for a person; the value only where it is a number."""
+    *_, name = [str(part).replace("_", " ") for part in entry["loc"] if not isinstance(part, int)] or ["the request"]
+    subject = "The request" if name in ("body", "query") else name.capitalize()
+    must = _MUST.get(entry["type"])
+    if must is None:
+        return f"{subject} cannot be used: {str(entry['msg']).encode('utf-8', 'replace').decode('utf-8')}."
+    value = entry.get("input")
+    is_told = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LONGEST_TOLD
+    now = f" is {value:g}, but it" if is_told else ""
+    return f"{subject}{now} {must.format(**entry.get('ctx', {}))}."
 
 
 def _pointer(entry: dict[str, Any], body: object) -> ProblemPointer:

@@ -34,6 +34,7 @@ _OPEN_TIMEOUT_S = 5.0
 
 
 _LOOKS = ("hideViserLogo", "darkMode")  # what the page asks of viser's client
+_SCRIPTS = ("viewer-without-eval.js", "software-renderer.js")
 _VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
 
 
@@ -44,7 +45,7 @@ _VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
 def page(request: Request, services: ServicesDep) -> HTMLResponse:
     """The viewer's client, one file; below what a page calls itself, it is the view of that page.
 
-    A script of ours comes before its own, for browsers without a graphics card.
+    Scripts of ours come before its own: it makes functions from strings, and expects a graphics card.
 
     It obeys its address: `websocket` and `playbackPath` name where its messages come from, and messages may hold
     scripts. So nothing but looks and this service's own relay (viser writes it there) may be asked for.
@@ -53,8 +54,9 @@ def page(request: Request, services: ServicesDep) -> HTMLResponse:
         if name not in _LOOKS and not _is_own(name, value, request, services):
             raise HTTPException(400, f"The 3D view cannot be opened with {shown(name)!r}; open it from the page.")
     # no-cache, because a client of another version than the server is refused by it
-    script = f'<head><script src="{request.scope.get("root_path", "")}/js/software-renderer.js"></script>'
-    client = services.viewer.client_page.read_text("utf-8").replace("<head>", script, 1)
+    root = request.scope.get("root_path", "")
+    scripts = "".join(f'<script src="{root}/js/{name}"></script>' for name in _SCRIPTS)
+    client = services.viewer.client_page.read_text("utf-8").replace("<head>", f"<head>{scripts}", 1)
     return HTMLResponse(client, headers={"Cache-Control": "no-cache"})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from importlib.metadata import version
 from typing import Annotated, Any, Protocol
 
 import tyro
@@ -81,10 +82,12 @@ def main(arguments: list[str] | None = None) -> int:
     # Threads spin while they wait for each other; for long, that stalls a machine that has anything else to do.
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        print(f"osf {version('osf-manipulation')}")
+        return 0
+    description = "Rearrange real objects from a photo. 'osf --version' prints the version."
     try:
-        command: Command = tyro.cli(
-            Commands, prog="osf", args=arguments, description="Rearrange real objects from a photo."
-        )
+        command: Command = tyro.cli(Commands, prog="osf", args=arguments, description=description)
         result = command.run()
     except OsfError as error:
         print(f"osf: {error}", file=sys.stderr)

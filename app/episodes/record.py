@@ -89,7 +89,7 @@ class EpisodeRecord:
         self._image, self._photo = about.image, None
         self._steps: list[dict[str, Any]] = []
         self._notices: list[dict[str, Any]] = []
-        self._began = time.perf_counter()
+        self._seconds, self._since = 0.0, time.perf_counter()
         self._actions: list[list[float]] = []
         self._end: Finished | None = None
         self._start = table.truth()
@@ -110,6 +110,8 @@ class EpisodeRecord:
         Raises:
             CannotWrite: if the disk refuses.
         """
+        now = time.perf_counter()
+        self._seconds, self._since = self._seconds + now - self._since, now
         self._course.take(event, self._table)
         match event:
             case Observed():
@@ -131,6 +133,10 @@ class EpisodeRecord:
                 pass
         if isinstance(event, GoalFound | Noticed | Stepped | Finished):
             self._write()
+
+    def go_on(self) -> None:
+        """Leave out the time since the last event: the episode rested."""
+        self._since = time.perf_counter()
 
     def finish(self) -> dict[str, Any]:
         """Write the video, and tell the report.
@@ -205,7 +211,7 @@ class EpisodeRecord:
             "outcome": None if end is None else end.outcome,
             "text": None if end is None else end.text,
             "steps_done": len(self._actions),
-            "seconds": round(time.perf_counter() - self._began, 2),
+            "seconds": round(self._seconds, 2),
             "seed": about.seed,
             "objects": list(self._start.names),
             "method": about.method,

@@ -317,8 +317,7 @@ class Episode:
                 return "reached", f"Everything is in its place, but on another side than in the goal: {names}."
             return "reached", f"The table looks like the goal{'' if self._number else ' already'}."
         if self._left() <= 0:
-            where = f"up to {100 * far.max():.1f} cm away and turned by up to {np.rad2deg(turned.max()):.0f}°"
-            return "out of steps", f"All {self._number} pushes are done; from their places objects are {where}."
+            return "out of steps", f"All {self._number} pushes are done, and not everything is in its place."
         return None
 
     def _stepped(self) -> Stepped:

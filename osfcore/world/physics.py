@@ -1,6 +1,6 @@
 """Rigid bodies on a table in PyBullet: one client per simulation, poses in, contacts and poses out.
 
-Only this file and `tiny.py` import pybullet. PyBullet's quaternions are (x, y, z, w): they are converted here.
+PyBullet's quaternions are (x, y, z, w): they are converted here.
 
 Friction: 0.5 on objects and 1.0 on the table are Bullet's own values for a body and for its plane, in force where a
 setup names none, as the paper's does; Bullet multiplies them, so 0.5 acts between object and table and 0.25 between
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pybullet
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from osfcore.geometry.poses import Pose, quaternion_from_matrix, rotate
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset
+from osfcore.world.bullet import pybullet
 
 TIME_STEP_S = 1 / 240
 SUBSTEPS = round(STEP_S / TIME_STEP_S)

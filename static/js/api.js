@@ -25,9 +25,7 @@ export class ApiError extends Error {
 /** The sentence of an answer that is an error. */
 export async function problemOf(answer) {
   try {
-    const problem = await answer.json();
-    const details = (problem.errors ?? []).map((e) => `${e.pointer ?? e.parameter ?? ""} ${e.detail}`.trim());
-    return [problem.detail, ...details].filter(Boolean).join(" ");
+    return (await answer.json()).detail || `The service answered ${answer.status}.`;
   } catch {
     return `The service answered ${answer.status}.`;
   }

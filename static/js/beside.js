@@ -8,7 +8,7 @@ import { byId, el } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { takeSettings } from "./episode-settings.js";
 import { LIVE } from "./jobs.js";
-import { NOT_KNOWN, farthest, offsets, parts } from "./run-summary.js";
+import { NOT_KNOWN, farthest, offsets, parts, roundAt } from "./run-summary.js";
 import { resetScene } from "./scenes.js";
 import { current, known, set } from "./state.js";
 import { scrollTo } from "./tabs.js";
@@ -22,7 +22,7 @@ const SETTINGS = {
 };
 let mine = null;
 let other = null;
-let at = 0; // the step that is on view
+let at = 0; // the round of mine that is on view
 let offeredFor = ""; // the episode for which the list was fetched
 
 const path = (id) => `episodes/${encodeURIComponent(id)}`;
@@ -71,14 +71,15 @@ function draw() {
   byId("beside-rows").replaceChildren(...rows().map(([label, values]) =>
     el("tr", {}, el("th", { textContent: label, scope: "row" }), ...values.map((value) => el("td", { textContent: value })))));
   byId("beside-name").textContent = other.name;
+  const actions = mine.steps[at]?.step ?? 0;
   for (const [id, episode] of [["beside-mine", mine], ["beside-other", other]]) {
-    const url = `api/${path(episode.id)}/frames/${Math.min(at, episode.steps.length - 1)}.png?part=now`;
+    const url = `api/${path(episode.id)}/frames/${roundAt(episode.steps, actions)}.png?part=now`;
     if (byId(id).getAttribute("src") !== url) byId(id).src = url;
   }
   const lines = [["this run", mine], [other.name, other]].map(([label, { steps }], i) => ({
     label, colour: COLOURS[i], values: steps.filter(offsets).map((step) => [step.step, farthest(step)]),
   }));
-  drawLines(byId("beside-chart"), lines, { unit: "mm", at, name: "Farthest object from its goal", none: NOT_KNOWN });
+  drawLines(byId("beside-chart"), lines, { unit: "mm", at: actions, name: "Farthest object from its goal", none: NOT_KNOWN });
   drawLegend(byId("beside-key"), lines);
 }
 

@@ -1,32 +1,33 @@
-// How an episode ended: before and after, what it came to in one line, what is missing, and what to do about it.
+// How an episode ended: goal, before and after, what it came to in one line, what is missing, and what to do about it.
 import { drawClip } from "./clip.js";
 import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
+import { reached } from "./episode-settings.js";
 import { LIVE } from "./jobs.js";
 import { NOT_KNOWN, length, offsets, summary } from "./run-summary.js";
 import { current, known, labelOf, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
 import { toast } from "./toasts.js";
 
-const NEAR_MM = 10; // further away than this, or turned by more, is what is told as missing
-const TURNED_DEG = 8.6;
 const MORE = 20;
 let shown = null;
 
 /** What is not as it should be, for each object. */
 function missing({ objects, steps }) {
   const last = steps.at(-1);
+  const near = reached() ?? { mm: 0, deg: 0 };
   return objects.flatMap((name) => {
     const far = offsets(last)?.[name] ?? 0; // what is not known is not told as missing
     const turned = last.to_goal_deg?.[name] ?? 0;
-    if (far <= NEAR_MM && turned <= TURNED_DEG) return [];
-    const parts = [far > NEAR_MM && `${length(far)} away`, turned > TURNED_DEG && `turned by ${turned.toFixed(0)}°`].filter(Boolean);
+    const parts = [far > near.mm && `${length(far)} away`, turned > near.deg && `turned by ${turned.toFixed(0)}°`].filter(Boolean);
+    if (!parts.length) return [];
     return [`${labelOf(name)} is still ${parts.join(" and ")}`];
   });
 }
 
 function why(episode) {
   if (episode.outcome === "refused") return "Nothing was moved, since the goal image is doubtful.";
+  if (episode.outcome === "reached") return "";
   if (!offsets(episode.steps.at(-1))) return `How far things are from their goals is ${NOT_KNOWN}.`;
   const left = missing(episode);
   if (!left.length) return "";
@@ -41,13 +42,20 @@ export function drawEnding(episode) {
   const isOver = !LIVE.has(episode.status) && episode.steps.length > 0;
   byId("ending").hidden = !isOver;
   if (!isOver) return;
-  const frame = (step) => `api/episodes/${encodeURIComponent(episode.id)}/frames/${step}.png?part=now`;
-  const [before, after] = [frame(0), frame(episode.steps.length - 1)];
-  if (byId("ending-before").getAttribute("src") !== before) byId("ending-before").src = before;
-  if (byId("ending-after").getAttribute("src") !== after) byId("ending-after").src = after;
+  const frame = (round, part) => `api/episodes/${encodeURIComponent(episode.id)}/frames/${round}.png?part=${part}`;
+  const last = episode.steps.length - 1;
+  for (const [id, url] of [["goal", frame(last, "goal")], ["before", frame(0, "now")], ["after", frame(last, "now")]]) {
+    const image = byId(`ending-${id}`);
+    if (image.getAttribute("src") === url) continue;
+    image.removeAttribute("src"); // else the picture of another episode stays until this one is there
+    image.src = url;
+  }
   byId("ending-sum").textContent = summary(episode);
   byId("ending-why").textContent = why(episode);
   byId("ending-why").hidden = !byId("ending-why").textContent;
+  const rule = reached();
+  byId("ending-rule").hidden = !rule || !offsets(episode.steps.at(-1));
+  if (rule) byId("ending-rule").textContent = `Reached means: each object within ${rule.mm.toFixed(0)} mm and ${rule.deg.toFixed(1)}° of its goal, as the cameras see it.`;
   drawClip(episode);
   byId("ending-next").hidden = !canGoOn(episode);
   byId("go-on-anyway").hidden = episode.outcome !== "refused";
@@ -63,10 +71,6 @@ function goOn(changes) {
 }
 
 export function setUpEnding() {
-  const after = byId("ending-pair").querySelector(".over");
-  const wipe = () => { after.style.clipPath = `inset(0 0 0 ${100 - byId("ending-at").value}%)`; };
-  byId("ending-at").addEventListener("input", wipe);
-  wipe();
   watch("scene", () => { if (shown) drawEnding(shown); });
   byId("more-pushes").addEventListener("click", () => goOn({ steps: MORE }));
   byId("go-on-anyway").addEventListener("click", () => goOn({ despite_doubts: true }));

@@ -134,6 +134,9 @@ function takeBack() {
   takeSettings(settings);
 }
 
+/** Within what an object has arrived: { mm, deg }; null before the service has told it. */
+export const reached = () => (offered ? { mm: offered.reached_mm, deg: offered.reached_deg } : null);
+
 export async function refreshSettings() {
   const answer = await tellFailure(() => get("settings"));
   if (!answer) return;

@@ -8,7 +8,7 @@ import { drawEnding } from "./ending.js";
 import { preload, setUpPictures, showFrame, standIn } from "./pictures.js";
 import { drawProgress, setUpProgress } from "./progress-charts.js";
 import { drawResults } from "./results.js";
-import { NOT_KNOWN, offsets } from "./run-summary.js";
+import { NOT_KNOWN, offsets, roundAt } from "./run-summary.js";
 import { current, inWords, known, labelOf, set, watch } from "./state.js";
 import { scrollTo } from "./tabs.js";
 import { Timeline } from "./timeline.js";
@@ -16,7 +16,7 @@ import { tellFailure, toast } from "./toasts.js";
 import { replay, showLive } from "./viewer.js";
 
 let shown = null; // the episode, as fetched last
-let wanted = null; // {id, step} to be fetched next; no step: stay where one is, at the end if there
+let wanted = null; // {id, step} to be fetched next, a step by its actions; none: stay where one is, at the end if there
 let isFetching = false;
 let closings = 0;
 let timeline = null;
@@ -29,7 +29,7 @@ const NOTE_MS = 300;
 const PREPARED = "What it found in table and photo was prepared with this example; from the first push on, all is live.";
 const PUBLISHED = "This is the method as published.";
 const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
-const frameUrl = (step) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${step}.png?part=all`;
+const frameUrl = (round) => `api/episodes/${encodeURIComponent(shown.id)}/frames/${round}.png?part=all`;
 const one = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
 
 /** How alike goal image and rendered estimate are. */
@@ -65,7 +65,7 @@ export function openEpisode(id, step) {
   return fetchWanted();
 }
 
-/** Puts a fetched episode on view, at a step or where one is. */
+/** Puts a fetched episode on view, after so many actions or where one is. */
 export function showEpisode(episode, step) {
   const isOther = shown?.id !== episode.id;
   const wasAtEnd = isOther || timeline.step >= timeline.last;
@@ -81,9 +81,10 @@ export function showEpisode(episode, step) {
   }
   drawHead(episode);
   const last = episode.steps.length - 1;
-  if (Number.isFinite(step) && last >= 0 && step > last) toast(`This episode has steps 0 to ${last}; showing the last one.`, "warning");
-  const at = Number.isFinite(step) ? Math.min(step, last) : wasAtEnd ? last : timeline.step;
-  timeline.set(last, at, episode.step_s);
+  const most = episode.steps.at(-1)?.step;
+  if (Number.isFinite(step) && step > most) toast(`This episode has steps 0 to ${most}; showing the last one.`, "warning");
+  const at = Number.isFinite(step) ? roundAt(episode.steps, step) : wasAtEnd ? last : timeline.step;
+  timeline.set(last, at, episode.step_s, episode.steps.map(({ step: actions }) => actions));
   drawEnding(episode);
   drawResults(episode, isOther);
   if (isOther) show3D(LIVE.has(episode.status) && !Number.isFinite(step) ? null : { at_s: timeline.at(at), plays: false, speed: 1 });
@@ -119,17 +120,20 @@ function drawHead(episode) {
   byId("noticed").hidden = episode.notices.length === 0;
   byId("notice-list").replaceChildren(...episode.notices.map((notice) => el(
     "li", {},
-    el("button", { type: "button", className: "plain", textContent: `Step ${notice.step}`, on: { click: () => timeline.go(notice.step) } }),
+    el("button", { type: "button", className: "plain", textContent: `Step ${notice.step}`, on: { click: () => goTo(notice.step) } }),
     el("span", { textContent: inWords(notice.text) }),
   )));
 }
+
+/** To the round that was over after so many actions. */
+const goTo = (actions) => timeline.go(roundAt(shown.steps, actions));
 
 /** Once the slider rests: browsers refuse an address that changes with each pixel. */
 function noteStep() {
   clearTimeout(noting);
   const { id } = shown;
   noting = setTimeout(() => {
-    if (shown?.id === id) note({ step: timeline.step < timeline.last ? timeline.step : null });
+    if (shown?.id === id) note({ step: timeline.step < timeline.last ? shownStep() : null });
   }, NOTE_MS);
 }
 
@@ -167,7 +171,7 @@ function drawStep(at) {
   drawProgress(shown, step ? step.step : -1);
   drawBeside(shown, at);
   if (!step) return;
-  showFrame(frameUrl(step.step));
+  showFrame(frameUrl(at));
   if (timeline.timer && at < timeline.last) preload(frameUrl(at + 1));
 }
 
@@ -207,8 +211,8 @@ export function dropShown(id) {
   if (shown?.id === id) closeShown();
 }
 
-/** The step that is on view, for links. */
-export const shownStep = () => timeline.step;
+/** The step that is on view, by its actions, for links. */
+export const shownStep = () => shown?.steps[timeline.step]?.step ?? 0;
 
 /** After the service was lost: what is on view may have gone on. */
 export function refreshShown() {
@@ -220,14 +224,14 @@ function travel({ episode, step }) {
   const at = step === undefined ? undefined : Number(step);
   if (!episode && shown && !LIVE.has(shown.status)) closeShown();
   else if (episode && shown?.id !== episode) openEpisode(episode, at);
-  else if (episode && Number.isInteger(at)) timeline.go(Math.min(at, timeline.last));
+  else if (episode && Number.isInteger(at)) goTo(at);
 }
 
 export function setUpEpisodeView() {
   onTravel(travel);
   setUpPictures();
   timeline = new Timeline(drawStep, show3D);
-  setUpProgress(() => timeline.last, (step) => timeline.go(step));
+  setUpProgress(() => shown?.steps.at(-1)?.step ?? 0, goTo);
   byId("close-shown").addEventListener("click", closeShown);
   watch("objects", () => {
     if (!shown) return;

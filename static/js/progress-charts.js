@@ -28,7 +28,7 @@ function times({ steps }) {
 /** How fast the rounds are against what they show: an action takes 0.2 s on the table. */
 function realTime(spent) {
   const seconds = spent.flatMap(({ values }) => values).reduce((sum, [, value]) => sum + value, 0);
-  return seconds ? `${((ACTION_S * spent[0].values.length) / seconds).toPrecision(2)} × real time` : "";
+  return seconds ? `${((ACTION_S * spent[0].values.at(-1)[0]) / seconds).toPrecision(2)} × real time` : "";
 }
 
 /** Draws all charts, with a mark at the step one looks at. */

@@ -167,6 +167,7 @@ async function uploadGoal() {
 }
 
 const start = () => act(byId("robot-start"), async () => {
+  if (!byId("robot-steps").reportValidity()) return;
   const asked = { goal: byId("robot-goal").value, names: chosenNames(), boxes: drawnBoxes(), settings: { steps: Number(byId("robot-steps").value) } };
   set("robot", await post("robot/episodes", asked));
   forgetBoxes();

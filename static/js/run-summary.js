@@ -7,10 +7,13 @@ export const offsets = (step) => step.truly_to_goal_mm ?? step.to_goal_mm;
 export const farthest = (step) => (offsets(step) ? Math.max(...Object.values(offsets(step))) : null);
 const cost = (step) => Number((1000 * step.image_cost).toPrecision(2));
 
+/** The last round that was over after so many actions; a round may have several. */
+export const roundAt = (steps, actions) => Math.max(steps.findLastIndex(({ step }) => step <= actions), 0);
+
 /** What it came to: [distance, pushes, time, light], "" for what is not known. */
-export function parts({ steps, done, started_at: started, finished_at: finished }) {
+export function parts({ steps, done, seconds: spent }) {
   const [first, last] = [steps[0], steps.at(-1)];
-  const seconds = started && finished ? `${((new Date(finished) - new Date(started)) / 1000).toFixed(0)} s` : "";
+  const seconds = Number.isFinite(spent) ? `${spent.toFixed(0)} s` : "";
   const light = first.light_off_deg === null || first.light_off_deg === undefined ? "" : `light found to ${first.light_off_deg.toFixed(1)}°`;
   const distance = offsets(last) ? `${length(farthest(first))} to ${length(farthest(last))}` : NOT_KNOWN;
   return [distance, `${done} ${done === 1 ? "push" : "pushes"}`, seconds, light];

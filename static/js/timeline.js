@@ -1,4 +1,4 @@
-// A slider over the steps of an episode, and a player that moves it: at the pace of the replay, in which pushes are
+// A slider over the rounds of an episode, and a player that moves it: at the pace of the replay, in which pushes are
 // as fast as they were and looks are short.
 import { byId } from "./dom.js";
 
@@ -12,6 +12,7 @@ export class Timeline {
     this.onMove = onMove;
     this.timer = 0;
     this.times = [0];
+    this.actions = [0];
     this.slider = byId("timeline");
     this.button = byId("timeline-play");
     this.slider.addEventListener("input", () => this.go(this.step));
@@ -37,8 +38,9 @@ export class Timeline {
     return this.times[Math.min(Math.max(step, 0), this.times.length - 1)] ?? 0;
   }
 
-  /** Steps 0 to `last`, where to be, and when each step is over [s]. */
-  set(last, step, times = []) {
+  /** Rounds 0 to `last`, where to be, when each is over [s], and after how many actions. */
+  set(last, step, times = [], actions = []) {
+    this.actions = actions;
     this.times = times.length > last ? times : Array.from({ length: Math.max(last, 0) + 1 }, (_, i) => STEP_S * i);
     this.slider.max = Math.max(last, 0);
     this.slider.disabled = this.button.disabled = last < 1;
@@ -93,8 +95,9 @@ export class Timeline {
 
   #tell(step) {
     this.slider.value = step;
-    byId("timeline-step").textContent = `${this.step} / ${this.last}`;
-    this.slider.setAttribute("aria-valuetext", `Step ${this.step} of ${this.last}`);
+    const [now, all] = [this.step, this.last].map((round) => this.actions[round] ?? round);
+    byId("timeline-step").textContent = `${now} / ${all}`;
+    this.slider.setAttribute("aria-valuetext", `Step ${now} of ${all}`);
     this.onStep(this.step);
   }
 }

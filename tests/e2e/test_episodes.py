@@ -270,6 +270,27 @@ def test_two_runs_are_compared_side_by_side_and_one_is_run_again(page, service):
     until(lambda: "beside=" not in page.url)
 
 
+def test_each_round_of_several_actions_has_its_own_picture(page, service):
+    scene = service.call("GET", "scenes")["current"]
+    objects = service.call("POST", f"scenes/{scene}/reset")["objects"]
+    poses = [{key: entry[key] for key in ("name", "position", "quaternion")} for entry in objects]
+    poses[0]["position"][0] += 0.2 if poses[0]["position"][0] < 0 else -0.2
+    order = {"scene": scene, "poses": poses, "settings": {**SHORT, "steps": 8, "replan_every": 4}}
+    episode = service.call("POST", "episodes", order)["id"]
+    until(lambda: service.episode()["status"] == "done", LONG_MS / 1000)
+    assert [step["step"] for step in service.call("GET", f"episodes/{episode}")["steps"]] == [0, 4, 8]
+    page.goto(f"{service.url}/?episode={episode}&step=4")
+    loaded = "img => img.complete && img.naturalWidth > 0 && new URL(img.src).pathname"
+    frames = f"/api/episodes/{episode}/frames"
+    until(lambda: page.eval_on_selector("#tiles img", loaded) == f"{frames}/1.png")
+    assert page.inner_text("#timeline-step") == "4 / 8"
+    page.press("#timeline", "ArrowRight")
+    until(lambda: page.eval_on_selector("#tiles img", loaded) == f"{frames}/2.png")
+    assert page.inner_text("#timeline-step") == "8 / 8"
+    for part, round_ in {"goal": 2, "before": 0, "after": 2}.items():
+        until(lambda: page.eval_on_selector(f"#ending-{part}", loaded) == f"{frames}/{round_}.png")  # noqa: B023
+
+
 def test_the_method_as_published_is_chosen_in_the_settings(page, service):
     ensure_goal(service)
     page.evaluate("document.getElementById('settings-card').open = true")

@@ -154,7 +154,7 @@ async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> As
 async def frame(
     services: ServicesDep,
     job: FoundDep,
-    step: Annotated[int, Path(**within(STEP), description="Number of the step, from 0.")],
+    step: Annotated[int, Path(**within(STEP), description="Which of `steps`, from 0; one may be several actions.")],
     part: Annotated[
         Part,
         Query(description="The goal image, the table then, the estimate as the goal camera would see it, how much "

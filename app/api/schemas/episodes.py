@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, Field
@@ -30,9 +31,7 @@ class SettingsIn(Input):
         description='"ours", or "paper": as published, which is slower and knows no goal poses; chosen before an '
         "episode, with a cost of images, a plan for each action, and no changes on the way.",
     )
-    steps: int | None = _between(
-        STEPS, "Actions at most, of 0.2 s each, counted anew after each disturbance."
-    )
+    steps: int | None = _between(STEPS, "Actions at most, of 0.2 s each, counted anew after each disturbance.")
     replan_every: int | None = _between(STEPS, "Actions executed of each plan.")
     cost: CostKind | None = Field(
         None, description='"pose" compares futures with where things are in the goal image, "image" rendered pixels.'
@@ -99,6 +98,8 @@ class EpisodeSettingsOut(BaseModel):
 
     defaults: SettingsOut
     published: SettingsOut = Field(description="Defaults of the method as published.")
+    reached_mm: float = Field(description="Objects as near as this to their goals, as estimated, have arrived [mm].")
+    reached_deg: float = Field(description="Likewise for how they are turned [deg].")
     bounds: SettingBounds
 
 
@@ -118,7 +119,13 @@ class ServiceSettings(BaseModel):
             temperature=list(TEMPERATURE),
         )
         ours, published = (SettingsOut(method=method, **defaults(method)) for method in METHODS)
-        return ServiceSettings(episode=EpisodeSettingsOut(defaults=ours, published=published, bounds=bounds))
+        rule = EpisodeSettings()
+        reached_mm, reached_deg = 1000 * rule.reached_m, math.degrees(rule.reached_rad)
+        return ServiceSettings(
+            episode=EpisodeSettingsOut(
+                defaults=ours, published=published, reached_mm=reached_mm, reached_deg=reached_deg, bounds=bounds
+            )
+        )
 
 
 class RenameIn(Input):
@@ -181,6 +188,7 @@ class EpisodeOut(BaseModel):
     outcome: Literal["reached", "out of steps", "refused"] | None
     text: str | None = Field(description="The outcome in a sentence.")
     notices: list[NoticeOut]
+    seconds: float | None = Field(description="Spent so far, without pauses [s]; null before the first look is over.")
     steps: list[EpisodeStepOut]
     step_s: list[float] = Field(description="When each step is over in the episode's replay, see /api/views [s].")
     files: list[str] = Field(description="Names to download from /api/episodes/{id}/files/{name}.")
@@ -221,6 +229,7 @@ class EpisodeOut(BaseModel):
             outcome=result.get("outcome"),
             text=result.get("text"),
             notices=[NoticeOut(**notice) for notice in report.get("noticed", ())],
+            seconds=report.get("seconds"),
             steps=[EpisodeStepOut.model_validate(step) for step in report.get("steps", ())],
             step_s=report.get("step_s", []),
             files=list(files),

@@ -88,13 +88,13 @@ class RunEpisode:
 
 
 def _show(out: Path, report: dict[str, Any]) -> None:
+    from app.episodes.clip.layout import length_text
+
     print(f"{report['text']} {report['steps_done']} actions, {report['seconds']:.0f} s.")
     for notice in report["noticed"]:
         print(f"  step {notice['step']}: {notice['text']}")
     if "score" in report:
-        score = report["score"]
-        print(
-            f"In truth, {', '.join(report['moved'])} had to move and ended {score['moved_mm']:.1f} mm and "
-            f"{score['moved_deg']:.0f} deg from the goal; the others went {score['others_mm']:.1f} mm."
-        )
+        worst = max(report["score"]["objects"], key=lambda one: one["mm"])
+        where = f"{length_text(worst['mm'] / 1000)} and {worst['deg']:.0f} deg from its goal"
+        print(f"In truth, {', '.join(report['moved'])} had to move; {worst['name']} ended farthest off, {where}.")
     print(f"Report, frames, video and recording: {out}")

@@ -16,11 +16,11 @@ class Render:
     """Render a scene with neural fields: relit, with shadows, without any mesh."""
 
     scene: Path
-    """scene.json with objects, light, pusher and cameras."""
+    """scene.json with objects, light, pusher and perhaps cameras, or the state.json of an estimate."""
     out: Path
     """PNG to write."""
     camera: str = "0"
-    """Name of one of the scene's cameras."""
+    """Name of one of the scene's cameras; of 0 to 3 and goal, the usual ones, if it has none."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What computes; auto takes a GPU where there is one."""
     data_dir: Path = field(default_factory=default_data_dir)
@@ -32,6 +32,7 @@ class Render:
         """Render with two by two rays a pixel; the result tells the file and its size."""
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
+        from osfcore.geometry.cameras import default_cameras, goal_camera
         from osfcore.io.image_file import write_png
         from osfcore.io.output_paths import check_place
         from osfcore.io.scene_file import read_scene
@@ -42,9 +43,9 @@ class Render:
             raise InvalidInput("output file", self.out, "a path that ends in .png")
         check_place(self.out)
         scene = read_scene(self.scene)
-        cameras = {camera.name: camera for camera in scene.cameras}
+        cameras = {camera.name: camera for camera in scene.cameras or (*default_cameras(), goal_camera())}
         if self.camera not in cameras:
-            raise InvalidInput("camera", self.camera, f"one of the scene's: {', '.join(cameras) or 'it has none'}")
+            raise InvalidInput("camera", self.camera, f"one of {', '.join(cameras)}")
         library = FieldLibrary(self.data_dir)
         fields = {name: library.load(name) for name in scene.state.names}
         renderer = SceneRenderer(fields, library.load_table(), device=str(pick_device(self.device)))

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -48,11 +49,14 @@ class ClipFacts:
         is_reached: whether the goal was.
         verdict: how it ended, a sentence.
         seconds: that it took; None if unknown.
+        far_m: distance of the farthest object from its goal after each action, as the report has it [m]; by the
+            trajectory and its goal if None.
     """
 
     is_reached: bool
     verdict: str
     seconds: float | None = None
+    far_m: Float[np.ndarray, "A"] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +91,19 @@ def clip_of(folder: Path, library: AssetLibrary, path: Path, executor: Executor 
     photo = folder / GOAL_FILE
     goal = _photo(photo) if photo.is_file() else _rendered(trajectory, meshes)
     outcome = report.get("outcome")
-    facts = ClipFacts(outcome == "reached", str(report.get("text") or "It was ended early."), report.get("seconds"))
+    verdict = str(report.get("text") or "It was ended early.")
+    far_m = _far_by_report(report, len(trajectory.states))
+    facts = ClipFacts(outcome == "reached", verdict, report.get("seconds"), far_m)
     yield from write_clip(path, trajectory, goal, meshes, facts, executor)
+
+
+def _far_by_report(report: Mapping[str, Any], count: int) -> Float[np.ndarray, "A"] | None:
+    """Distance of the farthest object after each of so many states [m]; None where the report does not know it."""
+    known = [(step["step"], step.get("truly_to_goal_mm") or step["to_goal_mm"]) for step in report["steps"]]
+    if not known or not known[0][1]:
+        return None
+    numbers, far = zip(*((number, max(offsets.values())) for number, offsets in known), strict=True)
+    return np.interp(np.arange(count), numbers, far) / 1000
 
 
 def _photo(path: Path) -> UInt8[np.ndarray, "h w 3"]:
@@ -215,6 +230,8 @@ class _Film:
         return np.linalg.norm((poses.position - goal.position)[:, :2], axis=1)
 
     def _far_m(self) -> Float[np.ndarray, "A"]:
+        if self._facts.far_m is not None:
+            return self._facts.far_m
         return np.array([self._distances(state.poses).max(initial=0.0) for state in self._trajectory.states])
 
     def _headline(self) -> str:

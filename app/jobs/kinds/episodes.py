@@ -124,6 +124,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         progress = replace(then, share=share, left_s=round(left_s, 1))
         yield progress
         timer.go_on()  # not before a pause is over
+        record.go_on()
     yield replace(progress, note="Writing video and recording", view=None)
     record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pybullet
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset, TexturedMesh
+from osfcore.world.bullet import pybullet
 from osfcore.world.imaging.optics import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp
 from osfcore.world.imaging.ray_tracer import Picture
 from osfcore.world.pusher_body import pusher_mesh

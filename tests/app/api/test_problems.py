@@ -69,6 +69,24 @@ def test_hostile_json_is_never_a_defect(service, body):
     assert answer.status_code in (400, 422)
 
 
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"count": "three"}, "whole number"),
+        ({"count": 99}, "99"),
+        ({"seed": 1.5}, "whole number"),
+        ({"poses": [{"name": "x", "quaternion": [1, 0, 0, 0]}]}, "missing"),
+        ({"sed": 1}, "Sed"),
+    ],
+)
+def test_what_is_wrong_with_a_request_is_a_sentence_of_no_terms(service, body, words):
+    detail = is_problem(service.post("/api/scenes", json=body), 422)["detail"]
+    assert words in detail
+    assert not {"#", "/", "_"} & set(detail)
+    assert detail[0].isupper()
+    assert detail.endswith(".")
+
+
 def test_pointers_name_what_is_wrong(service):
     body = {"count": 99, "poses": [{"name": "x", "position": [0, 0], "quaternion": [1, 0, 0, 0]}]}
     errors = is_problem(service.post("/api/scenes", json=body), 422)["errors"]

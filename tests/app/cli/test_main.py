@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
@@ -51,6 +52,16 @@ def test_threads_do_not_spin_for_long_while_they_wait_unless_told_to(monkeypatch
         main(["--help"])
     assert os.environ["GOMP_SPINCOUNT"] == "5"
     assert "usage" in capsys.readouterr().out
+
+
+def test_it_tells_its_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"osf {version('osf-manipulation')}\n"
+
+
+def test_the_simulator_is_loaded_without_a_word():
+    done = subprocess.run([sys.executable, "-c", "import osfcore.world.tabletop"], capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")
 
 
 def test_json_is_the_last_line_and_keys_are_stable(data_dir):

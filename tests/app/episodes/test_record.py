@@ -1,6 +1,7 @@
 import csv
 import gc
 import json
+import time
 from dataclasses import replace
 
 import cv2
@@ -150,6 +151,27 @@ def test_pictures_and_video_show_every_step(told, whole):
     video = cv2.VideoCapture(str(out / VIDEO_FILE))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3
     video.release()
+
+
+def test_each_round_has_one_frame_however_many_actions_it_has(told):
+    record = told.record(told.goal)
+    told.begin(record)
+    for actions in ((1, 2, 3, 4), (5, 6)):
+        for number in actions:
+            told.act(record, number)
+        told.step(record, actions[-1], {"estimate": 0.5})
+    report = told.end(record, 6)
+    assert [step["step"] for step in report["steps"]] == [0, 4, 6]
+    assert sorted(path.name for path in (told.out / FRAMES_FOLDER).iterdir()) == ["000.png", "001.png", "002.png"]
+
+
+def test_a_rest_is_not_counted_as_time(told):
+    record = told.record(told.goal)
+    told.begin(record)
+    before = json.loads((told.out / REPORT_FILE).read_text())["seconds"]
+    time.sleep(3.0)
+    record.go_on()
+    assert told.end(record)["seconds"] < before + 3.0
 
 
 def test_a_state_is_kept_for_the_start_and_every_action(told, whole):

@@ -113,7 +113,7 @@ def test_an_episode_toward_a_goal_image_names_it_even_when_it_has_gone(service, 
 )
 def test_mistakes_are_told(service, scene, body, status, words):
     before = service.get("/api/episodes").json()
-    assert words in is_problem(service.post("/api/episodes", json=body), status)["detail"]
+    assert words in str(is_problem(service.post("/api/episodes", json=body), status))
     assert service.get("/api/episodes").json() == before
 
 

@@ -97,7 +97,7 @@ def test_mistakes_are_told_in_one_sentence(service, body, words):
     answer = service.post("/api/predictions", json={"state": STATE, **body})
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
-    assert words in answer.json()["detail"]
+    assert words in answer.text
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
@@ -105,7 +105,7 @@ def test_no_number_but_finite_ones(service, number):
     text = json.dumps({"actions": [[[12345, 0, 0]]], "state": STATE}).replace("12345", number)
     answer = service.post("/api/predictions", content=text, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422
-    assert "/actions/0/0/0" in answer.json()["detail"]
+    assert "/actions/0/0/0" in answer.text
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def test_what_is_at_a_bound_is_taken_and_what_is_beyond_is_refused_before_anythi
     assert SettingsIn.model_validate({name: whole(bound)}).given() == {name: bound}
     beyond = bound * 2 if end else bound / 2 if name == "temperature" else bound - 1
     answer = service.post("/api/episodes", json={"goal": "g", "settings": {name: whole(beyond)}})
-    assert f"settings/{name}" in is_problem(answer, 422)["detail"]
+    assert f"settings/{name}" in is_problem(answer, 422)["errors"][0]["pointer"]
 
 
 def test_the_bounds_are_those_of_the_settings_themselves(service):

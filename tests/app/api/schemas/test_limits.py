@@ -166,4 +166,4 @@ def test_seeds_beyond_are_refused(service, seed):
         ("episodes", {"goal": "g", "seed": seed}),
         ("jobs", {"kind": "collect_table", "params": {"seed": seed}}),
     ):
-        assert "seed" in is_problem(service.post(f"/api/{path}", json=body), 422)["detail"]
+        assert "seed" in is_problem(service.post(f"/api/{path}", json=body), 422)["errors"][0]["pointer"]

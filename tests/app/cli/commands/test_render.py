@@ -36,9 +36,19 @@ def test_a_shipped_object_is_rendered_on_the_table(scene_file, tmp_path):
     assert 40 < yellow < 800  # a yellow bottle of about 9 x 17 px among grey wood
 
 
+@pytest.mark.parametrize("camera", ["0", "goal"])
+def test_a_scene_without_cameras_is_seen_by_the_usual_ones(scene_file, tmp_path, camera):
+    path = scene_file(MUSTARD)
+    content = json.loads(path.read_text())
+    del content["cameras"]
+    path.write_text(json.dumps({**content, "trusted": True}))
+    result = Render(path, tmp_path / "image.png", camera=camera, data_dir=tmp_path).run()
+    assert (result["width"], result["height"]) == (128, 128)
+
+
 def test_mistakes_are_told_in_words(scene_file, tmp_path):
     out = tmp_path / "image.png"
-    with pytest.raises(InvalidInput, match=r"camera.*one of the scene's: 0, 1, 2, 3"):
+    with pytest.raises(InvalidInput, match=r"camera.*0, 1, 2, 3"):
         Render(scene_file(MUSTARD), out, camera="9", data_dir=tmp_path).run()
     with pytest.raises(InvalidInput, match=r"ends in \.png"):
         Render(scene_file(MUSTARD), tmp_path / "image.jpg", data_dir=tmp_path).run()
