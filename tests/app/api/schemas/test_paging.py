@@ -49,7 +49,9 @@ def test_every_list_says_how_many_there_are_and_is_bounded(service, path, key):
     assert answer["total"] == len(answer[key])
     assert answer["next"] is None
     for limit in (0, 501):
-        assert is_problem(service.get(f"/api/{path}", params={"limit": limit}), 422)["errors"][0]["parameter"] == "limit"
+        assert (
+            is_problem(service.get(f"/api/{path}", params={"limit": limit}), 422)["errors"][0]["parameter"] == "limit"
+        )
 
 
 @pytest.mark.slow
