@@ -29,6 +29,8 @@ def test_a_story_tells_of_its_example_what_its_course_shows(preset):
     assert told["step_s"] == pytest.approx(ReplayClock(course).step_s, abs=1e-3)
     assert len(told["left_mm"]) == len(told["step_s"]) == len(course.rounds)
     assert told["pushes"] == len(course.states) - 1
+    assert told["outcome"] == "reached"
+    assert max(told["left_mm"][-1].values()) < 20
     prepared = prepared_from_json(json.loads(stories.prepared(preset.id).read_text()))
     assert prepared.first.estimate.state.names == prepared.goal.estimate.state.names == course.names
     assert prepared.first.estimate.trusted
