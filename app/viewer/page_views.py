@@ -18,6 +18,7 @@ import viser
 
 from app.episodes.trajectory import read_trajectory
 from app.processes.process_client import ProcessClient
+from app.viewer.nodes.atomic import atomic
 from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.panels.neural_panel import NeuralPanel
 from app.viewer.panels.panel import Panel
@@ -172,17 +173,22 @@ class PageViews(Panel):
                 page.is_due = False
         for name, page in due:
             try:
-                self._draw_page(page)
+                self._draw_at_once(page)
             except Exception as error:  # the views of others go on
                 if isinstance(error, OsfError):
                     _log.warning("a replay cannot go on: %s", error)
                 elif page.client is not None:  # else it has left in between
                     _log.exception("the view of page %s failed", name)
 
-    def _draw_page(self, page: _Page) -> None:
-        wish, client, now = page.wish, page.client, time.monotonic()
-        if client is None:
-            return
+    def _draw_at_once(self, page: _Page) -> None:
+        """Draw in one change, so that live table and replay are never seen together."""
+        client = page.client
+        if client is not None:
+            with atomic(client):
+                self._draw_page(page, client)
+
+    def _draw_page(self, page: _Page, client: viser.ClientHandle) -> None:
+        wish, now = page.wish, time.monotonic()
         if wish.replay is not None:
             self._draw_replay(page, wish.replay, client, now)
         elif page.nodes is not None:
@@ -197,9 +203,7 @@ class PageViews(Panel):
     def _draw_replay(self, page: _Page, wish: Replay, client: viser.ClientHandle, now: float) -> None:
         nodes = self._opened(page, wish, client)
         played_s = wish.speed * (now - page.since) if wish.plays else 0.0
-        with client.atomic():
-            nodes.at(wish.at_s + played_s)
-        client.flush()
+        nodes.at(wish.at_s + played_s)
         if wish.plays and wish.at_s + played_s < nodes.clock.length_s:
             with self._thread.changed:
                 page.is_due = True

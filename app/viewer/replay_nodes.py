@@ -8,7 +8,7 @@ from app.episodes.replay_clock import Moment, ReplayClock
 from app.episodes.trajectory import LookFrame, Round, Trajectory
 from app.viewer.nodes.episode_nodes import EpisodeNodes
 from app.viewer.nodes.estimate_nodes import TRACKED
-from app.viewer.nodes.scene_nodes import LIVE_NODES, SceneNodes
+from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes
 from osfcore.control.events import Looking
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.states import SceneState
@@ -72,9 +72,10 @@ class ReplayNodes:
 
     def remove(self) -> None:
         """Back to the live table."""
-        self._root.remove()
-        for node in self._hidden:
-            node.remove()
+        lamp = self._client.scene.get_handle_by_name(LAMP)
+        for node in (self._root, *self._hidden, lamp):
+            if node is not None:
+                node.remove()
 
     def _show_look(self, look: LookFrame | None) -> None:
         if look is None:

@@ -73,6 +73,15 @@
     });
   }
 
+  /**
+   * Messages of the service change nodes as soon as they come. Else the client takes them as it draws: what moves is in
+   * that picture, what comes and goes in the next one, so that old things stand on a new table for as long as a picture
+   * takes. That it does only while its tab is in view.
+   */
+  function takeMessagesBeforeDrawing() {
+    Object.defineProperty(document, "hidden", { get: () => true });
+  }
+
   /** The client's notice of this covers a corner of the table; what it warns of is seen to here. */
   function closeNotice() {
     const observer = new MutationObserver(() => {
@@ -90,5 +99,6 @@
   if (!SOFTWARE.test(rendererName())) return;
   dropSmoothing();
   limitFrames();
+  takeMessagesBeforeDrawing();
   closeNotice();
 })();

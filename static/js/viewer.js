@@ -1,6 +1,7 @@
 // The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
 import { VISITOR, put } from "./api.js";
 import { byId } from "./dom.js";
+import { isDriving } from "./driver.js";
 import { LIVE } from "./jobs.js";
 import { Newest } from "./newest.js";
 import { current, known, watch } from "./state.js";
@@ -94,8 +95,15 @@ export function setUpViewer(listener) {
       wish.ask();
     });
   }
-  byId("back-to-live").addEventListener("click", () => {
+  const backToLive = () => {
     onLive(); // first: what plays is stopped, and shown where it stopped
     showLive();
+  };
+  byId("back-to-live").addEventListener("click", backToLive);
+  let table;
+  watch("scene", (scene) => {
+    const isOther = table !== undefined && scene && scene.id !== table;
+    table = scene === undefined ? undefined : scene?.id ?? null;
+    if (isOther && isDriving() && !byId("replaying").hidden) backToLive(); // whoever chooses a table wants to see it
   });
 }

@@ -291,6 +291,19 @@ def test_each_round_of_several_actions_has_its_own_picture(page, service):
         until(lambda: page.eval_on_selector(f"#ending-{part}", loaded) == f"{frames}/{round_}.png")  # noqa: B023
 
 
+def test_whoever_chooses_another_table_sees_it_in_place_of_a_recorded_episode(page, service):
+    ensure_goal(service)
+    if not (episodes := service.call("GET", "episodes")["episodes"]):
+        goal = service.call("GET", "goals")["goals"][0]["id"]
+        episodes = [service.call("POST", "episodes", {"goal": goal, "settings": SHORT})]
+    until(lambda: service.episode()["status"] in ("done", "cancelled"), LONG_MS / 1000)
+    page.goto(f"{service.url}/?episode={episodes[0]['id']}")
+    page.wait_for_selector("#replaying:not([hidden])", timeout=WAIT_MS)
+    page.evaluate("document.getElementById('table-card').open = true")
+    page.click("#another-table", timeout=WAIT_MS)
+    page.wait_for_selector("#replaying", state="hidden", timeout=WAIT_MS)
+
+
 def test_the_method_as_published_is_chosen_in_the_settings(page, service):
     ensure_goal(service)
     page.evaluate("document.getElementById('settings-card').open = true")

@@ -26,9 +26,12 @@ from osfcore.objects.asset_library import AssetLibrary
 
 # Everything that is drawn of the live table, here and elsewhere; the room around it is not.
 LIVE_NODES = (
-    "/objects", "/names", "/handles", "/shadows", "/cameras", "/pusher", "/lamp", "/light", "/light_ray", "/light_name",
+    "/objects", "/names", "/handles", "/shadows", "/cameras", "/pusher", "/light", "/light_ray", "/light_name",
     "/light_handle", "/episode", "/estimate", "/push", "/goal",
 )  # fmt: skip
+# A browser's own lamp takes the place of the one for all, wherever its other nodes are: the table is dark while a lamp
+# that was hidden is put up again.
+LAMP = "/lamp"
 LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
 LABEL_GAP_M = 0.01
 _NUDGE = 1e-7  # viser sends nothing that is as it was
@@ -47,7 +50,7 @@ class SceneNodes:
             objects have no handles.
         on_light: called on viser's loop with light and client when the light was let go; None likewise.
         cameras: that are drawn.
-        root: below which everything is drawn.
+        root: below which everything but the lamp is drawn.
     """
 
     def __init__(
@@ -90,7 +93,7 @@ class SceneNodes:
     def begin(self, state: SceneState | None) -> None:
         """Begin with a state of any objects, or clear the table."""
         names = () if state is None else state.names
-        with self._lock:
+        with self._lock, atomic(self._server):  # what was on the table before is never seen on the new one
             for name in set(self._bodies) - set(names):
                 for nodes in (self._bodies, self._labels, self._gizmos):
                     if name in nodes:
@@ -212,7 +215,7 @@ class SceneNodes:
         start = (0.0, 0.0, 1.0)
         root = self._root
         # three.js divides by pi what Lambert's law does not
-        self._lamp = scene.add_light_directional(f"{root}/lamp", intensity=float(np.pi * DIFFUSE), position=start)
+        self._lamp = scene.add_light_directional(LAMP, intensity=float(np.pi * DIFFUSE), position=start)
         self._marker = LightMarker(scene, f"{root}/light", LIGHT_COLOUR)
         self._place_light(np.array(start))
         self._light_gizmo = None if self._on_light is None else self._add_light_handle(self._on_light, start)

@@ -73,10 +73,11 @@ def test_a_page_sees_an_episode_in_place_of_the_live_table_and_other_pages_do_no
         assert ask(live, "one", {"story": STORY, "at_s": 0.0})
         until(lambda: one.own(f"/replay/objects/{course.names[0]}"))
         assert one.hides("/objects")
-        assert one.hides("/lamp")
-        assert two.own("/replay") is two.own("/objects") is None
+        until(lambda: np.allclose(one.own("/lamp").position, course.states[0].light.position, atol=1e-5))
+        assert not one.hides("/lamp")
+        assert two.own("/replay") is two.own("/objects") is two.own("/lamp") is None
         ask(live, "one")
-        until(lambda: one.own("/replay") is None and one.own("/objects") is None)
+        until(lambda: one.own("/replay") is one.own("/objects") is one.own("/lamp") is None)
 
 
 @pytest.mark.parametrize("step", [0, 3, -1])
