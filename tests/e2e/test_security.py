@@ -13,7 +13,7 @@ pytestmark = pytest.mark.e2e
 WAIT_MS = 20_000
 SCRIPT = """() => {
   const script = document.createElement("script");
-  script.textContent = `setTimeout(() => { window.inline = "ran"; Function("window.fromString = 'ran'")(); })`;
+  script.textContent = `setTimeout(() => { window.inline = "ran"; eval("window.fromString = 'ran'"); })`;
   document.head.append(script);
 }"""
 CONNECT = """address => new Promise(done => {
