@@ -52,7 +52,7 @@ ROOMS = (
     "app.cli",
 )
 OWNERS = {  # who alone may import a package
-    "pybullet": ("osfcore.world.physics", "osfcore.world.imaging.tiny_renderer"),
+    "pybullet": ("osfcore.world.bullet",),
     "embreex": ("osfcore.world.imaging.traced_mesh",),
     "httpx2": ("osfcore.client.connection", "osfcore.robots.http_robot"),
     "cma": ("osfcore.estimation.search.cma_es",),

@@ -16,7 +16,7 @@ from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
 from osfcore.experiments.rearrangement.factors import EPISODE_FACTORS
 from osfcore.experiments.rearrangement.methods import TRUTHS, Variant
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
-from osfcore.paper.mppi import GaussianPlanSettings
+from osfcore.paper.mppi import STEPS, GaussianPlanSettings
 from osfcore.paper.stages import StageName
 from osfcore.planning.mppi import PlanSettings
 from osfcore.world.rearrangement_tasks import Family
@@ -64,7 +64,7 @@ class Scale:
     headline: int = 100
     counts: tuple[int, ...] = (2, 3, 4)
     objects: int = 3
-    settings: EpisodeSettings = field(default_factory=EpisodeSettings)
+    settings: EpisodeSettings = field(default_factory=lambda: EpisodeSettings(STEPS))
     published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
     foresight: ForesightSettings = field(default_factory=ForesightSettings)
     factors: tuple[str, ...] = EPISODE_FACTORS

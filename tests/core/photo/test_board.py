@@ -58,8 +58,8 @@ def test_camera_is_found_in_random_views():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("size", "count"), [(VGA, 200), ((1280, 960), 60)])
-def test_95_of_100_cameras_are_found_within_a_tenth_of_a_degree_and_a_millimetre(size, count):
+@pytest.mark.parametrize(("size", "count"), [(VGA, 40), ((1280, 960), 20)])
+def test_19_of_20_cameras_are_found_within_a_tenth_of_a_degree_and_a_millimetre(size, count):
     errors = board_errors(count, np.random.default_rng(1), size)
     found = np.isfinite(errors.rotation_rad)
     assert found.mean() > 0.98
@@ -69,7 +69,7 @@ def test_95_of_100_cameras_are_found_within_a_tenth_of_a_degree_and_a_millimetre
 
 @pytest.mark.slow
 def test_a_tag_of_8_cm_gives_the_camera_too():
-    errors = tag_errors(100, np.random.default_rng(1), VGA)
+    errors = tag_errors(40, np.random.default_rng(1), VGA)
     found = np.isfinite(errors.rotation_rad)
     assert found.mean() > 0.95
     assert np.percentile(np.rad2deg(errors.rotation_rad[found]), 95) < 0.3

@@ -72,7 +72,7 @@ def test_a_focal_length_that_is_a_little_off_is_not_taken_for_distortion():
 @pytest.mark.slow
 @pytest.mark.parametrize("radial", [-0.05, 0.1])
 def test_cameras_behind_lenses_are_found_several_times_better(radial):
-    bent, plain = (board_errors(15, np.random.default_rng(5), VGA, radial=k) for k in (radial, 0.0))
+    bent, plain = (board_errors(8, np.random.default_rng(5), VGA, radial=k) for k in (radial, 0.0))
     assert np.isfinite(bent.rotation_rad).mean() > 0.9
     assert np.rad2deg(np.nanmedian(bent.rotation_rad)) < 0.03
     assert np.nanmedian(bent.nearby_m) < 0.001

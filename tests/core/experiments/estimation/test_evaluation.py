@@ -158,7 +158,7 @@ def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library
 
 @pytest.mark.slow
 def test_an_executor_changes_no_estimate(solids, library, tmp_path):
-    config = quick(tmp_path / "alone", tasks=2, objects=1, names=SOLIDS[:1], size=32, parts=("first",))
+    config = quick(tmp_path / "alone", tasks=1, objects=1, names=SOLIDS[:1], size=32, parts=("first",))
     alone = last(evaluate_estimate(config, solids, library)).report
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
         shared = last(evaluate_estimate(replace(config, out=tmp_path / "shared"), solids, library, executor)).report

@@ -45,7 +45,7 @@ def test_an_unknown_focal_length_costs_distance():
 
 
 @pytest.mark.slow
-def test_95_of_100_cameras_of_unknown_focal_length_are_found_within_a_centimetre():
-    errors = board_errors(100, np.random.default_rng(3), VGA, is_focal_known=False)
+def test_19_of_20_cameras_of_unknown_focal_length_are_found_within_a_centimetre():
+    errors = board_errors(40, np.random.default_rng(3), VGA, is_focal_known=False)
     assert np.isfinite(errors.camera_m).mean() > 0.85
     assert np.nanpercentile(errors.camera_m, 95) < 0.01
