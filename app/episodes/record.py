@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -79,17 +79,23 @@ class EpisodeRecord:
         folder: for them.
         table: that the episode is about.
         about: what it was asked to be.
+        clock: tells the time [s].
 
+    Attributes:
+        seconds: that it took so far, as the report has them [s].
     """
 
-    def __init__(self, folder: Path, table: Table, about: About) -> None:
+    def __init__(
+        self, folder: Path, table: Table, about: About, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         self._folder, self._table, self._about = folder, table, about
         self._views: Float[np.ndarray, "V h w 3"] | None = None
         self._goal: GoalFound | None = None
         self._image, self._photo = about.image, None
         self._steps: list[dict[str, Any]] = []
         self._notices: list[dict[str, Any]] = []
-        self._seconds, self._since = 0.0, time.perf_counter()
+        self.seconds = self._seconds = 0.0
+        self._clock, self._since = clock, clock()
         self._actions: list[list[float]] = []
         self._end: Finished | None = None
         self._start = table.truth()
@@ -110,7 +116,7 @@ class EpisodeRecord:
         Raises:
             CannotWrite: if the disk refuses.
         """
-        now = time.perf_counter()
+        now = self._clock()
         self._seconds, self._since = self._seconds + now - self._since, now
         self._course.take(event, self._table)
         match event:
@@ -136,7 +142,7 @@ class EpisodeRecord:
 
     def go_on(self) -> None:
         """Leave out the time since the last event: the episode rested."""
-        self._since = time.perf_counter()
+        self._since = self._clock()
 
     def finish(self) -> dict[str, Any]:
         """Write the video, and tell the report.
@@ -149,6 +155,7 @@ class EpisodeRecord:
 
     def _write(self) -> dict[str, Any]:
         """Report and table so far: an episode that is broken off leaves what it has done."""
+        self.seconds = round(self._seconds, 2)
         report = self._report()
         write_json(self._folder / REPORT_FILE, report)
         write_trajectory(self._folder / TRAJECTORY_FILE, self._course.trajectory)
@@ -211,7 +218,7 @@ class EpisodeRecord:
             "outcome": None if end is None else end.outcome,
             "text": None if end is None else end.text,
             "steps_done": len(self._actions),
-            "seconds": round(self._seconds, 2),
+            "seconds": self.seconds,
             "seed": about.seed,
             "objects": list(self._start.names),
             "method": about.method,

@@ -6,6 +6,7 @@ import { doubted } from "./doubt.js";
 import { forDrivers } from "./driver.js";
 import { dropShown, openEpisode, outcomeOf, showEpisode } from "./episode-view.js";
 import { LIVE } from "./jobs.js";
+import { pushes, took } from "./run-summary.js";
 import { labelOf, watch } from "./state.js";
 import { act, tellFailure, toast } from "./toasts.js";
 
@@ -19,11 +20,9 @@ let older = null; // where the others begin
 let showsAll = false;
 let listed = ""; // the latest job's state when the list was fetched
 
-function tookText({ started_at: started, finished_at: finished, done, status }) {
-  if (LIVE.has(status)) return "";
-  const seconds = started && finished ? (new Date(finished) - new Date(started)) / 1000 : null;
-  const time = seconds === null ? "" : seconds < 90 ? ` in ${seconds.toFixed(0)} s` : ` in ${(seconds / 60).toFixed(1)} min`;
-  return `, ${done} ${done === 1 ? "push" : "pushes"}${time}`;
+function tookText(episode) {
+  if (LIVE.has(episode.status)) return "";
+  return `, ${[pushes(episode), took(episode)].filter(Boolean).join(" in ")}`;
 }
 
 /** The table before and after; of a few kilobytes each, and only once they come into view. */

@@ -10,13 +10,17 @@ const cost = (step) => Number((1000 * step.image_cost).toPrecision(2));
 /** The last round that was over after so many actions; a round may have several. */
 export const roundAt = (steps, actions) => Math.max(steps.findLastIndex(({ step }) => step <= actions), 0);
 
+export const pushes = ({ done }) => `${done} ${done === 1 ? "push" : "pushes"}`;
+/** "95 s", without pauses; "" where that is not known. */
+export const took = ({ seconds }) => (Number.isFinite(seconds) ? `${seconds.toFixed(0)} s` : "");
+
 /** What it came to: [distance, pushes, time, light], "" for what is not known. */
-export function parts({ steps, done, seconds: spent }) {
+export function parts(episode) {
+  const { steps } = episode;
   const [first, last] = [steps[0], steps.at(-1)];
-  const seconds = Number.isFinite(spent) ? `${spent.toFixed(0)} s` : "";
   const light = first.light_off_deg === null || first.light_off_deg === undefined ? "" : `light found to ${first.light_off_deg.toFixed(1)}°`;
   const distance = offsets(last) ? `${length(farthest(first))} to ${length(farthest(last))}` : NOT_KNOWN;
-  return [distance, `${done} ${done === 1 ? "push" : "pushes"}`, seconds, light];
+  return [distance, pushes(episode), took(episode), light];
 }
 
 /** "9.3 cm to 2 mm, 18 pushes, 95 s, light found to 0.2°"; the image cost where distances are not known. */

@@ -9,6 +9,7 @@ import { closeShown } from "./episode-view.js";
 import { takeGoal } from "./goals.js";
 import { LIVE } from "./jobs.js";
 import { refreshObjects } from "./objects.js";
+import { length } from "./run-summary.js";
 import { refreshScenes } from "./scenes.js";
 import { known, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
@@ -35,7 +36,6 @@ let isOn = false;
 const story = () => stories[number % stories.length];
 const speed = () => Math.max(story().step_s.at(-1) / LENGTH_S, 1);
 const farthest = (left) => Math.max(...Object.values(left));
-const distance = (mm) => (mm < 10 ? `${mm.toFixed(1)} mm` : `${(mm / 10).toFixed(1)} cm`);
 
 // Drawing
 
@@ -44,7 +44,7 @@ function stageAt(at, step) {
   if (at < goalLook) return "Four cameras look: which pose of each object, and which lamp, explain what they see?";
   if (at < times[0]) return `Lamp found to ${off.toFixed(1)}°. Now the photo: where should everything be?`;
   if (step < times.length - 1) return `Push ${step + 1} of ${pushes}: purple is the plan, golden is the goal, wires are what it believes`;
-  return `${distance(farthest(left[0]))} to ${distance(farthest(left.at(-1)))} in ${pushes} pushes; it took ${took.toFixed(0)} s on two CPU cores`;
+  return `${length(farthest(left[0]))} to ${length(farthest(left.at(-1)))} in ${pushes} pushes; it took ${took.toFixed(0)} s on two CPU cores`;
 }
 
 function drawCurve(at) {
@@ -60,7 +60,7 @@ function drawCurve(at) {
   });
   byId("story-curve").replaceChildren(svg("path", { d: `M0,${HEIGHT} H${WIDTH}`, class: "axis" }), ...lines);
   const now = left[Math.max(shown - 1, 0)];
-  drawLegend(byId("story-key"), objects.map((name, i) => ({ label: `${labelOf(name)} ${distance(now[name])}`, colour: COLOURS[i % COLOURS.length] })));
+  drawLegend(byId("story-key"), objects.map((name, i) => ({ label: `${labelOf(name)} ${length(now[name])}`, colour: COLOURS[i % COLOURS.length] })));
 }
 
 function draw(at) {

@@ -188,7 +188,7 @@ class EpisodeOut(BaseModel):
     outcome: Literal["reached", "out of steps", "refused"] | None
     text: str | None = Field(description="The outcome in a sentence.")
     notices: list[NoticeOut]
-    seconds: float | None = Field(description="Spent so far, without pauses [s]; null before the first look is over.")
+    seconds: float | None = Field(description="Spent so far, without pauses [s]; null before the first look.")
     steps: list[EpisodeStepOut]
     step_s: list[float] = Field(description="When each step is over in the episode's replay, see /api/views [s].")
     files: list[str] = Field(description="Names to download from /api/episodes/{id}/files/{name}.")
@@ -229,7 +229,7 @@ class EpisodeOut(BaseModel):
             outcome=result.get("outcome"),
             text=result.get("text"),
             notices=[NoticeOut(**notice) for notice in report.get("noticed", ())],
-            seconds=report.get("seconds"),
+            seconds=report.get("seconds", result.get("seconds")),
             steps=[EpisodeStepOut.model_validate(step) for step in report.get("steps", ())],
             step_s=report.get("step_s", []),
             files=list(files),

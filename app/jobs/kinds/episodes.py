@@ -50,6 +50,7 @@ class EpisodeProgress:
         left_s: time left, estimated [s]; None before it begins.
         stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
         steps: rounds whose results are in the report.
+        seconds: spent so far, without pauses [s]; None before the first look.
         outcome: how it ended; only at the end.
         text: the same in a sentence.
         view: what just happened, as a picture shows it.
@@ -62,6 +63,7 @@ class EpisodeProgress:
     left_s: float | None = None
     stage: str | None = None
     steps: int = 0
+    seconds: float | None = None
     outcome: str | None = None
     text: str | None = None
     view: Event | PlanSketch | None = None
@@ -121,7 +123,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         record.take(event)
         share, left_s = timer.take(event, progress.total or settings.steps)
         then = _progress_after(progress, pictures.drawn(event))
-        progress = replace(then, share=share, left_s=round(left_s, 1))
+        progress = replace(then, share=share, left_s=round(left_s, 1), seconds=record.seconds)
         yield progress
         timer.go_on()  # not before a pause is over
         record.go_on()

@@ -398,6 +398,9 @@ def test_an_episode_is_followed_to_its_end(service, services, done):
     now = services.runner.scene(scene["id"])
     assert now.time_s == pytest.approx(0.4)
     assert not np.array_equal(now.state.pusher, scene["pusher"]["position"])
+    listed = service.get("/api/episodes").json()["episodes"]
+    assert [one["seconds"] for one in listed if one["id"] == episode["id"]] == [episode["seconds"]]
+    assert episode["seconds"] > 0
     job = service.get(f"/api/jobs/{episode['id']}").json()
     assert (job["kind"], job["state"], job["result"]["steps"]) == ("episode", "done", 3)
     is_problem(service.delete(f"/api/episodes/{episode['id']}"), 409)

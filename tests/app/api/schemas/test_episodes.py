@@ -113,3 +113,8 @@ def test_steps_of_a_method_that_looks_at_images_alone_know_no_distances():
     out = EpisodeOut.of_job(job, "A", EpisodeSettings(), {"steps": [step]}, ())
     assert out.settings.method == "paper"
     assert (out.steps[0].to_goal_mm, out.steps[0].to_goal_deg) == (None, None)
+
+
+def test_the_time_that_it_took_is_told_with_and_without_its_steps():
+    job = Job("j", "episode", PARAMS, "done", result={"seconds": 31.25})
+    assert told(job).seconds == told(job, {**REPORT, "seconds": 31.25}).seconds == 31.25

@@ -126,11 +126,11 @@ def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
 
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     told = []
-    steps = [EpisodeProgress(1, 2, "Pushing", 0.5, 9.0, stage="act", steps=1)]
+    steps = [EpisodeProgress(1, 2, "Pushing", 0.5, 9.0, stage="act", steps=1, seconds=31.0)]
     monkeypatch.setitem(KINDS, "episode", lambda _params, _place: (step for step in steps))
     run_job(RunJob("episode", {}, place.data_dir, place.folder), JobControl(told.append), told.append)
     assert told[0].result == {
-        "share": 0.5, "left_s": 9.0, "stage": "act", "steps": 1, "outcome": None, "text": None,
+        "share": 0.5, "left_s": 9.0, "stage": "act", "steps": 1, "seconds": 31.0, "outcome": None, "text": None,
     }  # fmt: skip
 
 
@@ -214,6 +214,7 @@ def test_whoever_stops_it_leaves_its_steps_and_nothing_half_written(place, stage
         FRAMES_FOLDER,
     }
     assert len(report_of(place)["steps"]) == 2
+    assert step.seconds == report_of(place)["seconds"] > 0
 
 
 def test_settings_in_json_are_checked_like_any(stage):  # noqa: F811
