@@ -58,6 +58,18 @@ class ClipFacts:
     seconds: float | None = None
     far_m: Float[np.ndarray, "A"] | None = None
 
+    @staticmethod
+    def of_report(report: Mapping[str, Any], actions: int) -> ClipFacts:
+        """What a report tells of an episode of so many actions; distances between its steps are interpolated."""
+        steps = report.get("steps", ())
+        offsets = [step.get("truly_to_goal_mm") or step.get("to_goal_mm") for step in steps]
+        far_m = None
+        if offsets and all(offsets):
+            far_mm = [max(of.values()) for of in offsets]
+            far_m = np.interp(np.arange(actions + 1), [step["step"] for step in steps], far_mm) / 1000
+        verdict = str(report.get("text") or "It was ended early.")
+        return ClipFacts(report.get("outcome") == "reached", verdict, report.get("seconds"), far_m)
+
 
 @dataclass(frozen=True, slots=True)
 class ClipStep:
@@ -90,20 +102,8 @@ def clip_of(folder: Path, library: AssetLibrary, path: Path, executor: Executor 
     meshes = {name: TracedMesh(library.load(name).mesh) for name in trajectory.names}
     photo = folder / GOAL_FILE
     goal = _photo(photo) if photo.is_file() else _rendered(trajectory, meshes)
-    outcome = report.get("outcome")
-    verdict = str(report.get("text") or "It was ended early.")
-    far_m = _far_by_report(report, len(trajectory.states))
-    facts = ClipFacts(outcome == "reached", verdict, report.get("seconds"), far_m)
+    facts = ClipFacts.of_report(report, len(trajectory.states) - 1)
     yield from write_clip(path, trajectory, goal, meshes, facts, executor)
-
-
-def _far_by_report(report: Mapping[str, Any], count: int) -> Float[np.ndarray, "A"] | None:
-    """Distance of the farthest object after each of so many states [m]; None where the report does not know it."""
-    known = [(step["step"], step.get("truly_to_goal_mm") or step["to_goal_mm"]) for step in report["steps"]]
-    if not known or not known[0][1]:
-        return None
-    numbers, far = zip(*((number, max(offsets.values())) for number, offsets in known), strict=True)
-    return np.interp(np.arange(count), numbers, far) / 1000
 
 
 def _photo(path: Path) -> UInt8[np.ndarray, "h w 3"]:

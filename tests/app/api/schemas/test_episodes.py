@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -91,6 +92,11 @@ def test_the_defaults_are_those_of_an_episode_without_settings():
     assert defaults.method == "ours"
     assert nested(defaults.model_dump(exclude={"method"})) == nested({})
     assert defaults.model_dump()["steps"] == EpisodeSettings().steps
+
+
+def test_what_counts_as_reached_is_what_an_episode_goes_by():
+    told, rule = ServiceSettings.now().episode, EpisodeSettings()
+    assert (told.reached_mm, told.reached_deg) == pytest.approx((1000 * rule.reached_m, np.rad2deg(rule.reached_rad)))
 
 
 def test_the_method_as_published_has_defaults_of_its_own():

@@ -140,6 +140,19 @@ def test_the_card_tells_good_and_bad_news_in_different_colours():
     assert (good != bad).any()
 
 
+def test_distances_are_those_of_the_report():
+    steps = [
+        {"step": 0, "to_goal_mm": {"box": 61.0, "can": 2.0}, "truly_to_goal_mm": {"box": 60.0, "can": 1.0}},
+        {"step": 4, "to_goal_mm": {"box": 1.0, "can": 2.5}, "truly_to_goal_mm": {"box": 3.0, "can": 2.0}},
+    ]
+    facts = ClipFacts.of_report({"outcome": "reached", "text": "There.", "seconds": 31.5, "steps": steps}, 4)
+    assert (facts.is_reached, facts.verdict, facts.seconds) == (True, "There.", 31.5)
+    np.testing.assert_allclose(facts.far_m[[0, -1]], [0.060, 0.003])
+    assert len(facts.far_m) == 5
+    unknown = ClipFacts.of_report({"steps": [{"step": 0, "to_goal_mm": None}]}, 1)
+    assert (unknown.is_reached, unknown.verdict, unknown.far_m) == (False, "It was ended early.", None)
+
+
 @pytest.mark.parametrize(
     ("metres", "text"), [(0.0934, "9.3 cm"), (0.0021, "2.1 mm"), (0.0, "0.0 mm"), (0.01, "1.0 cm")]
 )
