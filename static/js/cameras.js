@@ -15,6 +15,19 @@ export class LatestImage {
     this.image = image;
     this.busy = false;
     this.next = null;
+    this.dropped = 0; // how often what was asked for was dropped
+  }
+
+  /** Lets nothing come that was asked for and is under way. */
+  drop() {
+    this.next = null;
+    this.dropped += 1;
+  }
+
+  /** Shows no image. */
+  clear() {
+    this.drop();
+    this.image.removeAttribute("src");
   }
 
   show(url) {
@@ -25,16 +38,14 @@ export class LatestImage {
   async #load() {
     this.busy = true;
     while (this.next) {
-      const url = this.next;
+      const { next: url, dropped } = this;
       this.next = null;
       const loader = new Image();
       loader.src = url;
-      try {
-        await loader.decode();
-        this.image.src = url;
-      } catch {
-        // A scene that was deleted meanwhile; the next one brings its own image.
-      }
+      const isThere = await loader.decode().then(() => true, () => false); // not that of a scene that was deleted meanwhile
+      if (dropped !== this.dropped) continue;
+      if (isThere) this.image.src = url;
+      else if (!this.next) this.image.removeAttribute("src"); // rather none than that of something else
     }
     this.busy = false;
   }
@@ -53,7 +64,7 @@ function url(scene, camera, size, { pusher = true } = {}) {
 function refresh(scene) {
   byId("camera-strip").querySelector(".of-goal").firstChild.nodeValue = labelOfTile("goal");
   for (const [name, tile] of tiles) {
-    if (!scene) tile.image.removeAttribute("src");
+    if (!scene) tile.latest.clear();
     else if (name === "goal" || showsMasks) tile.latest.show(url(scene, name, 128, { pusher: name !== "goal" }));
   }
   if (scene && largeCamera) large.show(url(scene, largeCamera, 512, { pusher: largeCamera !== "goal" }));
@@ -71,14 +82,18 @@ function enlarge(name) {
   largeCamera = name;
   byId("camera-dialog-title").textContent = labelOfTile(name);
   byId("camera-large").alt = byId("camera-dialog-title").textContent;
-  byId("camera-large").removeAttribute("src");
+  large.clear();
   refresh(scene);
   byId("camera-dialog").showModal();
 }
 
 export function showFrames({ scene, cameras }) {
   if (showsMasks || scene !== current()?.id) return;
-  for (const [name, data] of Object.entries(cameras)) if (tiles.has(name)) tiles.get(name).image.src = data;
+  for (const [name, data] of Object.entries(cameras)) {
+    const tile = tiles.get(name);
+    tile?.latest.drop(); // it is older
+    if (tile) tile.image.src = data;
+  }
 }
 
 export function toggleMasks(on = !showsMasks) {

@@ -48,7 +48,7 @@ function draw(draft) {
   byId("goal-choice").hidden = Boolean(draft);
   if (!draft) {
     pictured = "";
-    byId("draft-image").removeAttribute("src");
+    picture.clear();
     return;
   }
   if (isNew) {

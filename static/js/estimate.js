@@ -82,7 +82,7 @@ function begin(job) {
   drawKey(byId("loss-key"), job.params.names.map(labelOf));
   byId("estimate-camera").replaceChildren(...job.params.cameras.map((name, view) =>
     el("option", { value: view, textContent: /^\d+$/.test(name) ? `Camera ${name}` : name })));
-  byId("estimate-image").removeAttribute("src");
+  picture.clear();
   byId("estimate-images").hidden = byId("estimate-result").hidden = true;
 }
 

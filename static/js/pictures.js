@@ -18,6 +18,10 @@ const frame = new LatestImage({
     for (const image of all) image.src = url;
     byId("shown").classList.add("has-frame");
   },
+  removeAttribute(name) {
+    for (const image of all) image.removeAttribute(name);
+    byId("shown").classList.remove("has-frame");
+  },
 });
 
 /** A window onto one tile of the frame. */
@@ -47,8 +51,7 @@ export function preload(url) {
 
 /** Before the first frame: the goal image and what the goal camera sees. */
 export function standIn({ goal, now }) {
-  byId("shown").classList.remove("has-frame");
-  for (const image of all) image.removeAttribute("src");
+  frame.clear();
   for (const [part, url] of Object.entries({ goal, now })) {
     const image = alone.get(part);
     image.hidden = !url;

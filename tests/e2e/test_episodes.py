@@ -15,6 +15,13 @@ WAIT_MS = 20_000
 LOOKING = {"copy-scene", "estimate-camera", "more-jobs"}  # controls that change nothing
 LONG_MS = 300_000  # both looks take half a minute of an idle machine
 NAMES = ["005_tomato_soup_can", "006_mustard_bottle"]
+# Notes each change of the first picture, with the episode that is on view then.
+NOTE_PICTURES = """() => {
+  window.pictures = [];
+  const [image, shown] = ["#tiles img", "#shown"].map((selector) => document.querySelector(selector));
+  const note = () => window.pictures.push([shown.dataset.episode, image.getAttribute("src")]);
+  new MutationObserver(note).observe(image, { attributeFilter: ["src"] });
+}"""
 SHORT = {"steps": 3, "samples": 16, "horizon": 6}
 
 
@@ -291,13 +298,49 @@ def test_each_round_of_several_actions_has_its_own_picture(page, service):
         until(lambda: page.eval_on_selector(f"#ending-{part}", loaded) == f"{frames}/{round_}.png")  # noqa: B023
 
 
-def test_whoever_chooses_another_table_sees_it_in_place_of_a_recorded_episode(page, service):
+def show(page, episode):
+    page.click(f"#episode-list li[data-episode='{episode}'] button:text-is('Show')", timeout=WAIT_MS)
+    page.wait_for_selector(f"#shown[data-episode='{episode}']", timeout=WAIT_MS)
+
+
+def finished_episode(service):
+    """One that has pushed, the one that is there or a new one."""
+    episodes = service.call("GET", "episodes")["episodes"]
+    for episode in episodes:
+        if episode["status"] == "done":
+            return episode["id"]
     ensure_goal(service)
-    if not (episodes := service.call("GET", "episodes")["episodes"]):
-        goal = service.call("GET", "goals")["goals"][0]["id"]
-        episodes = [service.call("POST", "episodes", {"goal": goal, "settings": SHORT})]
-    until(lambda: service.episode()["status"] in ("done", "cancelled"), LONG_MS / 1000)
-    page.goto(f"{service.url}/?episode={episodes[0]['id']}")
+    goal = service.call("GET", "goals")["goals"][0]["id"]
+    episode = service.call("POST", "episodes", {"goal": goal, "settings": {**SHORT, "despite_doubts": True}})["id"]
+    until(lambda: service.episode()["status"] == "done", LONG_MS / 1000)
+    return episode
+
+
+def test_a_picture_that_comes_late_is_not_shown_with_another_episode(page, service):
+    earlier = finished_episode(service)
+    ensure_goal(service)
+    goal = service.call("GET", "goals")["goals"][0]["id"]
+    later = service.call("POST", "episodes", {"goal": goal, "settings": SHORT})["id"]
+    service.call("DELETE", f"episodes/{later}")
+    page.goto(f"{service.url}/?episode={later}")
+    page.evaluate(NOTE_PICTURES)
+    frames, held = f"**/episodes/{earlier}/frames/*.png?part=all", []
+    page.route(frames, lambda route: held.append(route))  # Playwright takes no built-in function
+    show(page, earlier)
+    until(lambda: page.wait_for_timeout(50) or held)
+    show(page, later)
+    with page.expect_request_finished(lambda request: f"{earlier}/frames" in request.url):
+        held.pop().continue_()
+    page.unroute(frames)
+    show(page, earlier)  # whose picture is loaded after the one that was late
+    until(lambda: page.eval_on_selector("#tiles img", "image => image.complete && image.naturalWidth > 0"))
+    pictures = page.evaluate("window.pictures")
+    assert [earlier, True] in [[at, bool(url)] for at, url in pictures]
+    assert [later, True] not in [[at, bool(url)] for at, url in pictures]
+
+
+def test_whoever_chooses_another_table_sees_it_in_place_of_a_recorded_episode(page, service):
+    page.goto(f"{service.url}/?episode={finished_episode(service)}")
     page.wait_for_selector("#replaying:not([hidden])", timeout=WAIT_MS)
     page.evaluate("document.getElementById('table-card').open = true")
     page.click("#another-table", timeout=WAIT_MS)
