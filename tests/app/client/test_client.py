@@ -203,7 +203,7 @@ def test_what_the_service_refuses_is_one_sentence(osf, live):
     with pytest.raises(ServiceError, match="There is no scene named") as unknown:
         osf.image(scene="none")
     assert unknown.value.status == 404
-    with Client(live.url) as plain, pytest.raises(ServiceError, match="steps"):
+    with Client(live.url) as plain, pytest.raises(ServiceError, match="Steps is 0"):
         plain.episode({BOX: Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))}, steps=0)
 
 

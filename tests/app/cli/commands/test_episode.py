@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from app.cli.main import main
+from app.episodes.clip.layout import length_text
 from app.episodes.headless import EpisodeStep
 
 BOX = "009_gelatin_box"
@@ -110,7 +111,8 @@ def test_people_are_told_in_sentences(ran, tmp_path, data_dir, monkeypatch, caps
     shown = capsys.readouterr().out
     assert shown.startswith(f"{ran.report['text']} 2 actions, ")
     assert "step 1: The lamp was moved." in shown
-    assert f"{BOX} had to move and ended {ran.report['score']['moved_mm']:.1f} mm" in shown
+    assert f"{BOX} had to move; {BOX} ended farthest off, " in shown
+    assert length_text(max(ran.report["steps"][-1]["truly_to_goal_mm"].values()) / 1000) in shown
     assert shown.endswith(f"{out}\n")
 
 
