@@ -216,7 +216,7 @@ def _sentence(entry: Mapping[str, Any]) -> str:
         return f"{subject} cannot be used: {str(entry['msg']).encode('utf-8', 'replace').decode('utf-8')}."
     value = entry.get("input")
     is_told = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LONGEST_TOLD
-    now = f" is {value:g}, but it" if is_told else ""
+    now = f" is {value:g}, but it" if is_told and must.startswith("must") else ""
     return f"{subject}{now} {must.format(**entry.get('ctx', {}))}."
 
 

@@ -104,6 +104,24 @@ def test_viewer_shows_the_scene(page):
     wait_until(lambda: pixels(page, "#viewer")[150:].std() > 20, 30)  # a table with objects, not one colour
 
 
+@pytest.mark.parametrize("number", ["", "0", "99", "1.5"])
+def test_a_number_that_cannot_be_is_told_where_it_stands_and_not_sent(page, service, number):
+    page.click("#tab-episode")
+    page.evaluate("document.getElementById('table-card').open = true")
+    posted = []
+    note = lambda request: posted.append(request.url) if request.method == "POST" else None  # noqa: E731
+    page.on("request", note)
+    page.fill("#table-count", number)
+    page.click("#another-table")
+    assert page.eval_on_selector("#table-count", "input => input.validationMessage")
+    page.fill("#table-count", "2")
+    before = service.scene()["id"]
+    page.click("#another-table")
+    wait_until(lambda: service.scene()["id"] != before)
+    page.remove_listener("request", note)
+    assert [url for url in posted if url.endswith("/scenes")] == [f"{service.url}/api/scenes"]
+
+
 def test_chosen_objects_make_the_scene(page, service):
     page.click("#tab-scenes")
     page.check('input[name="which"][value="chosen"]')
