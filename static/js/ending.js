@@ -19,7 +19,7 @@ function missing({ objects, steps }) {
   return objects.flatMap((name) => {
     const far = offsets(last)?.[name] ?? 0; // what is not known is not told as missing
     const turned = last.to_goal_deg?.[name] ?? 0;
-    const parts = [far > near.mm && `${length(far)} away`, turned > near.deg && `turned by ${turned.toFixed(0)}°`].filter(Boolean);
+    const parts = [far > near.mm && `${length(far)} away`, turned > near.deg && `turned by ${turned.toFixed(turned < 10 ? 1 : 0)}°`].filter(Boolean);
     if (!parts.length) return [];
     return [`${labelOf(name)} is still ${parts.join(" and ")}`];
   });

@@ -392,3 +392,27 @@ def test_distances_that_nobody_knows_are_told_so(page, service):
     assert page.inner_text("#ending-sum").startswith("image cost 20 to 10 · 10⁻³")
     assert "not known" in page.inner_text("#ending-why")
     assert page.is_hidden("#make-clip")
+
+
+def test_what_is_missing_is_told_by_the_rule_that_an_episode_goes_by(page, service):
+    ensure_goal(service)
+    goal = service.call("GET", "goals")["goals"][0]["id"]
+    episode = service.call("POST", "episodes", {"goal": goal, "settings": SHORT})
+    service.call("DELETE", f"episodes/{episode['id']}")
+    one, *others = episode["objects"]
+    steps = [
+        {
+            "step": n, "seconds": {"plan": 2.0}, "image_cost": 0.01, "estimate_off_mm": {},
+            "to_goal_mm": {one: 60.0 - 51 * n, **dict.fromkeys(others, 1.0)},
+            "to_goal_deg": {one: 3.488, **dict.fromkeys(others, 0.5)},
+        }
+        for n in range(2)
+    ]  # fmt: skip
+    report = service.data_dir / "collections" / episode["id"] / "report.json"
+    report.parent.mkdir(exist_ok=True)
+    report.write_text(json.dumps({"steps": steps, "seconds": 31.4, "outcome": "out of steps", "text": "No."}))
+    page.goto(f"{service.url}/?episode={episode['id']}")
+    page.wait_for_selector("#ending-rule:has-text('within 8 mm and 3.4°')", timeout=WAIT_MS)
+    assert page.inner_text("#ending-sum").startswith("6.0 cm to 9.0 mm, 0 pushes, 31 s")
+    label = next(o["label"] for o in service.call("GET", "objects")["objects"] if o["name"] == one)
+    assert page.inner_text("#ending-why") == f"{label} is still 9.0 mm away and turned by 3.5°."
