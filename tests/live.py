@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
@@ -108,3 +109,12 @@ def resident_mb(process: int) -> float:
     found = re.search(r"^Pss: +(\d+) kB", text, re.MULTILINE)  # in which shared pages count once in all
     assert found is not None
     return int(found[1]) / 1024 + sum(resident_mb(child) for child in children(process))
+
+
+@contextmanager
+def service_of(objects: Path) -> Iterator[str]:
+    """The address of a service with a data directory of its own, which goes with it, but the objects of a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "objects").symlink_to(objects.resolve())
+        with live_service(Path(folder)) as url:
+            yield url

@@ -5,7 +5,6 @@ python -m tests.bench.bench_episode [--data-dir DIR] [--seconds 90]
 
 import asyncio
 import json
-import tempfile
 import threading
 import time
 import urllib.request
@@ -18,7 +17,7 @@ import tyro
 from app.storage.paths import default_data_dir
 from tests.bench.bench_service import call, viewer_updates
 from tests.bench.machine import machine
-from tests.live import live_service
+from tests.live import service_of
 
 CLIENTS, LISTENERS, POLL_S = 20, 5, 0.5
 
@@ -54,29 +53,26 @@ def main() -> None:
     """Measure and print."""
     arguments = tyro.cli(Arguments)
     print(machine())
-    with tempfile.TemporaryDirectory() as folder:
-        data_dir = Path(folder)
-        (data_dir / "objects").symlink_to((arguments.data_dir / "objects").resolve())
-        with live_service(data_dir) as url:
-            made = call(f"{url}/api/presets/three", {})
-            asked = {"scene": made["scene"]["id"], "goal": made["goal"]["id"], "settings": {"despite_doubts": True}}
-            episode = call(f"{url}/api/episodes", asked)["id"]
-            stop, events, rate = threading.Event(), [], []
-            times: list[list[float]] = [[] for _ in range(CLIENTS)]
-            paths = [f"/api/episodes/{episode}", "/api/health"]
-            threads = [threading.Thread(target=poll, args=(url, paths, stop, own)) for own in times]
-            threads += [threading.Thread(target=listen, args=(url, stop, events)) for _ in range(LISTENERS)]
-            threads.append(
-                threading.Thread(target=lambda: rate.append(asyncio.run(viewer_updates(url, arguments.seconds))))
-            )
-            for thread in threads:
-                thread.start()
-            time.sleep(arguments.seconds)
-            stop.set()
-            for thread in threads:
-                thread.join()
-            with urllib.request.urlopen(f"{url}/api/episodes/{episode}") as answer:
-                after = json.load(answer)
+    with service_of(arguments.data_dir / "objects") as url:
+        made = call(f"{url}/api/presets/three", {})
+        asked = {"scene": made["scene"]["id"], "goal": made["goal"]["id"], "settings": {"despite_doubts": True}}
+        episode = call(f"{url}/api/episodes", asked)["id"]
+        stop, events, rate = threading.Event(), [], []
+        times: list[list[float]] = [[] for _ in range(CLIENTS)]
+        paths = [f"/api/episodes/{episode}", "/api/health"]
+        threads = [threading.Thread(target=poll, args=(url, paths, stop, own)) for own in times]
+        threads += [threading.Thread(target=listen, args=(url, stop, events)) for _ in range(LISTENERS)]
+        threads.append(
+            threading.Thread(target=lambda: rate.append(asyncio.run(viewer_updates(url, arguments.seconds))))
+        )
+        for thread in threads:
+            thread.start()
+        time.sleep(arguments.seconds)
+        stop.set()
+        for thread in threads:
+            thread.join()
+        with urllib.request.urlopen(f"{url}/api/episodes/{episode}") as answer:
+            after = json.load(answer)
     every = np.concatenate(times)
     print(f"{len(every)} requests of {CLIENTS} clients: median {np.median(every):.1f} ms, "
           f"p99 {np.quantile(every, 0.99):.1f} ms, most {every.max():.0f} ms")  # fmt: skip

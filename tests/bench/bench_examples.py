@@ -4,7 +4,6 @@ python -m tests.bench.bench_examples [--data-dir DIR] [--seeds 0 10] [--names fi
 """
 
 import json
-import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from app.services.examples.presets import PRESETS
 from app.storage.paths import default_data_dir
 from tests.bench.bench_service import call
 from tests.bench.machine import machine
-from tests.live import live_service
+from tests.live import service_of
 
 
 @dataclass(frozen=True)
@@ -46,22 +45,19 @@ def main() -> None:
     """Run them, and print a line for each and a summary."""
     arguments = tyro.cli(Arguments)
     print(machine())
-    with tempfile.TemporaryDirectory() as folder:
-        data_dir = Path(folder)
-        (data_dir / "objects").symlink_to((arguments.data_dir / "objects").resolve())
-        with live_service(data_dir) as url:
-            for name in arguments.names:
-                episodes = [run(url, name, seed) for seed in range(*arguments.seeds)]
-                pushes, seconds = ([one[key] for one in episodes] for key in ("done", "seconds"))
-                print(json.dumps({
-                    "example": name,
-                    "reached": sum(one["outcome"] == "reached" for one in episodes),
-                    "of": len(episodes),
-                    "pushes": pushes,
-                    "pushes_mean": float(np.mean(pushes)),
-                    "seconds": seconds,
-                    "seconds_mean": float(np.mean(seconds)),
-                }), flush=True)  # fmt: skip
+    with service_of(arguments.data_dir / "objects") as url:
+        for name in arguments.names:
+            episodes = [run(url, name, seed) for seed in range(*arguments.seeds)]
+            pushes, seconds = ([one[key] for one in episodes] for key in ("done", "seconds"))
+            print(json.dumps({
+                "example": name,
+                "reached": sum(one["outcome"] == "reached" for one in episodes),
+                "of": len(episodes),
+                "pushes": pushes,
+                "pushes_mean": float(np.mean(pushes)),
+                "seconds": seconds,
+                "seconds_mean": float(np.mean(seconds)),
+            }), flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ python -m tests.bench.bench_service [--data-dir DIR] [--seconds 20]
 
 import asyncio
 import json
-import tempfile
 import threading
 import time
 import urllib.request
@@ -19,7 +18,7 @@ from websockets.asyncio.client import connect
 
 from app.storage.paths import default_data_dir
 from tests.bench.machine import machine
-from tests.live import live_service
+from tests.live import service_of
 
 ACTIONS = [[0.2, 0.1, 0], [-0.2, 0.1, 0], [-0.2, -0.1, 0], [0.2, -0.1, 0]]
 
@@ -83,23 +82,20 @@ def main() -> None:
     """Measure and print."""
     arguments = tyro.cli(Arguments)
     print(machine())
-    with tempfile.TemporaryDirectory() as folder:
-        data_dir = Path(folder)
-        (data_dir / "objects").symlink_to((arguments.data_dir / "objects").resolve())
-        with live_service(data_dir) as url:
-            scene = call(f"{url}/api/scenes", {"count": 3, "seed": 1})["id"]
-            stop, actions, rate = threading.Event(), [], []
-            pusher = threading.Thread(target=push_on, args=(url, scene, stop, actions))
-            watcher = threading.Thread(target=lambda: rate.append(asyncio.run(viewer_updates(url, arguments.seconds))))
-            pusher.start()
-            watcher.start()
-            start = time.monotonic()
-            paths = ["/api/health", f"/api/scenes/{scene}", "/api/objects", "/api/jobs"]
-            measured = latencies(url, paths, arguments.seconds)
-            elapsed = time.monotonic() - start
-            stop.set()
-            pusher.join()
-            watcher.join()
+    with service_of(arguments.data_dir / "objects") as url:
+        scene = call(f"{url}/api/scenes", {"count": 3, "seed": 1})["id"]
+        stop, actions, rate = threading.Event(), [], []
+        pusher = threading.Thread(target=push_on, args=(url, scene, stop, actions))
+        watcher = threading.Thread(target=lambda: rate.append(asyncio.run(viewer_updates(url, arguments.seconds))))
+        pusher.start()
+        watcher.start()
+        start = time.monotonic()
+        paths = ["/api/health", f"/api/scenes/{scene}", "/api/objects", "/api/jobs"]
+        measured = latencies(url, paths, arguments.seconds)
+        elapsed = time.monotonic() - start
+        stop.set()
+        pusher.join()
+        watcher.join()
     every = np.concatenate(list(measured.values()))
     for path, values in measured.items():
         where = path.replace(scene, "ID")
