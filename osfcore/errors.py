@@ -84,6 +84,17 @@ class UnknownName(OsfError):
         super().__init__(f"There is no {kind} named {shown(repr(name))};{meant} known: {_listed(known)}.")
 
 
+class NotThere(UnknownName):
+    """Something known by an identifier, which says nothing to people; most often it was deleted meanwhile.
+
+    Args:
+        kind: what it would be, such as "scene".
+    """
+
+    def __init__(self, kind: str) -> None:
+        OsfError.__init__(self, f"There is no such {kind}; it may have been deleted.")
+
+
 class MissingAssets(OsfError):
     """Objects that the catalogue knows but whose meshes have not been fetched."""
 

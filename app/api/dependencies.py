@@ -34,7 +34,6 @@ from app.services.visitors.driver import Driver
 from app.services.visitors.look_outlines import Outliner
 from app.storage.database import Store
 from app.viewer import Viewer
-from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
 
@@ -60,7 +59,7 @@ class ObjectCatalogue:
                 self._names, self._seen_at = self._library.names(), time.monotonic()
                 for name in self._names:
                     if name not in self._labels:
-                        self._labels[name] = _label(self._library, name)
+                        self._labels[name] = self._library.label(name)
             return self._names
 
     def outdate(self) -> None:
@@ -73,13 +72,6 @@ class ObjectCatalogue:
         """Names for people, by name."""
         self.names()
         return self._labels
-
-
-def _label(library: AssetLibrary, name: str) -> str:
-    try:
-        return library.info(name).label
-    except OsfError:  # a damaged user's object still has its name
-        return name
 
 
 @dataclass(frozen=True)

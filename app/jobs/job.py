@@ -196,7 +196,7 @@ def check_file_name(job: Job, name: str) -> str:
         UnknownName: if it has none of this name.
     """
     if name not in job.files:
-        raise UnknownName(f"file of job {job.id}", name, job.files)
+        raise UnknownName("file of this job", name, job.files)
     return name
 
 

@@ -6,14 +6,13 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
 from app.storage.database import Store
 from app.storage.paths import without_places
-from osfcore.errors import UnknownName
+from osfcore.errors import NotThere
 
 _EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
 
@@ -96,8 +95,7 @@ class JobTable:
         """
         found = self._jobs.get(job)
         if found is None or kind not in (None, found.kind):
-            known = (other.id for other in reversed(list(self._jobs.values())) if kind in (None, other.kind))
-            raise UnknownName(kind or "job", job[:80], islice(known, 5))
+            raise NotThere(kind or "job")
         return self._told(found, self._waiting() if found.state == "queued" else [])
 
     def queue(self) -> list[Job]:

@@ -43,7 +43,7 @@ from app.processes.messages.scene_messages import (
 )
 from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.scene_pictures import image_png, mask_png, view_png
-from osfcore.errors import OsfError, UnknownName
+from osfcore.errors import NotThere, OsfError, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -179,7 +179,7 @@ class Simulation:
 
     def _record(self, scene: str) -> SceneRecord:
         if scene not in self._records:
-            raise UnknownName("scene", scene, self._records)
+            raise NotThere("scene")
         return self._records[scene]
 
     # Worlds

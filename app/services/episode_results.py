@@ -125,7 +125,7 @@ class EpisodeResults:
         """
         names = self.files(job)
         if name not in names:
-            raise UnknownName(f"file of episode {job.id}", name[:80], names)
+            raise UnknownName("file of this episode", name[:80], names)
         with self._making:
             return self._made(job, name)
 

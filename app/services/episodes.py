@@ -235,14 +235,15 @@ class Episodes(EpisodeResults):
             ended = (job.result or {}).get("outcome")
             if outcome not in (None, ended, job.state):
                 return False
-            text = " ".join((self.name(job), *map(self._label, job.params["names"]))).casefold() if words else ""
+            labels = map(self._runner.library.label, job.params["names"]) if words else ()
+            text = " ".join((self.name(job), *labels)).casefold()
             return all(word in text for word in words)
 
         return self._runner.jobs.page(limit, before, KIND, fits)
 
     def name(self, job: Job) -> str:
         """What people call an episode: its own name, or that of its objects in episodes of earlier versions."""
-        return job.params.get("title") or ", ".join(map(self._label, job.params["names"]))
+        return job.params.get("title") or ", ".join(map(self._runner.library.label, job.params["names"]))
 
     def rename(self, job: Job, name: str) -> Job:
         """Call an episode something else.
@@ -254,16 +255,10 @@ class Episodes(EpisodeResults):
             raise InvalidInput("name", "empty", "some letters")
         return self._runner.jobs.rename(job.id, name.strip())
 
-    def _label(self, name: str) -> str:
-        try:
-            return self._runner.library.info(name).label
-        except OsfError:  # removed since
-            return name
-
     def _new_name(self, asked: AskedEpisode, names: tuple[str, ...]) -> str:
         """That of the goal, or of the objects; with a number if there is one of that name already."""
         goal = None if asked.goal is None else self._goals.get(asked.goal)
-        name = ", ".join(map(self._label, names)) if goal is None else goal.name
+        name = ", ".join(map(self._runner.library.label, names)) if goal is None else goal.name
         taken = {self.name(job) for job in self._runner.jobs.page(_MOST_NAMES, None, KIND).jobs}
         numbered = itertools.chain([name], (f"{name} {n}" for n in itertools.count(2)))
         return next(one for one in numbered if one not in taken)

@@ -64,8 +64,8 @@ class NoPrior(OsfError):
 class NoImages(OsfError):
     """An estimate whose images are gone, or not there yet."""
 
-    def __init__(self, job: str, why: str) -> None:
-        super().__init__(f"Estimate {job} has no images to show; {why}.")
+    def __init__(self, why: str) -> None:
+        super().__init__(f"This estimate has no images to show; {why}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ class Estimates:
         if asked.prior is not None:
             job = self.get(asked.prior)
             if job.state != "done":
-                raise InvalidInput(f"status of estimate {job.id}", job.state, "done")
+                raise InvalidInput("status of the estimate to begin with", job.state, "done")
         elif scene is None:
             raise NoPrior(asked.mode, "in the archive (prior.json) or named in the request (prior)")
         else:
@@ -194,7 +194,9 @@ class Estimates:
                 raise NoPrior(asked.mode, "of this scene")
         prior = self._state(job)
         if set(prior.state.names) != set(names):
-            raise InvalidInput(f"objects of estimate {job.id}", ", ".join(prior.state.names), ", ".join(names))
+            raise InvalidInput(
+                "list of objects of the estimate to begin with", ", ".join(prior.state.names), ", ".join(names)
+            )
         return prior
 
     # Telling of one
@@ -254,14 +256,14 @@ class Estimates:
         camera, image = self._observed(job, view)
         steps = self.steps(job)
         if not steps:
-            raise NoImages(job.id, "its first step has not been made yet")
+            raise NoImages("its first step has not been made yet")
         if step is not None and not 1 <= step <= len(steps):
             raise UnknownName("step", str(step), [f"1 to {len(steps)}"])
         state = state_of_step(steps[-1 if step is None else step - 1])
         try:
             return CompareView(uuid.uuid4().hex, state, camera, image.read_bytes())
         except FileNotFoundError:
-            raise NoImages(job.id, "they have been removed from the data directory") from None
+            raise NoImages("they have been removed from the data directory") from None
 
     def _observed(self, job: Job, view: int) -> tuple[Camera, Path]:
         names = job.params["cameras"]
@@ -269,7 +271,7 @@ class Estimates:
             raise UnknownName("view", str(view), [str(number) for number in range(len(names))])
         folder = self._runner.jobs.inputs(job.id) / OBSERVATION
         if not folder.is_dir():
-            raise NoImages(job.id, f"it was {job.state}" if job.state == "cancelled" else f"it has {job.state}")
+            raise NoImages(f"it was {job.state}" if job.state == "cancelled" else f"it has {job.state}")
         observation = _observation(folder)
         return observation.cameras[view].camera(), folder / observation.images[names[view]]
 

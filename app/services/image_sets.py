@@ -21,7 +21,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.storage.database import CannotStore, now_utc
 from app.storage.uploads import Examiner, save
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, shown
+from osfcore.errors import CorruptFile, InvalidInput, NotThere, OsfError, shown
 from osfcore.io.files import put_in_place, read_json
 from osfcore.io.json_codec import Text, decode
 
@@ -117,7 +117,7 @@ class ImageSets:
         for record in self.all():
             if record.id == set_id:
                 return record
-        raise UnknownName("image set", set_id[:80], [record.id for record in self.all()])
+        raise NotThere("image set")
 
     def folder(self, set_id: str) -> Path:
         """The folder with train and test of a set that exists."""

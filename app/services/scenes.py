@@ -33,7 +33,7 @@ from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.scene_images import SceneImages
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore, Store, now_utc
-from osfcore.errors import InvalidInput, MissingAssets, OsfError, UnknownName
+from osfcore.errors import InvalidInput, MissingAssets, NotThere, OsfError
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -121,7 +121,7 @@ class Scenes:
         """One scene; raises UnknownName if there is none."""
         record = self._records.get(scene)
         if record is None:
-            raise UnknownName("scene", scene, tuple(self._records))
+            raise NotThere("scene")
         return record
 
     # Changing

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from app.storage.schema import CannotStore
-from osfcore.errors import CorruptFile, OsfError, UnknownName
+from osfcore.errors import CorruptFile, NotThere, OsfError
 from osfcore.io.files import put_in_place
 
 _TEMPORARY_PREFIX = ".new-"
@@ -82,7 +82,7 @@ class RecordFolders(Generic[Record]):
         for record in records:
             if record.id == name:
                 return record
-        raise UnknownName(self._what, name[:80], [record.id for record in records][:5])
+        raise NotThere(self._what)
 
     def remove(self, name: str) -> None:
         """Delete a record.

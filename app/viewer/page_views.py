@@ -115,7 +115,7 @@ class PageViews(Panel):
         self._library = library
         self._page_of = page_of
         self._live = live
-        self.neural = NeuralPanel(link, self.seen, fields, lambda name: library.info(name).label)
+        self.neural = NeuralPanel(link, self.seen, fields, library.label)
         self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, but for what is drawn
 
     def ask(self, page: str, wish: Wish) -> bool:

@@ -195,7 +195,8 @@ class Viewer:
             command()
         except OsfError as error:
             if client is not None:
-                sentence = without_places(str(error), self._runner.library.root.parent)
+                library = self._runner.library
+                sentence = library.in_words(without_places(str(error), library.root.parent))
                 client.add_notification("Not possible", sentence, color="orange", auto_close_seconds=6.0)
         except Exception:
             _log.exception("a command from the viewer failed")

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, MissingAssets, UnknownName
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, MissingAssets, OsfError, UnknownName
 from osfcore.io.files import sync, sync_tree
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
@@ -36,6 +36,7 @@ from osfcore.objects.download import raising_fetch_failed, remove_old
 FORMAT_VERSION = 1
 _FACTS, _ARRAYS, _TEXTURE, _VIEWER = "object.json", "arrays.npz", "texture.png", "viewer.glb"
 _TEMPORARY_PREFIX = ".writing-"
+_NAME = re.compile(r"(?=[\w.-]*[\d_])[\w.-]*\w")  # a whole word that no other word looks like
 _TEMPORARY_LIFE_S = 600  # far longer than one write takes; older ones were left by a killed process
 
 
@@ -84,6 +85,17 @@ class AssetLibrary:
         facts = self._known_facts(name)
         with self._as_corrupt(name):
             return decode(ObjectInfo, facts["info"], "info")
+
+    def label(self, name: str) -> str:
+        """What people call an object; its name where nothing else is known."""
+        try:
+            return self.info(name).label
+        except OsfError:  # removed meanwhile, or damaged
+            return name
+
+    def in_words(self, sentence: str) -> str:
+        """A sentence with what people call the objects in place of their names."""
+        return _NAME.sub(lambda word: self.label(word[0]), sentence)
 
     def source(self, name: str) -> str:
         """Where an object on this machine came from, as told to `write`."""

@@ -35,7 +35,7 @@ function entry(field) {
     el("span", { className: "state", textContent: quality }),
     el("span", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}` }),
     published(field),
-    field.has_mesh ? null : el("span", { className: "missing", textContent: "needs a mesh for scenes", title: field.note }),
+    field.has_mesh ? null : el("span", { className: "missing", textContent: "needs a mesh for scenes", title: inWords(field.note ?? "") }),
   );
   item.dataset.field = field.name;
   return item;

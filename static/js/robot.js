@@ -99,7 +99,7 @@ function drawDialog(now) {
   byId("robot-dialog-title").textContent = `Move the robot at ${now.host}?`;
   byId("robot-what").textContent = `Its pusher will push ${params.names.map(labelOf).join(", ")} until the table looks like “${params.title}”, in ${params.settings.steps} pushes at most.`;
   byId("robot-limits").textContent = `It stays ${limitsText(now)}.`;
-  byId("robot-doubts").replaceChildren(...(result?.doubts ?? []).map((text) => el("li", { textContent: text })));
+  byId("robot-doubts").replaceChildren(...(result?.doubts ?? []).map((text) => el("li", { textContent: inWords(text) })));
   if (!dialog.open) dialog.showModal();
 }
 

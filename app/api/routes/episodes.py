@@ -187,7 +187,7 @@ def file(
     """Download what an episode has left: report, table of steps, goal image, video, and a recording for the viewer."""
     with named_in_path():
         path = services.episodes.file(job, name)
-    gone = f"{name} of episode {job.id} has been removed from the data directory."
+    gone = f"{name} of this episode has been removed from the data directory."
     return OpenFile(path, gone, media_type=_MEDIA_TYPES[path.suffix], filename=name, disposition="inline")
 
 

@@ -148,7 +148,7 @@ async def image(
 
 
 def _observed(estimates: Estimates, job: Job, view: int) -> OpenFile:
-    gone = f"The images of estimate {job.id} have been removed from the data directory."
+    gone = "The images of this estimate have been removed from the data directory."
     return OpenFile(estimates.observed(job, view), gone, media_type="image/png")
 
 

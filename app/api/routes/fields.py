@@ -78,7 +78,7 @@ def overlay(services: ServicesDep, set_id: SetId) -> OpenFile:
     """Show how a set was understood: axes, light and the silhouettes' box, drawn into some of its images."""
     _found_set(services, set_id)
     path = services.runner.sets.overlay(set_id)
-    gone = f"The overlay of image set {set_id} has been removed from the data directory."
+    gone = "The overlay of this image set has been removed from the data directory."
     return OpenFile(path, gone, media_type="image/png")
 
 

@@ -180,7 +180,7 @@ def photo(services: ServicesDep, record: FoundDep) -> OpenFile:
 def image(services: ServicesDep, record: FoundDep) -> OpenFile:
     """Show a goal."""
     path = services.goals.image(record.id)
-    gone = f"The image of goal {record.id} has been removed from the data directory."
+    gone = "The image of this goal has been removed from the data directory."
     return OpenFile(path, gone, media_type="image/png")
 
 

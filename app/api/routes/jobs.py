@@ -81,7 +81,7 @@ def file(services: ServicesDep, job: JobId, name: FileName) -> OpenFile:
     known_job = _known_job(services, job)
     with named_in_path():
         path = services.runner.jobs.folder(job) / check_file_name(known_job, name)
-    gone = f"{name} of job {job} has been removed from the data directory."
+    gone = f"{name} of this job has been removed from the data directory."
     return OpenFile(path, gone, media_type="application/octet-stream", filename=name)
 
 
@@ -90,7 +90,7 @@ def preview(services: ServicesDep, job: JobId) -> OpenFile:
     """Show one unseen image of a field in training: the truth, the field's, and their difference times four."""
     _known_job(services, job)
     path = services.runner.jobs.folder(job) / PREVIEW
-    gone = f"Job {job} has no preview; training a field makes one, some seconds after it has begun."
+    gone = "This job has no preview; training a field makes one, some seconds after it has begun."
     return OpenFile(path, gone, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
@@ -104,5 +104,5 @@ def comparison(services: ServicesDep, job: JobId) -> OpenFile:
     """Show held-out images beside what the former and the new field make of them."""
     with named_in_path():
         folder = services.runner.jobs.folder(services.runner.jobs.get(job).id)
-    gone = f"Job {job} has compared nothing; training a field of which there was one already does, at its end."
+    gone = "This job has compared nothing; training a field of which there was one already does, at its end."
     return OpenFile(folder / COMPARISON, gone, media_type="image/png")

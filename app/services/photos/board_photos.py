@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Callable, Sequence
 
 from app.processes.messages.photo_messages import AssessCamera, PhotoAnswer, PhotoOrder, SightBoard
-from osfcore.errors import UnknownName
+from osfcore.errors import NotThere
 from osfcore.geometry.poses import Pose
 from osfcore.photo.calibration.calibrate import Calibration
 from osfcore.photo.calibration.sighting import Sighting
@@ -61,5 +61,5 @@ class BoardPhotos:
     def _sighting(self, identifier: str) -> Sighting:
         with self._lock:
             if identifier not in self._sightings:
-                raise UnknownName("photo of the board", identifier[:80], list(self._sightings)[-5:])
+                raise NotThere("photo of the board")
             return self._sightings[identifier]

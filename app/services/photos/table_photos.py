@@ -20,7 +20,7 @@ from app.services.photos.photo_looker import PhotoLooker
 from app.services.runner import Runner
 from app.storage.database import CannotStore, now_utc
 from app.storage.table_photos import PICTURE, STRAIGHT, MarkedObject, TablePhoto, TablePhotoStore, mask_file
-from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
+from osfcore.errors import InvalidInput, NotThere, OsfError, UnknownName, check_seed
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
@@ -296,7 +296,7 @@ class TablePhotos:
         try:
             return path.read_bytes()
         except FileNotFoundError:
-            raise UnknownName("photo", photo, [each.id for each in self.all()][:5]) from None
+            raise NotThere("photo") from None
 
     def _told(self, photo: TablePhoto) -> TablePhoto:
         self._runner.hub.publish(PhotosChanged())

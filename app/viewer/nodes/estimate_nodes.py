@@ -25,7 +25,6 @@ from app.viewer.nodes.ghosts import (
 from app.viewer.nodes.label_layout import Label, separated
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.scene_nodes import LIGHT_COLOUR
-from osfcore.errors import OsfError
 from osfcore.estimation.steps import UNPLACED_BELOW_M, EstimateStep
 from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
@@ -146,12 +145,6 @@ class EstimateNodes:
             for part, opacity in (("guess", _WIRES), (TRACKED, _FAINT_WIRES))
         )
 
-    def _label(self, name: str) -> str:
-        try:
-            return self._library.info(name).label
-        except OsfError:
-            return name
-
     def _copies(
         self, path: str, mesh: Mesh, count: int, colour: Colour = _TRIED, opacity: float = 0.2
     ) -> viser.BatchedMeshHandle:
@@ -216,7 +209,7 @@ class EstimateNodes:
             far_mm, turn_deg = 1000 * _SIGMAS * estimate.position_std[n], np.rad2deg(_SIGMAS * estimate.rotation_std[n])
             text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}° ({_SIGMAS:.0f}σ)"
             text = f"DOUBTFUL: {estimate.doubts[n]}" if estimate.doubts[n] else text
-            texts.append(text if name in standing else f"{self._label(name)}: {text}")
+            texts.append(text if name in standing else f"{self._library.label(name)}: {text}")
             anchors.append(pose.position + np.array([0, 0, top_m(self._meshes[name][0], pose.quaternion) + _LABEL_M]))
         places = separated(np.array(anchors).reshape(-1, 3), texts, tuple(standing.values()))
         self._verdicts += [

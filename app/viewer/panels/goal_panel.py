@@ -108,7 +108,7 @@ class GoalPanel(Panel):
                     self._copies[name] = _Copy(self._server.scene, self._library, name, self._let_go)
                 self._copies[name].place(pose)
                 self._copies[name].colour(WRONG if problem else GOAL)
-            self._words.text, self._words.visible = problem, bool(problem)
+            self._words.text, self._words.visible = self._library.in_words(problem), bool(problem)
 
     def _let_go(self, copy: _Copy, grip: int, pose: Pose, client: Client) -> None:
         """A copy was let go; where that is refused, it goes back. Called on viser's loop."""

@@ -5,7 +5,7 @@ What comes from browsers, the simulation and the process that predicts is only s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
@@ -154,7 +154,7 @@ class PushPanel(Panel):
 
     def _say(self, text: str) -> None:
         with self._thread.changed:
-            self._message = text
+            self._message = self._library.in_words(text)
             self._thread.wake()
 
     def _execute(self) -> None:
@@ -169,7 +169,7 @@ class PushPanel(Panel):
             done = self._act(prediction.record.id, list(prediction.actions))
             message = _EXECUTED if done.revision == prediction.last_revision else _CHANGED
         except OsfError as error:
-            message = str(error)
+            message = self._library.in_words(str(error))
             raise
         finally:
             with self._thread.changed:
@@ -248,7 +248,7 @@ class PushPanel(Panel):
             self._nodes.show_truth(prediction.truth)
         after = prediction.truth[-1] if prediction.is_executed else None
         rows = outcomes(prediction.record.state, prediction.rollouts, after, self._library)
-        self._report.content = report(rows, self._labels(prediction.rollouts.names))
+        self._report.content = report(rows, {name: self._library.label(name) for name in prediction.rollouts.names})
         self._report.visible = True
         moving = len(self._nodes.moving)
         text = f"{moving} object{'s' * (moving != 1)} will move" if moving else "Nothing will move"
@@ -259,15 +259,6 @@ class PushPanel(Panel):
             if self._prediction is prediction:  # else there is something newer to tell
                 self._message = message
             return self._message
-
-    def _labels(self, names: tuple[str, ...]) -> Mapping[str, str]:
-        labels = {}
-        for name in names:
-            try:
-                labels[name] = self._library.info(name).label
-            except OsfError:
-                labels[name] = name
-        return labels
 
 
 def _refuse(error: OsfError) -> None:

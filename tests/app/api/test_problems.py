@@ -87,6 +87,13 @@ def test_what_is_wrong_with_a_request_is_a_sentence_of_no_terms(service, body, w
     assert detail.endswith(".")
 
 
+@pytest.mark.parametrize("noun", ["scenes", "jobs", "episodes", "estimates", "goals", "photos", "fields/sets"])
+def test_what_is_not_there_is_told_without_its_identifier(service, noun):
+    detail = is_problem(service.get(f"/api/{noun}/3f2a9c01beef"), 404)["detail"]
+    assert "3f2a9c01beef" not in detail
+    assert detail.startswith("There is no such ")
+
+
 def test_pointers_name_what_is_wrong(service):
     body = {"count": 99, "poses": [{"name": "x", "position": [0, 0], "quaternion": [1, 0, 0, 0]}]}
     errors = is_problem(service.post("/api/scenes", json=body), 422)["errors"]

@@ -200,7 +200,7 @@ def test_what_the_service_refuses_is_one_sentence(osf, live):
     with pytest.raises(ServiceError, match=r"There is no object named 'teapot'; .*known:") as refused:
         osf.new_scene(["teapot"])
     assert refused.value.status == 422
-    with pytest.raises(ServiceError, match="There is no scene named") as unknown:
+    with pytest.raises(ServiceError, match="There is no such scene") as unknown:
         osf.image(scene="none")
     assert unknown.value.status == 404
     with Client(live.url) as plain, pytest.raises(ServiceError, match="Steps is 0"):

@@ -66,7 +66,7 @@ def test_commands_are_answered_and_refusals_told(link):
     assert made.state.names == ("003_cracker_box",)
     with pytest.raises(UnknownName, match="teapot"):
         create(link, "b", ("teapot",))
-    with pytest.raises(UnknownName, match="no scene"):
+    with pytest.raises(UnknownName, match="no such scene"):
         link.call(ResetScene("b"))
     assert link.status == "ready"
 

@@ -189,7 +189,7 @@ def test_of_an_image_of_something_else_the_truth_is_unknown(episodes, goals, oth
     [
         (AskedEpisode(), NoGoal, "needs a goal"),
         (AskedEpisode(goal="made", poses=POSES), NoGoal, "needs a goal"),
-        (AskedEpisode(goal="none"), UnknownName, "no goal named 'none'"),
+        (AskedEpisode(goal="none"), UnknownName, "no such goal"),
         (AskedEpisode(scene="t", goal="made"), UnknownName, "no scene named 't'"),
         (AskedEpisode(goal="made", seed=-1), InvalidInput, "seed"),
         (AskedEpisode(goal="made", settings={"steps": 0}), InvalidInput, "number of steps"),

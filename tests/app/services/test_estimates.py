@@ -166,7 +166,7 @@ def test_later_frames_and_goals_begin_with_the_latest_estimate_of_the_scene(esti
     first = estimates.of_scene(Asked())
     with pytest.raises(NoPrior):
         estimates.of_scene(Asked("goal"))  # it is not done
-    with pytest.raises(InvalidInput, match="status of estimate job0 is queued"):
+    with pytest.raises(InvalidInput, match="status of the estimate to begin with is queued"):
         estimates.of_scene(Asked("goal", prior=first.id))
     runner.jobs.finish(first)
     later = estimates.of_scene(Asked("next"))
@@ -179,7 +179,7 @@ def test_later_frames_and_goals_begin_with_the_latest_estimate_of_the_scene(esti
     with pytest.raises(UnknownName, match="no estimate named 'x'"):
         estimates.of_scene(Asked("next", prior="x"))
     runner.names = (MUSTARD,)
-    with pytest.raises(InvalidInput, match=f"objects of estimate job0 is {BOX}, {MUSTARD}"):
+    with pytest.raises(InvalidInput, match=f"objects of the estimate to begin with is {BOX}, {MUSTARD}"):
         estimates.of_scene(Asked("next"))
 
 

@@ -231,7 +231,7 @@ def test_a_job_is_not_queued_for_a_scene_that_was_deleted_meanwhile(open_runner)
     runner = open_runner(demo_scene=False)
     with runner.jobs.new_inputs() as folder:
         folder.mkdir(parents=True)
-        with pytest.raises(UnknownName, match="no scene named 'gone'"):
+        with pytest.raises(UnknownName, match="no such scene"):
             runner.submit_with_inputs("episode", {"scene": "gone"}, folder)
     assert runner.jobs.all() == ()
 

@@ -84,7 +84,7 @@ def test_a_goal_that_was_removed_is_gone_with_its_image(store, tmp_path):
     store.remove("a")
     assert left(tmp_path) == []
     for call in (store.get, store.remove):
-        with pytest.raises(UnknownName, match="no goal named 'a'"):
+        with pytest.raises(UnknownName, match="no such goal"):
             call("a")
 
 

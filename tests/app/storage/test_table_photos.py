@@ -62,7 +62,7 @@ def test_only_so_many_are_kept_and_one_may_go(store):
         store.keep(record("p3"), b"", b"")
     store.remove("p1")
     assert [photo.id for photo in store.all()] == ["p2"]
-    with pytest.raises(UnknownName, match="p1"):
+    with pytest.raises(UnknownName, match="no such photo"):
         store.get("p1")
 
 

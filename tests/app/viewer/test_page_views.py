@@ -176,7 +176,7 @@ def test_a_page_chooses_between_meshes_and_beliefs(live, shown):
         ({"at_s": 0.0}, 422, "an episode or a story"),
         ({"episode": "a", "story": "b"}, 422, "an episode or a story"),
         ({"story": "../presets"}, 404, "story"),
-        ({"episode": "nobody"}, 404, "nobody"),
+        ({"episode": "nobody"}, 404, "no such episode"),
         ({"story": STORY, "at_s": -1.0}, 422, "greater than or equal to 0"),
         ({"story": STORY, "speed": 0.0}, 422, "greater than or equal to 0.1"),
     ],

@@ -52,6 +52,12 @@ def test_what_is_written_comes_back(shelf, asset):
     assert shelf.names() == ("toy",)
 
 
+def test_sentences_are_told_with_what_people_call_the_objects(shelf):
+    said = "006_mustard_bottle and 003_cracker_box overlap by 4 mm, 0.5 cm from no_such_thing."
+    assert shelf.in_words(said) == "Mustard bottle and Cracker box overlap by 4 mm, 0.5 cm from no_such_thing."
+    assert (shelf.label("toy"), shelf.label("gone")) == (shelf.info("toy").label, "gone")
+
+
 def test_its_shape_comes_back_alone_even_without_its_texture(shelf, asset):
     (shelf.root / "toy" / "texture.png").unlink()
     shape = shelf.load_geometry("toy")

@@ -76,7 +76,7 @@ def test_what_shows_no_board_or_is_not_there_is_told(service, pictures):
     refuses(answer, 422, "wall.png cannot be used: ")
     refuses(service.post("/api/calibration/photos", content=b"a text", headers=ANY), 422, "no picture")
     refuses(service.post("/api/calibration/photos", json={}), 415, "photo")
-    refuses(service.post("/api/calibration", json={"photos": ["gone"]}), 422, "no photo of the board named 'gone'")
+    refuses(service.post("/api/calibration", json={"photos": ["gone"]}), 422, "no such photo of the board")
     refuses(service.post("/api/calibration", json={"photos": []}), 422, "number of photos of the board is 0")
     same = send(service, pictures[0][0], "one.png")["id"]
     refuses(service.post("/api/calibration", json={"photos": [same, same]}), 422, "it shows the same as one.png")

@@ -183,8 +183,8 @@ def test_images_of_different_sizes_are_refused(service, folder, tmp_path):
     [
         ({"json": {"mode": "third"}}, 422, "#/mode"),
         ({"json": {"mode": "first", "extra": 1}}, 422, "#/extra"),
-        ({"json": {"scene": "nowhere"}}, 422, "no scene named 'nowhere'"),
-        ({"json": {"mode": "next", "prior": "x"}}, 422, "no estimate named 'x'"),
+        ({"json": {"scene": "nowhere"}}, 422, "no such scene"),
+        ({"json": {"mode": "next", "prior": "x"}}, 422, "no such estimate"),
         ({"json": {}, "params": {"seed": 1}}, 422, "seed stands in the query"),
         ({"content": b"{", "headers": {"Content-Type": "application/json"}}, 422, "JSON"),
         ({"content": b"x", "headers": {"Content-Type": "text/plain"}}, 415, "application/zip for an observation"),

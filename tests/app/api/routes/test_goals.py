@@ -166,7 +166,7 @@ def test_a_camera_that_makes_no_sense_is_refused(service, camera):
         ({"json": {}}, 422, "either objects or random"),
         ({"json": {"random": {}, "objects": []}}, 422, "#/objects"),
         ({"json": {"random": {"moved": 3}}}, 422, "between 1 and 2"),
-        ({"json": {"random": {}, "scene": "nowhere"}}, 422, "nowhere"),
+        ({"json": {"random": {}, "scene": "nowhere"}}, 422, "no such scene"),
         ({"json": {"random": {}, "light": {"position": [1, 0, 0]}}}, 422, "light"),
         ({"content": b"{", "headers": {"Content-Type": "application/json"}}, 422, "JSON"),
         ({"content": b"0" * (5 << 20), "headers": {"Content-Type": "application/json"}}, 413, "larger"),

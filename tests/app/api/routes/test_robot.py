@@ -280,7 +280,7 @@ def test_the_end_of_the_service_stops_it(monkeypatch, library, tmp_path, robot):
     [
         ({"names": ["no such thing"]}, "no such thing"),
         ({"names": [NAMES[0], NAMES[0]]}, "each named once"),
-        ({"goal": "nothing"}, "nothing"),
+        ({"goal": "nothing"}, "no such goal"),
         ({"settings": {"steps": 0}}, ""),
     ],
 )

@@ -90,7 +90,7 @@ def test_a_photo_is_kept_with_what_its_file_tells(service):
     changed = service.patch(f"/api/photos/{photo['id']}", json={"focal_px": 100}).json()
     assert changed["focal_px"] == 100
     assert service.delete(f"/api/photos/{photo['id']}").status_code == 204
-    refuses(service.get(f"/api/photos/{photo['id']}"), 404, photo["id"])
+    refuses(service.get(f"/api/photos/{photo['id']}"), 404, "no such photo")
 
 
 def test_the_board_can_be_printed(service):

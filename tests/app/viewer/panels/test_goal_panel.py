@@ -56,7 +56,7 @@ class Room:
         if pose.position[0] > 1:
             raise OsfError("It would lie beside the table.")
         laid = {**dict(self.draft.poses), **dict(poses)}
-        problem = "The box and the can would overlap." if pose.position[0] > 0.5 else ""
+        problem = f"{BOX} and {CAN} would overlap." if pose.position[0] > 0.5 else ""
         self.set(Draft("s", tuple(laid.items()), problem, self.draft.revision + 1))
 
     def drop_draft(self):
@@ -145,7 +145,7 @@ def test_a_problem_is_told_in_red_until_it_is_gone(composing):
     composing.drag(BOX, (0.6, 0.0, 0.1))
     until(lambda: composing.colours() == {WRONG})
     assert composing.gui.shows("/goal/problem")
-    assert composing.gui.node("/goal/problem").text == "The box and the can would overlap."
+    assert composing.gui.node("/goal/problem").text == "Cracker box and Tomato soup can would overlap."
     composing.drag(BOX, (0.2, 0.0, 0.1))
     until(lambda: composing.colours() == {GOAL})
     until(lambda: not composing.gui.shows("/goal/problem"))
