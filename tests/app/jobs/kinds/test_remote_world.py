@@ -6,7 +6,7 @@ import pytest
 
 from app.jobs.kinds.remote_world import RemoteWorld
 from app.processes.messages.scene_messages import Act, ObserveScene, SceneRecord, TakeView
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import InvalidInput, NotThere, OsfError
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.io.observation_file import write_observation
 from osfcore.world.scene_request import SceneRequest
@@ -95,7 +95,7 @@ def test_a_photo_shows_what_any_camera_sees_with_the_pusher(remote, stage, size)
 
 def test_what_the_stage_refuses_is_told(tmp_path):
     def refuse(_):
-        raise UnknownName("scene", "s1", [])
+        raise NotThere("scene")
 
     remote = RemoteWorld(refuse, "s1", tmp_path)
     for call in (
@@ -104,7 +104,7 @@ def test_what_the_stage_refuses_is_told(tmp_path):
         lambda: remote.act(np.zeros(3)),
         lambda: remote.photo(goal_camera(SIDE)),
     ):
-        with pytest.raises(OsfError, match="no scene named 's1'"):
+        with pytest.raises(OsfError, match="no such scene"):
             call()
     assert list(tmp_path.iterdir()) == []
 
