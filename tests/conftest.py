@@ -14,6 +14,7 @@ import osfcore.objects
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.fetch import fetch
 from osfcore.objects.sources import FolderSource, WheelSource
+from tests.kernels import compile_kernels
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
 os.environ.setdefault("OSF_STANDBY", "0")  # a process in reserve would take time from tests that need none
@@ -23,6 +24,14 @@ settings.load_profile("untimed")
 
 CACHE = Path(__file__).parents[1] / ".cache"
 TEST_OBJECTS = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box", "035_power_drill")
+
+
+def pytest_sessionstart() -> None:
+    """Compile first where several processes share all the tests; one that runs a few compiles what it comes to."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker is not None:
+        CACHE.mkdir(exist_ok=True)
+        compile_kernels(CACHE, int(worker.removeprefix("gw")))
 
 
 def _objects_key() -> str:

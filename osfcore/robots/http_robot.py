@@ -57,7 +57,7 @@ class HttpRobot:
         InvalidInput: if what it says of itself is out of range.
     """
 
-    def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = 2.0) -> None:
+    def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = 5.0) -> None:
         self._url, self._names = url.rstrip("/"), names
         # Names of proxies in the environment are not for a robot beside the computer.
         self._http = httpx2.Client(timeout=timeout_s, trust_env=False)

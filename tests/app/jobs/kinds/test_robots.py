@@ -59,7 +59,9 @@ def test_it_waits_for_permission_and_then_does_its_steps(robot, tmp_path):
     job.told("asked")
     np.testing.assert_array_equal(robot[1].truth().pusher, before)
     job.control.take(ChangeJob({"allowed": True}))
-    assert job.end()["outcome"] == "out of steps"
+    ended = job.end()
+    assert isinstance(ended, dict), ended
+    assert ended["outcome"] == "out of steps"
     assert [step.done for step in job.steps][-1] == 2
     assert np.any(robot[1].truth().pusher != before)
     assert (tmp_path / "job" / "report.json").is_file()
