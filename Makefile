@@ -43,9 +43,9 @@ $(VENV)/.dev-installed: $(VENV)/.installed
 test: dev
 	$(BIN)/pytest -n 2 --dist loadfile
 
-# Shapes and types of arrays are checked on the way.
+# Shapes and types of arrays are checked on the way. The files with the slowest tests come first.
 test-all: dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile -p tests.typecheck -m 'not soak and not e2e'
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -p tests.typecheck -m 'not soak and not e2e'
 	$(BIN)/pytest -m e2e
 
 # Their packages stay in .cache, five gigabytes each where torch comes with CUDA; from then on 'make test-all' has the test, too.

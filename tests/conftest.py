@@ -34,6 +34,12 @@ def pytest_sessionstart() -> None:
         compile_kernels(CACHE, int(worker.removeprefix("gw")))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest: at the end, no process waits for another."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path.name != "test_readme.py", item.path not in slow))
+
+
 def _objects_key() -> str:
     """Changes when the conversion changes, so that stale objects are not used."""
     sources = [Path(osfcore.geometry.convex_parts.__file__), *sorted(Path(osfcore.objects.__path__[0]).glob("*.py"))]
