@@ -256,9 +256,9 @@ class PushPanel(Panel):
         if prediction.truth:
             message = _EXECUTED if prediction.is_executed else "Executing"
         with self._thread.changed:
-            if self._prediction is prediction:  # else there is something newer to tell
+            if self._prediction is prediction:  # else the next drawing tells what is newer, with its nodes
                 self._message = message
-            return self._message
+        return message
 
 
 def _refuse(error: OsfError) -> None:
