@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from osfcore.fields.field_weights import read_field
 from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
 from tests.live import live_service
 
@@ -54,6 +55,14 @@ def test_commands_run(data_dir, tmp_path):
             ["sh", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, f"{command}: {done.stderr[-500:]}"
+    assert json.loads((tmp_path / "table.json").read_text())["psnr"] > 20
+    for name in ("mustard", "gelatin"):
+        assert read_field(tmp_path / "fields" / f"{name}.safetensors").hidden > 0
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "Where episodes fail" in page
+    assert "A quick look and no measurement: 1 tasks a cell, 1 actions instead of 30" in page
+    (section,) = json.loads((tmp_path / "report" / "reproduction.json").read_text())["sections"]
+    assert all(cell["figures"]["steps_median"] <= 1 for cell in section["cells"])
 
 
 @pytest.fixture(scope="module")

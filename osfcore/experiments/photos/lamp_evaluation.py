@@ -36,7 +36,7 @@ class EvaluateLamps:
 
     Attributes:
         folder: for report.json.
-        tasks: scenes with a near lamp; a fourth as many have a distant one. Every other table is of wood.
+        tasks: scenes with a near lamp; a fourth as many, rounded up, have a distant one. Every other table is of wood.
         views: photographs of each scene.
         seed: of everything random.
     """
@@ -144,7 +144,7 @@ def evaluate_lamps(config: EvaluateLamps, library: AssetLibrary, fields: FieldLi
     check_ranges(("scenes", config.tasks, 1, _MOST_TASKS), ("photographs of each scene", config.views, 1, _MOST_VIEWS))
     names = sorted(set(fields.names()) & set(library.names()))
     models = PhotoModels({name: fields.load(name) for name in names})
-    cases = [(True, k) for k in range(config.tasks)] + [(False, k) for k in range(config.tasks // _FAR_EVERY)]
+    cases = [(True, k) for k in range(config.tasks)] + [(False, k) for k in range(-(-config.tasks // _FAR_EVERY))]
     scores: list[LampScore] = []
     for done, (is_near, number) in enumerate(cases):
         yield LampsStep(done, len(cases), f"A {'near' if is_near else 'distant'} lamp")

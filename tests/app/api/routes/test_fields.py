@@ -183,17 +183,3 @@ def test_damaged_sets_do_not_hide_the_list(service, services):
     )
     assert service.get("/api/fields/sets").status_code == 200
     shutil.rmtree(folder)
-
-
-@pytest.mark.slow
-def test_what_lies_in_the_data_directory_is_listed(service, services, archive):
-    made = upload(service, archive).json()
-    job = finished(service, train(service, "one", {"set": made["id"]}).headers["location"], 240)
-    assert job["state"] == "done"
-    fields = services.settings.data_dir / "fields"
-    shutil.copytree(fields / "one", fields / "two")
-    names = [field["name"] for field in service.get("/api/fields").json()["fields"]]
-    assert {"one", "two"} <= set(names)
-    for name in ("one", "two"):
-        service.delete(f"/api/fields/{name}")
-    service.delete(f"/api/fields/sets/{made['id']}")
