@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import multiprocessing
 import os
 import signal
@@ -50,15 +51,22 @@ def worker_pool(
 def _cluster(address: str, answers_within_s: float) -> Iterator[Executor]:
     try:
         from distributed import Client
+        from distributed.comm import connect
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise OsfError("--cluster needs Dask; 'pip install osf-manipulation[cluster]' brings it.") from None
+
+    async def check() -> None:
+        (await connect(address, timeout=answers_within_s)).abort()
+
     try:
-        client = Client(address, timeout=answers_within_s, set_as_default=False)
+        # Before there is a client: one that cannot connect waits for the collector, which closes it. Where that happens
+        # while another one starts, both wait for Dask's lock for ever.
+        asyncio.run(check())
     except (OSError, ValueError):
         allowed = "that of a running Dask scheduler, such as tcp://127.0.0.1:8786 ('dask scheduler' tells its own)"
         raise InvalidInput("address of the cluster", address, allowed) from None
-    with client:
+    with Client(address, timeout=answers_within_s, set_as_default=False) as client:
         try:
             yield client.get_executor()
         except KilledWorker as error:
