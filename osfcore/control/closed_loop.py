@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.control import monitor
 from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
 from osfcore.control.episode_settings import EpisodeSettings
 from osfcore.control.estimators import EpisodeParts
@@ -32,6 +31,7 @@ from osfcore.control.events import (
     Stepped,
 )
 from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
+from osfcore.control.monitor import ProgressMonitor, lamp_moved, lies_otherwise, moved_by_hand, offsets
 from osfcore.control.prepared_look import PreparedLooks
 from osfcore.control.relocalization import relocalize
 from osfcore.control.scene_models import SceneModels
@@ -97,7 +97,7 @@ class Episode:
         self._start, self._prepared, self._how = start, prepared, self._parts.estimators
         self._number, self._is_stalled = 0, False
         self._counted_from, self._renewals = 0, 0  # actions before those that count toward settings.steps
-        self._progress, self._sight = monitor.ProgressMonitor(), Sight()
+        self._progress, self._sight = ProgressMonitor(), Sight()
         self._doubted: dict[str, int] = {}
         self._searches = 0
         self._timer = StageTimer()
@@ -208,10 +208,10 @@ class Episode:
 
     def _noticed_changes(self, before: EstimatedState, expected: SceneState) -> Iterator[Event]:
         now = self._estimate.state
-        angle = monitor.lamp_moved(before.state.light, now.light)
+        angle = lamp_moved(before.state.light, now.light)
         if angle is not None:
             yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f}°: found again.")
-        names = monitor.moved_by_hand(expected, now)
+        names = moved_by_hand(expected, now)
         if names:
             self._planner.reset()
             self._before = None
@@ -309,8 +309,8 @@ class Episode:
     # Telling
 
     def _outcome(self) -> tuple[Outcome, str] | None:
-        far, turned = monitor.offsets(self._goal, self._estimate.state)
-        rolled = self._is_stalled & monitor.lies_otherwise(self._goal, self._estimate.state)  # and stays so
+        far, turned = offsets(self._goal, self._estimate.state)
+        rolled = self._is_stalled & lies_otherwise(self._goal, self._estimate.state)  # and stays so
         if far.max() <= self.settings.reached_m and np.all(turned[~rolled] <= self.settings.reached_rad):
             if rolled.any():
                 names = ", ".join(np.array(self._estimate.state.names)[rolled])
@@ -323,7 +323,7 @@ class Episode:
     def _stepped(self) -> Stepped:
         estimate = self._estimate
         self._goal = nearest_symmetric_goal(self._goal, estimate.state, self._models.symmetries)
-        far, turned = monitor.offsets(self._goal, estimate.state)
+        far, turned = offsets(self._goal, estimate.state)
         rendered = self._rendered(estimate.state, self._camera, self._light)
         cost = float(((rendered - self._image) ** 2).mean())
         taken = self._timer.taken()

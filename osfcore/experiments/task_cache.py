@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -102,16 +101,3 @@ def table_sha256(table: TableField) -> str:
     """The same of a table."""
     arrays = [np.asarray(getattr(table, entry.name)).tobytes() for entry in fields_of(table)]
     return hashlib.sha256(b"".join(arrays)).hexdigest()
-
-
-def code_sha256(*modules: ModuleType) -> str:
-    """The same of the sources of modules, and of whole packages: figures are the code's that made them."""
-    files = sorted(path for module in modules for path in _sources(module))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
-
-
-def _sources(module: ModuleType) -> list[Path]:
-    if hasattr(module, "__path__"):
-        return [path for folder in module.__path__ for path in Path(folder).rglob("*.py")]
-    assert module.__file__ is not None
-    return [Path(module.__file__)]

@@ -18,8 +18,6 @@ from osfcore.io.image_file import to_uint8
 _MOST_COLUMNS = 4
 _SIDE = 384  # longer side of a tile: outlines and names need more pixels than most images have
 _AXIS_M = 0.1
-_RED, _GREEN, _BLUE = (0, 0, 255), (0, 255, 0), (255, 0, 0)
-_WHITE, _YELLOW = (255, 255, 255), (0, 255, 255)
 _HUES = (0.5, 0.83, 0.08, 0.42, 0.92, 0.58, 0.22, 0.75)  # of the objects; far from each other one after the other
 
 

@@ -14,7 +14,6 @@ from osfcore.planning.path_planning import CLEARANCE_M
 _ANGLE_RAD = 0.2  # sigma of the push's direction around that of the goal
 _ASIDE = 0.2  # sigma of the push's offset from the middle, of half the object's breadth
 _LENGTHS = (0.6, 1.15)  # of the distance to go
-_SPARE_M = 0.003  # from the place behind an object to what must stay clear
 _APART_M = 0.005
 _MEETS_M = PUSHER_RADIUS_M + 0.01  # beside the pusher's line, what of an outline it may meet
 

@@ -24,7 +24,6 @@ from osfcore.render.table_kernels import empty_pixel, meet_table, pixel_ray, tab
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
 BAND_ROWS = 4  # rows of an image that one thread draws at a time
-_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _FAINT = np.float32(1e-3)  # of a pixel that shows anything less, the distance is not told
 
 

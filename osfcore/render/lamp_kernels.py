@@ -12,7 +12,7 @@ import numpy as np
 
 from osfcore.render.numba_options import HELPER, TINY
 
-_ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
+_THREE = np.float32(3)
 
 
 @numba.njit(**HELPER)

@@ -9,8 +9,6 @@ import numpy as np
 from osfcore.render.lamp_kernels import light_on_table
 from osfcore.render.numba_options import FAR, HELPER, TINY
 
-_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
-
 
 @numba.njit(**HELPER)
 def pixel_ray(cameras, view, u, v):

@@ -67,10 +67,6 @@ class RosNames:
         return f"/{camera.strip('/')}/{below}"
 
 
-class _Header(Entry):
-    frame_id: str
-
-
 class _CameraInfo(Entry):
     header: _Header
     width: int

@@ -25,7 +25,6 @@ from osfcore.dynamics.kernels.network_kernels import EDGE_WIDTH, NODE_WIDTH
 from osfcore.dynamics.kernels.options import HALF, HELPER, ONE, ZERO
 from osfcore.dynamics.kernels.shape_kernels import extent_along, farthest_point, push_motion
 from osfcore.dynamics.limit_surface import ARM_RATIO
-from osfcore.geometry.workspace import PUSHER_RADIUS_M
 
 
 def _fan(count: int, radius: float, height: float) -> np.ndarray:
@@ -35,12 +34,7 @@ def _fan(count: int, radius: float, height: float) -> np.ndarray:
 
 _CLOSE, _MAGNIFIED = np.float32(CLOSE_M), np.float32(MAGNIFIED)
 _PER_LENGTH, _PER_SHIFT, _PER_TURN, _PER_GAP = (np.float32(1 / x) for x in (LENGTH_M, SHIFT_M, TURN_RAD, GAP_M))
-_ARM, _RIM, _MOST_NEAR, _RESTS = (
-    np.float32(ARM_RATIO / OUTLINE),
-    np.float32(PUSHER_RADIUS_M),
-    np.float32(4),
-    np.float32(1e-6),
-)
+_ARM, _MOST_NEAR, _RESTS = np.float32(ARM_RATIO / OUTLINE), np.float32(4), np.float32(1e-6)
 _SLANT = math.sqrt(0.5)
 _EXTENTS = np.concatenate(
     [_fan(AROUND, 1, 0), _fan(SLANTED, _SLANT, -_SLANT), _fan(SLANTED, _SLANT, _SLANT), [[0, 0, -1], [0, 0, 1]]]

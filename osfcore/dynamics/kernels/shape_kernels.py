@@ -23,7 +23,7 @@ CIRCLE_X, CIRCLE_Y = (
 )  # as `polygons.circle`
 _SIDES, _HALF_SIDE, _LAST = np.int64(MAP_SIDE), np.float32(MAP_SIDE / 2), np.int64(MAP_SIDE - 1)
 _FRICTION = np.float32(FRICTION)
-_TINY, _TINIER, _REPEATED = np.float32(1e-12), np.float32(1e-14), np.float32(1e-4)
+_TINIER, _REPEATED = np.float32(1e-14), np.float32(1e-4)
 _LEAST_GAIN = np.float32(1e-3)
 
 

@@ -16,36 +16,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from osfcore import (
-    control,
-    dynamics,
-    estimation,
-    geometry,
-    metrics,
-    objects,
-    paper,
-    planning,
-    random_streams,
-    render,
-    world,
-)
-from osfcore import fields as fields_room
 from osfcore.control.episode_settings import CostKind, EpisodeSettings
 from osfcore.dynamics.push_models import network_path, shipped
 from osfcore.errors import InvalidInput, MissingAssets, check_ranges, check_seed
-from osfcore.experiments import rivals
-from osfcore.experiments.estimation import tasks as estimation_tasks
-from osfcore.experiments.fields import composite_scenes
 from osfcore.experiments.image_methods import field_path, known_names
 from osfcore.experiments.pieces import EvaluationStep, Piece, finished
-from osfcore.experiments.rearrangement import factors, measured_episodes, methods, own_pushes, runs, sensor
 from osfcore.experiments.rearrangement.factors import UNSEEN_NETWORK, factor_named
 from osfcore.experiments.rearrangement.measured_episodes import MeasuredEpisodes
 from osfcore.experiments.rearrangement.methods import Variant, check_variant
 from osfcore.experiments.rearrangement.report import MpcReport, write_pictures
 from osfcore.experiments.rivals.fitvid.weights import fitvid_path
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
-from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
+from osfcore.experiments.task_cache import TaskCache, TaskResult, file_sha256, table_sha256
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_json
 from osfcore.objects.asset_library import AssetLibrary
@@ -60,10 +42,7 @@ MAX_TRIES = 1000
 ORACLE_PLAN = PlanSettings(samples=192)
 _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
 
-_CODE = (
-    control, dynamics, estimation, fields_room, geometry, metrics, objects, paper, planning, random_streams, render,
-    rivals, world, composite_scenes, estimation_tasks, factors, measured_episodes, methods, own_pushes, runs, sensor,
-)  # fmt: skip
+VERSION = 1  # raised by hand when figures may change
 
 Plan = PlanSettings | GaussianPlanSettings | ForesightSettings
 _Work = Callable[[int], TaskResult]
@@ -246,7 +225,7 @@ def _circumstances(
         "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in names},
         "network": file_sha256(network_path(config.data_dir)),
         "table": table_sha256(fields.load_table()),
-        "code": code_sha256(*_CODE),
+        "version": VERSION,
     }
     own: dict[str, Any] = {}
     if config.variant.fields != "ours":

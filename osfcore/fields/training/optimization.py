@@ -21,7 +21,6 @@ from osfcore.fields.ray_sampling import RayBatch
 # Step sizes of the features, relative to the learning rate: g spans tens, colours one.
 _FEATURE_UNITS = (10.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0)
 _NETWORK_RATE = 0.25
-_ALPHA_WEIGHT = 0.5
 _CELL_JITTER = 0.25
 _MOST_G = 10.0  # and least: a shorter range loses less when it is stored in 8 bits
 _MOST_DIPOLE = 1.5

@@ -24,7 +24,6 @@ from osfcore.render.numba_options import FAR, HELPER, KERNEL
 from osfcore.render.table_kernels import meet_table, pixel_ray, table_colour
 
 MOST_OBJECTS = 24
-_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _RED, _GREEN, _BLUE = (np.float32(value) for value in PUSHER_ALBEDO)
 
 

@@ -24,7 +24,6 @@ NOTHING = np.float32(-1e9)
 _DECIMALS = 2  # of a light's direction up to which objects share a map: 0.3 degrees
 _OPAQUE = np.float32(0.5)
 _BIAS_VOXELS = np.float32(2)
-_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 
 
 class ShadowMaps(NamedTuple):

@@ -20,7 +20,7 @@ from osfcore.photo.light.lit_pixels import LitPixels
 RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
 _TINY = 1e-9
 _TABLE_SCALE_M = 0.4
-_LEAST_STD, _LEAST_SHARE = 2e-3, 0.05  # [radiance], and of the median radiance
+_LEAST_SHARE = 0.05  # of the median radiance
 
 
 @dataclass(frozen=True, eq=False, slots=True)

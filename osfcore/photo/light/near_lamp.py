@@ -33,7 +33,6 @@ _PATCH_M = 0.03
 _PRIOR_STD = np.array([1e3, 1e3, 1e3, 0.3, 0.3, 1.0, 0.3])  # of what is searched, in its units: of the cone only
 _POSE_STD_RAD, _POSE_STD_PER_M = 0.02, 0.09  # what errors of poses, albedo and table add, as simulated scenes showed
 _MOST_LOG_STD = 0.25  # of a distance that is known
-_LEAST_GAIN, _MOST_DIRECTED = 0.05, 1.0  # as of a distant lamp
 _LEAST_TABLE_GAIN = 0.12  # 0.3 and more in simulated scenes under a lamp, at most 0.1 in most photographs of rooms
 _WIDE_DEG = 85.0  # half-angle of a cone whose border no photograph shows
 

@@ -31,7 +31,6 @@ from osfcore.photo.other_programs.ycb_video import ModelFrame, in_object_frame, 
 
 MAX_BYTES = 100_000_000
 _COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t")
-_MOST_SKEW = 0.02  # of R R^T from the identity
 _NEAR_M, _FAR_M = 0.02, 20.0  # where objects can be before a camera
 _QUATERNION = 4
 _KINDS = "a .csv of BOP, a scene_gt.json, a .mat of PoseCNN, or a .json with a position and a quaternion of each object"

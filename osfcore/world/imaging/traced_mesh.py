@@ -17,7 +17,6 @@ from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.objects.asset import TexturedMesh
 
 NO_HIT = np.float32(1e30)
-_REMAP_COLUMNS = 512  # OpenCV's remap takes at most 32767 rows and columns
 
 
 @dataclass(frozen=True, eq=False, slots=True)
