@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from osfcore import AssetLibrary, Episode, FieldLibrary, GoalImage, Tabletop, goal_camera, load_scene_models
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.world.goal_layouts import random_goal
-from osfcore.world.scene_request import SceneRequest
+from osfcore.control.events import EpisodeSettings
+from osfcore.world.tasks import random_goal
+from osfcore.world.scenes import SceneRequest
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 

@@ -4,10 +4,10 @@ import numpy as np
 from scene import table
 
 from osfcore import FieldLibrary, MPPIPlanner, Pose, SceneState, load_push_model
-from osfcore.dynamics.push_models import load_shapes
+from osfcore.dynamics.rollout import load_shapes
 from osfcore.geometry.workspace import STEP_S
-from osfcore.planning.pose_cost import PoseCost, PoseGoal
-from osfcore.planning.push_proposals import PushProposals
+from osfcore.planning.costs import PoseCost, PoseGoal
+from osfcore.planning.pushes import PushProposals
 
 STEPS = 12
 

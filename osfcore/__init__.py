@@ -38,14 +38,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from osfcore.control.closed_loop import Episode
+    from osfcore.control.estimators import SceneModels, load_scene_models
     from osfcore.control.first_frame import estimate_first
     from osfcore.control.goal import GoalImage
-    from osfcore.control.scene_models import SceneModels, load_scene_models
-    from osfcore.dynamics.push_models import load_push_model
-    from osfcore.dynamics.rollout import PushModel
+    from osfcore.dynamics.rollout import PushModel, load_push_model
     from osfcore.errors import OsfError
     from osfcore.estimation.goal_image import estimate_goal
-    from osfcore.estimation.objective.object_models import ObjectModels
+    from osfcore.estimation.objective import ObjectModels
     from osfcore.estimation.tracking import estimate_next
     from osfcore.fields.field_library import FieldLibrary
     from osfcore.fields.kiloosf import KiloOSF
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     from osfcore.geometry.states import Observation, SceneState
     from osfcore.objects.asset_library import AssetLibrary
     from osfcore.planning.mppi import MPPIPlanner
-    from osfcore.render.scene_renderer import SceneRenderer
+    from osfcore.render.renderer import SceneRenderer
     from osfcore.render.types import SceneBatch
     from osfcore.world.tabletop import Tabletop
 
@@ -66,16 +65,16 @@ _HOMES = {
     "FieldLibrary": "fields.field_library",
     "GoalImage": "control.goal",
     "KiloOSF": "fields.kiloosf",
-    "SceneModels": "control.scene_models",
+    "SceneModels": "control.estimators",
     "Light": "geometry.light",
-    "ObjectModels": "estimation.objective.object_models",
+    "ObjectModels": "estimation.objective",
     "Observation": "geometry.states",
     "OsfError": "errors",
     "MPPIPlanner": "planning.mppi",
     "Pose": "geometry.poses",
     "PushModel": "dynamics.rollout",
     "SceneBatch": "render.types",
-    "SceneRenderer": "render.scene_renderer",
+    "SceneRenderer": "render.renderer",
     "SceneState": "geometry.states",
     "Tabletop": "world.tabletop",
     "default_cameras": "geometry.cameras",
@@ -83,8 +82,8 @@ _HOMES = {
     "estimate_goal": "estimation.goal_image",
     "estimate_next": "estimation.tracking",
     "goal_camera": "geometry.cameras",
-    "load_scene_models": "control.scene_models",
-    "load_push_model": "dynamics.push_models",
+    "load_scene_models": "control.estimators",
+    "load_push_model": "dynamics.rollout",
 }
 __all__ = [
     "AssetLibrary",

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from distributed import LocalCluster
 
-from osfcore.experiments.task_cache import TaskResult
-from osfcore.fields.training.kiloosf_training import FieldStep, train_field
-from osfcore.fields.training.recipes import TrainField
+from osfcore.experiments.harness import TaskResult
+from osfcore.fields.train_kiloosf import FieldStep, TrainField, train_field
 from osfcore.inspection.contact_sheet import Comparison
 from tests.core.fields.rendered_sets import QUICK
 

@@ -12,8 +12,7 @@ from hypothesis import settings
 import osfcore.geometry.convex_parts
 import osfcore.objects
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.objects.fetch import fetch
-from osfcore.objects.sources import FolderSource, WheelSource
+from osfcore.objects.fetch import FolderSource, WheelSource, fetch
 from tests.kernels import compile_kernels
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in

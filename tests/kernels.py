@@ -18,8 +18,8 @@ def compile_kernels(locks: Path, first: int = 0) -> None:
 
 
 def _render() -> None:
-    from osfcore.geometry.spot_lamp import SpotLamp  # what the library imports is checked by a hook that is set by then
-    from osfcore.render.scene_renderer import SceneRenderer
+    from osfcore.geometry.light import SpotLamp  # what the library imports is checked by a hook that is set by then
+    from osfcore.render.renderer import SceneRenderer
     from osfcore.render.types import OUTPUTS, SceneBatch
     from tests.core.render.scenes import random_scene, view, wooden_table
 
@@ -30,8 +30,7 @@ def _render() -> None:
 
 
 def _roll_out() -> None:
-    from osfcore.dynamics.push_models import load_shapes
-    from osfcore.dynamics.rollout import PushModel
+    from osfcore.dynamics.rollout import PushModel, load_shapes
     from osfcore.fields.field_library import FieldLibrary
     from tests.core.dynamics.scenes import NAMES, crowd, network
 

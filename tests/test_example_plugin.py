@@ -22,9 +22,8 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.planning.parts import COST, PLANNER
 from osfcore.plugins import part_names
-from osfcore.world import parts as worlds
-from osfcore.world.parts import WORLD, WORLDS
-from osfcore.world.tabletop import Tabletop
+from osfcore.world import tabletop as worlds
+from osfcore.world.tabletop import WORLD, WORLDS, Tabletop
 
 ROOT = Path(__file__).parents[1]
 SOURCE, GUIDE = ROOT / "examples" / "plugin", ROOT / "docs" / "extending.md"

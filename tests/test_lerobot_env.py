@@ -17,9 +17,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from osfcore.export.lerobot.conventions import instruction
-from osfcore.export.lerobot.dataset import write_dataset
-from osfcore.export.lerobot.episode import LeRobotEpisode
+from osfcore.export.lerobot import LeRobotEpisode, instruction, write_dataset
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "examples" / "lerobot_env_osf"

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from osfcore.fields.field_weights import read_field
-from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
+from osfcore.fields.kiloosf import read_field
+from osfcore.world.collect_images import CollectObservation, collect_observation
 from tests.live import live_service
 
 ROOT = Path(__file__).parents[1]

@@ -12,8 +12,8 @@ from app.episodes.part_names import parts_of
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import EpisodeOrder, SimulatedTable, given
 from osfcore.control.closed_loop import Episode
+from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import ActionExecuted, Event, Stepped
-from osfcore.control.scene_models import load_scene_models
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng

@@ -16,7 +16,7 @@ from osfcore.estimation.steps import UNPLACED_BELOW_M
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 from osfcore.render.types import PLANNING, Renderer, SceneBatch
 
 SIDE = 160  # of a picture [px]

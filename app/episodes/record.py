@@ -19,16 +19,23 @@ from app.episodes.part_names import PartNames
 from app.episodes.replay_clock import ReplayClock
 from app.episodes.trajectory import write_trajectory
 from app.episodes.trajectory_recorder import TrajectoryRecorder
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.events import (
+    ActionExecuted,
+    EpisodeSettings,
+    Event,
+    Finished,
+    GoalFound,
+    Noticed,
+    Observed,
+    Stepped,
+)
 from osfcore.control.goal import GoalImage
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import encode
-from osfcore.io.scene_file import ObjectJson, state_to_json
-from osfcore.io.state_file import estimated_to_json
+from osfcore.io.scene_file import ObjectJson, estimated_to_json, state_to_json
 from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from PIL import Image
 
 from app.episodes.part_names import PartNames
-from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import EpisodeSettings
 from osfcore.control.goal import GoalImage
-from osfcore.control.world_protocol import SimulatedWorld
+from osfcore.control.world import SimulatedWorld
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
@@ -24,12 +24,11 @@ from osfcore.io.json_codec import decode
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.found_scene import FoundScene
 from osfcore.photo.table_layout import TableLayout, layout_of
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 from osfcore.plugins import part_factory
-from osfcore.world.goal_layouts import arranged_goal, random_goal
-from osfcore.world.parts import WORLD, WORLDS, WorldInputs
-from osfcore.world.scene_request import SceneRequest
-from osfcore.world.tabletop import Tabletop
+from osfcore.world.scenes import SceneRequest
+from osfcore.world.tabletop import WORLD, WORLDS, Tabletop, WorldInputs
+from osfcore.world.tasks import arranged_goal, random_goal
 
 _MODES = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's, of 8 bits a channel: others would be clipped silently
 

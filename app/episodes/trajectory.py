@@ -18,11 +18,10 @@ from jaxtyping import Float, Int
 
 from app.processes.plan_summary import PlanSketch
 from osfcore.errors import CorruptFile
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.files import write_atomically
 
 LookAt = Literal["first", "goal"]

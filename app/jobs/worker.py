@@ -21,13 +21,13 @@ STEP_INTERVAL_S = 0.1
 
 
 def _collect_pushes(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
-    from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+    from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
     yield from collect_pushes(CollectPushes(out=place.folder / "pushes.h5", **params), place.library)
 
 
 def _collect_object(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
-    from osfcore.world.collection.collect_images import CollectObject, collect_object
+    from osfcore.world.collect_images import CollectObject, collect_object
 
     out = place.folder / params["name"]
     yield from collect_object(CollectObject(out=out, **params), place.library)
@@ -35,7 +35,7 @@ def _collect_object(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
 
 
 def _collect_table(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
-    from osfcore.world.collection.collect_images import CollectTable, collect_table
+    from osfcore.world.collect_images import CollectTable, collect_table
 
     out = place.folder / "table"
     yield from collect_table(CollectTable(out=out, **params))
@@ -43,8 +43,7 @@ def _collect_table(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
 
 
 def _fetch_assets(params: dict[str, Any], place: JobContext) -> Iterator[Any]:
-    from osfcore.objects.fetch import fetch
-    from osfcore.objects.sources import source_from
+    from osfcore.objects.fetch import fetch, source_from
 
     source = source_from("pypi", place.data_dir / "downloads")
     yield from fetch(tuple(params["names"]), source, place.library)
@@ -110,7 +109,7 @@ _NOT_EXTRA = ("done", "total", "note", "view")
 
 
 _LOADED = (  # by a process that waits for its job
-    "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.scene_models",
+    "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.estimators",
     "app.jobs.kinds.remote_world", "app.jobs.kinds.estimates", "osfcore.photo.summary",
     "app.episodes.record", "app.episodes.recording",
 )  # fmt: skip

@@ -64,11 +64,11 @@ class PushPredictor:
 
     def _model(self, names: tuple[str, ...], method: Method) -> DynamicsModel:
         if method == "paper":
-            from osfcore.paper.dynamics.rollout import load_paper_push_model as load
-            from osfcore.paper.dynamics.weights import weights_path as network
+            from osfcore.paper.dynamics import load_paper_push_model as load
+            from osfcore.paper.dynamics import weights_path as network
         else:
-            from osfcore.dynamics.push_models import load_push_model as load
-            from osfcore.dynamics.push_models import network_path as network
+            from osfcore.dynamics.rollout import load_push_model as load
+            from osfcore.dynamics.rollout import network_path as network
 
         chosen = tuple(sorted(names))
         stamps = [_stamp(self._fields.folder(name) / FIELD_FILE) for name in chosen]

@@ -30,11 +30,11 @@ from osfcore.io.image_file import encode_png, to_uint8
 
 if TYPE_CHECKING:
     from osfcore.estimation.content_check import ContentChecker
-    from osfcore.estimation.content_verdict import ContentCheck
+    from osfcore.estimation.steps import ContentCheck
     from osfcore.fields.kiloosf import KiloOSF
     from osfcore.geometry.cameras import Camera
     from osfcore.geometry.states import SceneState
-    from osfcore.render.scene_renderer import SceneRenderer
+    from osfcore.render.renderer import SceneRenderer
     from osfcore.render.types import Quality
 
 DIFFERENCE_GAIN = 4  # as in the pictures that a training shows
@@ -107,7 +107,7 @@ class NeuralRenderer:
     def _photograph(self, order: DrawPhoto) -> bytes:
         import cv2
 
-        from osfcore.estimation.photometry.camera_response import linear_from_encoded, srgb_of_linear
+        from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
         from osfcore.render.types import EXACT
 
         def sized(picture: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ class NeuralRenderer:
         return drawn.rgb[0, 0], None if drawn.depth is None else drawn.depth[0, 0]
 
     def _renderer(self, names: tuple[str, ...]) -> SceneRenderer:
-        from osfcore.render.scene_renderer import SceneRenderer
+        from osfcore.render.renderer import SceneRenderer
 
         key = self._key(names)
         if key not in self._renderers:
@@ -150,7 +150,7 @@ class NeuralRenderer:
     def _checker(self, names: tuple[str, ...]) -> ContentChecker:
         """That of the latest objects only: a photo is checked when it comes, or when the table changes."""
         from osfcore.estimation.content_check import ContentChecker
-        from osfcore.estimation.objective.object_models import ObjectModels
+        from osfcore.estimation.objective import ObjectModels
 
         key = self._key(names)
         if self._latest_checker is None or self._latest_checker[0] != key:

@@ -9,7 +9,7 @@ import numpy as np
 from app.processes.messages.scene_messages import TakeImage, TakeMask
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera, image_side
-from osfcore.inspection.mask_tint import tint_masks
+from osfcore.inspection.overlays import tint_masks
 from osfcore.io.image_file import encode_png, to_uint8
 
 if TYPE_CHECKING:

@@ -185,7 +185,7 @@ class Simulation:
     # Worlds
 
     def _create(self, command: CreateScene) -> SceneRecord:
-        from osfcore.world.scene_request import SceneRequest
+        from osfcore.world.scenes import SceneRequest
         from osfcore.world.tabletop import Tabletop
 
         request = SceneRequest(command.names, command.count, command.light)
@@ -212,7 +212,7 @@ class Simulation:
 
     def _world(self, scene: str) -> Tabletop:
         """The scene's simulation, loaded from its record if it is not in memory."""
-        from osfcore.world.scene_request import SceneRequest
+        from osfcore.world.scenes import SceneRequest
         from osfcore.world.tabletop import Tabletop
 
         record = self._record(scene)
@@ -311,7 +311,7 @@ class Simulation:
         return replace(record, state=world.truth())
 
     def _compose(self, command: ComposeGoal) -> ComposedGoal:
-        from osfcore.world.goal_layouts import arranged_goal, random_goal
+        from osfcore.world.tasks import arranged_goal, random_goal
 
         world, time_s = self._world(command.id), self._time_s(command.id)
         try:

@@ -21,7 +21,7 @@ from app.services.goals.goals import GOAL_SIDE, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
 from app.storage.goal_store import GoalRecord, Poses, poses_to_json
-from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput, OsfError, check_seed
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import unit_quaternion

@@ -34,13 +34,11 @@ from app.services.uploaded_observations import ARCHIVE, Uploaded, check_fits, ex
 from app.storage.uploads import Examiner, save
 from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.files import read_json, write_json
 from osfcore.io.json_codec import decode
 from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson
-from osfcore.io.scene_file import read_scene, state_to_json
-from osfcore.io.state_file import EstimateJson, read_estimated, write_estimated
+from osfcore.io.scene_file import EstimateJson, read_estimated, read_scene, state_to_json, write_estimated
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.method import Method
 

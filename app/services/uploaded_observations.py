@@ -7,7 +7,7 @@ from pathlib import Path
 
 from app.jobs.kinds.estimates import OBSERVATION, PRIOR, Mode
 from osfcore.errors import CannotWrite, InvalidInput
-from osfcore.io.state_file import read_estimated
+from osfcore.io.scene_file import read_estimated
 
 ARCHIVE = "observation.zip"
 

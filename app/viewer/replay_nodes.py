@@ -13,7 +13,7 @@ from osfcore.control.events import Looking
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 from osfcore.progress import Progress
 
 ROOT = "/replay"

@@ -14,25 +14,342 @@ import io
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
+import httpx2
 import numpy as np
 from jaxtyping import Float, Float32
 from PIL import Image
 
-from osfcore.client.answers import Episode, Estimate, Goal, Health, RemoteScene
-from osfcore.client.connection import Connection
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts, check_actions
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.io.files import file_at_once
 from osfcore.io.image_file import encode_png, to_uint8
-from osfcore.io.json_codec import decode
-from osfcore.io.rollout_file import rollouts_from_json
-from osfcore.io.scene_file import state_to_json
+from osfcore.io.json_codec import Entry, decode
+from osfcore.io.scene_file import (
+    CameraJson,
+    EstimateJson,
+    ObjectJson,
+    rollouts_from_json,
+    scene_from_json,
+    state_to_json,
+)
+
+# What the service answers, as frozen dataclasses with the core's own types; members it does not know are left
+# alone.
+#
+# Each is decoded from the JSON that the REST interface documents; a test compares them with its OpenAPI schema.
+
+
+class Health(Entry):
+    """Whether and how the service runs.
+
+    Attributes:
+        status: "ok" or "degraded".
+        problems: what is wrong now, a sentence each.
+        version: of the program.
+        stage: of the simulation: "starting", "ready" or "restarting".
+    """
+
+    status: str
+    problems: list[str]
+    version: str
+    stage: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RemoteScene:
+    """A table of the service.
+
+    Attributes:
+        id: names it.
+        state: poses of the objects, light and pusher as they truly are.
+        cameras: that look at it; the last one takes goal images.
+        time_s: simulated time since it was made [s].
+    """
+
+    id: str
+    state: SceneState
+    cameras: tuple[Camera, ...]
+    time_s: float
+
+    @staticmethod
+    def of(data: dict[str, Any]) -> RemoteScene:
+        """From what the service answers."""
+        scene, facts = scene_from_json(data), decode(_SceneFacts, data, "scene")
+        return RemoteScene(facts.id, scene.state, scene.cameras, facts.time_s)
+
+
+class _SceneFacts(Entry):
+    id: str
+    time_s: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Goal:
+    """A goal image that the service keeps.
+
+    Attributes:
+        id: names it.
+        name: for people.
+        camera: that took the image.
+        names: of the objects whose places in it are known; none of a photo.
+    """
+
+    id: str
+    name: str
+    camera: Camera
+    names: tuple[str, ...]
+
+    @staticmethod
+    def of(data: object) -> Goal:
+        """From what the service answers."""
+        facts = decode(_GoalFacts, data, "goal")
+        names = tuple(one.name for one in facts.objects or ())
+        return Goal(facts.id, facts.name, facts.camera.camera(), names)
+
+
+class _GoalFacts(Entry):
+    id: str
+    name: str
+    camera: CameraJson
+    objects: list[ObjectJson] | None
+
+
+class EpisodeStep(Entry):
+    """One round of the loop, or how it was before the first.
+
+    Attributes:
+        step: actions executed so far.
+        image_cost: mean squared difference of goal image and rendered estimate.
+        to_goal_mm: of each object as estimated [mm]; None where the method looks at images alone.
+        to_goal_deg: likewise [deg].
+        seconds: spent, by part of the loop [s].
+    """
+
+    step: int
+    image_cost: float
+    to_goal_mm: dict[str, float] | None
+    to_goal_deg: dict[str, float] | None
+    seconds: dict[str, float]
+
+
+class _Running(Entry):
+    """Work of the service as it is now.
+
+    Attributes:
+        id: names it.
+        status: of its job.
+        stage: what it does, such as "first", "goal", "plan", "act" in an episode.
+        done: units of work, or actions of an episode, that are done.
+        total: in all, at most; 0 before it is known.
+        note: what happens now, for people.
+        eta_s: estimated time left [s].
+        error: why it failed, if it did.
+    """
+
+    id: str
+    status: Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
+    stage: str | None
+    done: int
+    total: int
+    note: str
+    eta_s: float | None
+    error: str | None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more comes."""
+        return self.status not in ("queued", "running", "paused")
+
+
+class Episode(_Running):
+    """An episode as it is now.
+
+    Attributes:
+        name: for people.
+        scene: its table.
+        outcome: "reached", "out of steps" or "refused" once it has ended by itself.
+        text: the outcome in a sentence.
+        steps: all so far.
+        files: that `Client.download` brings.
+    """
+
+    name: str
+    scene: str
+    outcome: str | None
+    text: str | None
+    steps: list[EpisodeStep]
+    files: list[str]
+
+
+class Estimate(_Running):
+    """An estimate of poses and light as it is now.
+
+    Attributes:
+        estimate: the result as in state.json; None before it is there.
+    """
+
+    estimate: EstimateJson | None
+
+    @property
+    def estimated(self) -> EstimatedState | None:
+        """The result; None before it is there."""
+        return None if self.estimate is None else self.estimate.estimate()
+
+
+# HTTP with the service: requests, streams of events, and problems (RFC 9457) as errors of one sentence.
+
+
+_QUIET_S = 60.0  # without a byte before a stream counts as lost; a service that works sends something sooner
+_RECONNECTS = 5  # in a row, without an event between them
+
+
+class ServiceError(OsfError):
+    """What the service answered instead, or that it does not answer.
+
+    Args:
+        sentence: for a person.
+        status: of HTTP; 0 where nothing was answered.
+    """
+
+    def __init__(self, sentence: str, status: int = 0) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class Connection:
+    """One service.
+
+    Args:
+        http: a client of its own, with base address and headers; closed with this.
+    """
+
+    def __init__(self, http: httpx2.Client) -> None:
+        self._http = http
+
+    @staticmethod
+    def to(url: str, token: str | None, timeout_s: float) -> Connection:
+        """Connect to an address.
+
+        Args:
+            url: such as http://127.0.0.1:8000.
+            token: of a service that was started with one.
+            timeout_s: how long an answer may take [s].
+        """
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        return Connection(httpx2.Client(base_url=url, headers=headers, timeout=timeout_s))
+
+    def close(self) -> None:
+        """Release the sockets."""
+        self._http.close()
+
+    def json(self, method: str, path: str, body: object = None, **query: object) -> Any:  # noqa: ANN401
+        """What a request answers, parsed.
+
+        Raises:
+            ServiceError: if it is refused or there is no answer.
+        """
+        return self._answer(method, path, query, json=body).json()
+
+    def send(self, method: str, path: str, content: bytes, kind: str, **query: object) -> Any:  # noqa: ANN401
+        """What a request with a file answers, parsed.
+
+        Args:
+            method: of HTTP.
+            path: from the root.
+            content: of the file.
+            kind: its media type.
+            query: parameters; those that are None are left out.
+
+        Raises:
+            ServiceError: if it is refused or there is no answer.
+        """
+        return self._answer(method, path, query, content=content, headers={"Content-Type": kind}).json()
+
+    def bytes(self, path: str, **query: object) -> bytes:
+        """A file.
+
+        Raises:
+            ServiceError: if there is none or no answer.
+        """
+        return self._answer("GET", path, query).content
+
+    def download(self, path: str, to: Path) -> Path:
+        """Write a file to disk piece by piece; it is there when it is whole.
+
+        Raises:
+            ServiceError: if there is none or no answer.
+            CannotWrite: if the disk refuses.
+        """
+        with self._told(), self._http.stream("GET", path) as answer:
+            if answer.is_error:
+                answer.read()
+            _check(answer)
+            with file_at_once(to) as partial, partial.open("wb") as file:
+                for chunk in answer.iter_bytes():
+                    file.write(chunk)
+        return to
+
+    def follow(self, path: str) -> Iterator[Any]:
+        """The data of events of a stream, parsed, until it ends; it is opened again where the network breaks it.
+
+        Raises:
+            ServiceError: if there is no such stream, or the service no longer answers.
+        """
+        breaks = 0
+        while True:
+            try:
+                with self._http.sse(path, timeout=_QUIET_S) as events:
+                    if events.response.is_error:
+                        events.response.read()
+                    _check(events.response)
+                    for event in events:
+                        breaks = 0
+                        yield event.json()
+                    return
+            except httpx2.TransportError as error:
+                breaks += 1
+                if breaks > _RECONNECTS or isinstance(error, httpx2.ConnectError):
+                    raise self._silent(error) from error
+
+    def _answer(self, method: str, path: str, query: dict[str, object], **more: Any) -> httpx2.Response:  # noqa: ANN401
+        params: Any = {key: value for key, value in query.items() if value is not None}
+        with self._told():
+            answer = self._http.request(method, path, params=params, **more)
+        _check(answer)
+        return answer
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except (httpx2.TransportError, httpx2.InvalidURL) as error:
+            raise self._silent(error) from error
+
+    def _silent(self, error: Exception) -> ServiceError:
+        told = f"The service at {self._http.base_url} does not answer ({error})"
+        return ServiceError(f"{told}; start it with 'osf serve', or give its address.")
+
+
+def _check(answer: httpx2.Response) -> None:
+    if answer.is_success:
+        return
+    try:
+        detail = answer.json()["detail"]
+    except (ValueError, KeyError, TypeError):
+        told = f"{answer.url} answered {answer.status_code} as this service does not"
+        detail = f"{told}; give the address of one that 'osf serve' runs."
+    raise ServiceError(detail, answer.status_code)
+
 
 T = TypeVar("T")
 Mode = Literal["first", "next", "goal"]

@@ -8,17 +8,19 @@ drawn anew.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.estimators import EpisodeParts
+from osfcore.control.estimators import EpisodeParts, SceneModels
 from osfcore.control.events import (
     ActionExecuted,
+    EpisodeSettings,
     Event,
     Finished,
     GoalFound,
@@ -30,27 +32,244 @@ from osfcore.control.events import (
     Planning,
     Stepped,
 )
+from osfcore.control.first_frame import PreparedLooks
 from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
-from osfcore.control.monitor import ProgressMonitor, lamp_moved, lies_otherwise, moved_by_hand, offsets
-from osfcore.control.prepared_look import PreparedLooks
-from osfcore.control.relocalization import relocalize
-from osfcore.control.scene_models import SceneModels
-from osfcore.control.sight import Sight
-from osfcore.control.stage_timer import StageTimer
-from osfcore.control.world_protocol import World
+from osfcore.control.world import Sight, World
 from osfcore.errors import InvalidInput
-from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.camera_response import ImageModel
+from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.objective import ObjectModels
+from osfcore.estimation.photometry import adapted
+from osfcore.estimation.steps import EstimateStep, all_but_last
+from osfcore.estimation.tracking import estimate_next
 from osfcore.estimation.uncertainty import expected_fit, object_residuals, relative_residuals
 from osfcore.geometry.cameras import Camera, goal_camera
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, planar_turn, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
+from osfcore.geometry.workspace import PUSHER_RADIUS_M
+from osfcore.planning.costs import ARM_M, Cost, PoseGoal
 from osfcore.planning.parts import COSTS, CostInputs, PlannerInputs
-from osfcore.planning.pose_cost import ARM_M, Cost, PoseGoal
-from osfcore.planning.push_proposals import PushProposals
+from osfcore.planning.pushes import PushProposals
 from osfcore.render.types import Quality, SceneBatch
+
+# Wall time of the stages of a closed loop, without what whoever drives its generator takes between two steps.
+
+
+StepT = TypeVar("StepT")
+
+
+class StageTimer:
+    """Adds up seconds by stage."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time within the context."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - began
+
+    def steps(self, name: str, steps: Iterator[StepT]) -> Iterator[StepT]:
+        """Pass on steps, and count the time until each of them is there."""
+        while True:
+            with self.stage(name):
+                step = next(steps, None)
+            if step is None:
+                return
+            yield step
+
+    def taken(self) -> dict[str, float]:
+        """Seconds of each stage since this was asked last."""
+        taken, self._seconds = self._seconds, {}
+        return taken
+
+
+# Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all.
+
+
+def relocalize(
+    models: ObjectModels,
+    observation: Observation,
+    last: EstimatedState,
+    rng: np.random.Generator,
+    config: GoalImageConfig | None = None,
+) -> Iterator[EstimateStep]:
+    """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: all views, at best without anything in front.
+        last: the estimate whose doubted objects are looked for.
+        rng: of the search.
+        config: how the one image is searched.
+    """
+    state = last.state
+    lost = [n for n, doubt in enumerate(last.doubts) if doubt]
+    view = int(rng.integers(len(observation.cameras)))
+    alone = Observation(
+        observation.cameras[view : view + 1], observation.images[view : view + 1], observation.names, None, None,
+        observation.time_s,
+    )  # fmt: skip
+    first_frame = None
+    for step in estimate_goal(models, alone, state, config):
+        first_frame = step.estimate
+        yield replace(step, estimate=None)
+    assert first_frame is not None, "the last step brings the estimate"
+    expected = replace(_with_poses_of(state, first_frame.state, lost), pusher=observation.pusher)
+    for step in estimate_next(models, observation, expected, rng):
+        update = step.estimate
+        is_worse = update is not None and sum(map(bool, update.doubts)) > len(lost)
+        yield replace(step, estimate=last) if is_worse else step
+
+
+def _with_poses_of(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:
+    """The state with some of its objects where another one has them."""
+    positions, quaternions = state.poses.position.copy(), state.poses.quaternion.copy()
+    for n in numbers:
+        pose = other.pose(state.names[n])
+        positions[n], quaternions[n] = pose.position, pose.quaternion
+    return replace(state, poses=Pose(positions, quaternions))
+
+
+# Models and pictures that agree: what the first frame tells of exposure, response, ambient light and table is kept.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AdaptedModels:
+    """Models of the objects in a scene, and how pictures are made to look as these do.
+
+    Attributes:
+        models: fields and table, with the scene's ambient light and albedo.
+        image_model: of the pictures; None for those that fields were made for.
+    """
+
+    models: ObjectModels
+    image_model: ImageModel | None = None
+
+    def to(self, image_model: ImageModel | None, names: tuple[str, ...]) -> AdaptedModels:
+        """These, which must not be adapted yet, for pictures of another kind.
+
+        Args:
+            image_model: of the pictures; None leaves everything as it is.
+            names: of the objects that are needed.
+        """
+        return self if image_model is None else AdaptedModels(adapted(self.models, names, image_model), image_model)
+
+    def normalized(self, observation: Observation) -> Observation:
+        """Pictures as these models show them."""
+        return observation if self.image_model is None else self.image_model.normalized(observation)
+
+    def normalized_goal(self, goal: GoalImage) -> GoalImage:
+        """A goal image likewise."""
+        return goal if self.image_model is None else replace(goal, image=self.normalized(goal.observed(())).images[0])
+
+
+def estimate_goal_image(
+    usual: AdaptedModels,
+    scene: AdaptedModels,
+    goal: GoalImage,
+    prior: SceneState,
+    config: GoalImageConfig | None = None,
+    shares: Mapping[str, float] | None = None,
+) -> Iterator[EstimateStep]:
+    """The goal image as the scene's cameras would take it and, should that be doubtful, as fields were made for.
+
+    Args:
+        usual: models that are not adapted.
+        scene: models for the pictures of the first frame.
+        goal: one view.
+        prior: how the objects lie now.
+        config: how much work to do.
+        shares: by object, its residual in the first frame as a share of its level, see `goal_allowance`.
+    """
+    best = yield from all_but_last(_estimated(scene, goal, prior, config, shares))
+    if scene.image_model is not None and not _is_trusted(best):
+        yield replace(best, estimate=None)
+        other = yield from all_but_last(_estimated(usual, goal, prior, config, shares))
+        best = other if _is_trusted(other) else best
+    yield best
+
+
+def _estimated(
+    fitting: AdaptedModels,
+    goal: GoalImage,
+    prior: SceneState,
+    config: GoalImageConfig | None,
+    shares: Mapping[str, float] | None,
+) -> Iterator[EstimateStep]:
+    seen = fitting.normalized_goal(goal).observed(prior.names)
+    for step in estimate_goal(fitting.models, seen, prior, config, shares):
+        yield step if step.estimate is None else replace(step, image_model=fitting.image_model)
+
+
+def _is_trusted(step: EstimateStep) -> bool:
+    return step.estimate is not None and step.estimate.trusted
+
+
+# Monitoring of a closed loop: distance to the goal, stalled progress, changes that no push explains.
+
+
+_MAX_STALLED = 16  # actions without progress
+_PROGRESS_M = 0.003
+_LAMP_RAD = np.deg2rad(4.0)
+_MOVED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
+_REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perhaps by way of another object
+
+
+def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """How far each object is from where it should be: on the table's plane [m], and turned [rad]."""
+    target = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
+    turned = rotation_angle(state.poses.quaternion, target)
+    return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
+
+
+def lies_otherwise(goal: PoseGoal, state: SceneState) -> Bool[np.ndarray, "N"]:
+    """Which objects lie on another side than in the goal: turning them about the vertical would not do."""
+    turns = (planar_turn(state.pose(name).quaternion, goal.pose(name).quaternion) for name in state.names)
+    return np.array([turn is None for turn in turns], bool)
+
+
+class ProgressMonitor:
+    """Detects that the distance to the goal no longer shrinks."""
+
+    def __init__(self) -> None:
+        self._least, self._since = np.inf, 0
+
+    def is_stalled(self, distance_m: float) -> bool:
+        """Take the distance after each action; true once it has not shrunk for 16 actions, and counting restarts."""
+        if distance_m < self._least - _PROGRESS_M:
+            self._least, self._since = distance_m, 0
+            return False
+        self._since += 1
+        if self._since < _MAX_STALLED:
+            return False
+        self._least, self._since = distance_m, 0
+        return True
+
+
+def lamp_moved(before: Light, now: Light) -> float | None:
+    """By which angle the lamp was moved [rad]; None if it was not."""
+    angle = before.angle_to(now)
+    return angle if angle > _LAMP_RAD else None
+
+
+def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:
+    """Objects that are not where they were expected, too far from the pusher for a push to be the cause."""
+    assert now.pusher is not None
+    shift = np.linalg.norm(now.poses.position - expected.poses.position, axis=1)
+    ends = [now.pusher] if expected.pusher is None else [now.pusher, expected.pusher]
+    away = np.min(
+        [np.linalg.norm(expected.poses.position[:, :2] - end[:2], axis=1) for end in ends], axis=0
+    )  # fmt: skip
+    is_moved = (shift > _MOVED_M) & (away > _REACH_M + PUSHER_RADIUS_M)
+    return tuple(name for name, flag in zip(now.names, is_moved, strict=True) if flag)
+
 
 _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another

@@ -10,15 +10,22 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.control.first_frame import estimate_first
+from osfcore.dynamics.dynamics_model import DynamicsModel
+from osfcore.dynamics.graph import read_network
+from osfcore.dynamics.rollout import PushModel, load_shapes, network_path
+from osfcore.dynamics.shapes import ObjectShape
 from osfcore.estimation.first_frame import FirstFrameConfig
-from osfcore.estimation.goal_refinement import GoalImageConfig
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.goal_image import GoalImageConfig
+from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
+from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import Observation, SceneState
+from osfcore.objects.asset import Symmetry
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.planning.costs import Cost
 from osfcore.planning.parts import CostInputs, Planner, PlannerInputs, mppi
-from osfcore.planning.pose_cost import Cost
 from osfcore.plugins import PartKind
 
 
@@ -87,3 +94,49 @@ class EpisodeParts:
     estimators: Estimators = field(default_factory=Estimators)
     planner: Callable[[PlannerInputs], Planner] = mppi
     cost: Callable[[CostInputs], Cost] | None = None
+
+
+# Models of an episode's objects: fields, dynamics, shapes, symmetries.
+
+
+@dataclass(frozen=True, slots=True)
+class SceneModels:
+    """Models of the objects, loaded before the first image.
+
+    Attributes:
+        appearance: how objects and table look.
+        dynamics: what pushes do.
+        pushes: the network that proposals are drawn by, whatever predicts them.
+        shapes: of the objects, by name.
+        symmetries: which of their orientations look the same; none for those left out.
+    """
+
+    appearance: ObjectModels
+    dynamics: DynamicsModel
+    pushes: PushModel
+    shapes: Mapping[str, ObjectShape]
+    symmetries: Mapping[str, Symmetry]
+
+
+def load_scene_models(
+    names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary, data_dir: Path | None, device: str = "cpu"
+) -> SceneModels:
+    """Load the models of some objects.
+
+    Args:
+        names: of the objects.
+        fields: library of their fields.
+        assets: library of their symmetries.
+        data_dir: whose weights and convex parts come before the installed ones.
+        device: that computes.
+
+    Raises:
+        UnknownName: if one has no field.
+        CorruptFile: if a file is broken.
+    """
+    shapes = load_shapes(data_dir, fields, names)
+    pushes = PushModel(read_network(network_path(data_dir)), shapes, device)
+    symmetries = {name: assets.info(name).symmetry for name in names}
+    loaded, table = {name: fields.load(name) for name in names}, fields.load_table()
+    appearance = ObjectModels(loaded, table, device=device, symmetries=symmetries)
+    return SceneModels(appearance, pushes, pushes, shapes, symmetries)

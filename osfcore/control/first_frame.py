@@ -14,26 +14,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Float
 
+from osfcore.errors import InvalidInput
+from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.estimation.first_frame import FirstFrameConfig, check_masks, visible_part
 from osfcore.estimation.first_frame import estimate_first as estimate_usual
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
-from osfcore.estimation.objective.parametrization import SceneParameters
-from osfcore.estimation.photometry.calibration import Calibration, Calibrator
-from osfcore.estimation.photometry.camera_response import Encoding, linear_from_encoded
-from osfcore.estimation.photometry.scaled_fields import adapted
-from osfcore.estimation.photometry.table_check import check_table
-from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
-from osfcore.estimation.search.pose_initialization import OVERHEAD, initial_poses
-from osfcore.estimation.step_reporter import StepReporter
+from osfcore.estimation.objective import FINE_SIDE, ObjectModels, SceneParameters, views_of
+from osfcore.estimation.photometry import Calibration, Calibrator, adapted
+from osfcore.estimation.search import OVERHEAD, GaussNewtonState, StepReporter, check_table, gauss_newton, initial_poses
 from osfcore.estimation.steps import EstimateStep, all_but_last
-from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit, relative_allowance
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.geometry.states import Observation
+from osfcore.estimation.uncertainty import (
+    AMBIGUOUS,
+    estimate_with_uncertainty,
+    evaluate_fit,
+    expected_residuals,
+    relative_allowance,
+)
+from osfcore.geometry.states import EstimatedState, Observation
+from osfcore.io.json_codec import Entry, decode, encode
+from osfcore.io.scene_file import EstimateJson
 from osfcore.progress import Progress
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
@@ -190,3 +193,95 @@ def _aligned(
         at = step
         yield reporter.refinement("Exposure and table", at)
     return at
+
+
+# Estimates that were made beforehand, and whether they explain what is seen now as well as what was seen then.
+#
+# An example comes with the estimates of its first frame and of its goal image, so that it need not be looked at for
+# half a minute. They are used only where they fit: residuals of the fields rendered there are compared with those
+# of then.
+
+
+_WORSE, _NOISE = 1.2, 0.004  # by how much a residual may exceed the former one: a factor, and [radiance]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PreparedLook:
+    """An estimate and how well it explained the images that it was made from.
+
+    Attributes:
+        estimate: of poses and light.
+        residuals: RMS of each object there [radiance], see `expected_residuals`.
+    """
+
+    estimate: EstimatedState
+    residuals: Float[np.ndarray, "N"]
+
+    @staticmethod
+    def of(models: ObjectModels, observation: Observation, estimate: EstimatedState) -> PreparedLook:
+        """What is known now of an observation, for later."""
+        return PreparedLook(estimate, expected_residuals(models, observation, estimate.state))
+
+    def explains(self, models: ObjectModels, observation: Observation) -> bool:
+        """Whether it fits an observation of the same objects about as well as the one that it was made from."""
+        state = self.estimate.state
+        if state.names != observation.names:
+            return False
+        now = expected_residuals(models, observation, state)
+        return bool(np.all(now <= _WORSE * self.residuals + _NOISE))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PreparedLooks:
+    """What was found out beforehand about a table and its goal image.
+
+    Attributes:
+        first: of the first frame.
+        goal: of the goal image.
+    """
+
+    first: PreparedLook
+    goal: PreparedLook
+
+    def step(self, look: str, models: ObjectModels, observation: Observation) -> EstimateStep | None:
+        """The result of a look, "first" or "goal", if it explains what is seen; None if an estimator must find it."""
+        prepared = self.first if look == "first" else self.goal
+        if not prepared.explains(models, observation):
+            return None
+        estimate = prepared.estimate
+        return EstimateStep(Progress(1, 1, "prepared with this example"), "done", estimate.state, estimate=estimate)
+
+
+class _LookJson(Entry):
+    estimate: EstimateJson
+    residuals: list[float]
+
+    def look(self) -> PreparedLook:
+        estimate = self.estimate.estimate()
+        if len(self.residuals) != len(estimate.state.names):
+            raise InvalidInput("number of residuals", len(self.residuals), f"{len(estimate.state.names)}")
+        return PreparedLook(estimate, np.array(self.residuals, float))
+
+
+class _LooksJson(Entry):
+    first: _LookJson
+    goal: _LookJson
+
+
+def prepared_to_json(prepared: PreparedLooks) -> dict[str, Any]:
+    """As plain lists and numbers."""
+    looks = {
+        name: _LookJson(estimate=EstimateJson.of_estimate(look.estimate), residuals=look.residuals.round(6).tolist())
+        for name, look in (("first", prepared.first), ("goal", prepared.goal))
+    }
+    return encode(_LooksJson(**looks))
+
+
+def prepared_from_json(data: object) -> PreparedLooks:
+    """Of parsed JSON.
+
+    Raises:
+        InvalidInput: if something is missing or out of range; the message names it.
+    """
+    looks = decode(_LooksJson, data, "prepared looks")
+    return PreparedLooks(looks.first.look(), looks.goal.look())

@@ -9,17 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses.orientation_hypotheses import with_pose
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
-from osfcore.estimation.objective.parametrization import SceneParameters
-from osfcore.estimation.objective.photometric_loss import loss_of
+from osfcore.estimation.hypotheses import with_pose
+from osfcore.estimation.objective import FINE_SIDE, ObjectModels, SceneParameters, loss_of, views_of
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.objects.asset import Symmetry
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 
 _NO_WORSE = 1.01  # times the loss, by which an object may explain the goal image worse where it is now
 _STAYS_M, _STAYS_RAD = 0.006, 0.12  # a goal this close to where an object is, is where it is

@@ -13,7 +13,7 @@ from osfcore.geometry.states import SceneState
 
 
 class DynamicsModel(Protocol):
-    """Predicts what pushes do: our `PushModel`, or the paper's (`osfcore.paper.dynamics.rollout`)."""
+    """Predicts what pushes do: our `PushModel`, or the paper's (`osfcore.paper.dynamics`)."""
 
     device: torch.device
 

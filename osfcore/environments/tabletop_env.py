@@ -1,30 +1,87 @@
 """Rearrangement of a simulated tabletop as a Gymnasium environment.
 
-Each episode is a random rearrangement task (`osfcore.world.rearrangement_tasks`): a scene at rest, and how it
+Each episode is a random rearrangement task (`osfcore.world.tasks`): a scene at rest, and how it
 shall become.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from osfcore.environments.observations import KINDS, Kind, observation_of, space_of
 from osfcore.errors import InvalidInput, NoRoom, OsfError, finite_vector
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
-from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S, check_action
+from osfcore.geometry.states import SceneState, pose_rows
+from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M, check_action
 from osfcore.io.image_file import to_uint8
 from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.data_dir import default_data_dir
-from osfcore.world.rearrangement_tasks import Family, TaskSet, check_tasks, draw_task
-from osfcore.world.scene_request import SceneRequest, check_request
+from osfcore.world.scenes import SceneRequest, check_request
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tasks import Family, TaskSet, check_tasks, draw_task
+
+# What an environment tells of a table: spaces and values of poses and pixels.
+
+
+Kind = Literal["poses", "pixels", "both"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+def space_of(kind: Kind, objects: int, available: int, views: int, side: int) -> gymnasium.spaces.Dict:
+    """The space of observations.
+
+    Args:
+        kind: of them.
+        objects: in the scene (N).
+        available: objects to choose from.
+        views: images of the table (V).
+        side: of each image [px].
+    """
+    box = gymnasium.spaces.Box
+    spaces: dict[str, gymnasium.Space[Any]] = {"pusher": box(-PUSHER_REACH_M, PUSHER_REACH_M, (2,), np.float64)}
+    goal: dict[str, gymnasium.Space[Any]] = {}
+    if kind != "pixels":
+        spaces["objects"] = gymnasium.spaces.MultiDiscrete([available] * objects)
+        limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (objects, 1))
+        spaces["poses"] = goal["poses"] = box(-limits, limits, dtype=np.float64)
+    if kind != "poses":
+        spaces["pixels"] = box(0, 255, (views, side, side, 3), np.uint8)
+        goal["pixels"] = box(0, 255, (side, side, 3), np.uint8)
+    return gymnasium.spaces.Dict({**spaces, "goal": gymnasium.spaces.Dict(goal)})
+
+
+def observation_of(
+    state: SceneState,
+    goal: SceneState,
+    available: tuple[str, ...],
+    pixels: Mapping[str, UInt8[np.ndarray, "..."]] | None,
+    kind: Kind,
+) -> dict[str, Any]:
+    """An observation, nothing of which belongs to another one.
+
+    Args:
+        state: of the table.
+        goal: how it shall become.
+        available: objects to choose from: what is told of an object is its number in them.
+        pixels: images of "table" and "goal", where they are told.
+        kind: of the observation.
+    """
+    assert state.pusher is not None, "a simulated table has a pusher"
+    told: dict[str, Any] = {"pusher": state.pusher[:2].clip(-PUSHER_REACH_M, PUSHER_REACH_M)}
+    aim: dict[str, Any] = {}
+    if kind != "pixels":
+        told["objects"] = np.array([available.index(name) for name in state.names])
+        told["poses"], aim["poses"] = pose_rows(state.poses), pose_rows(goal.poses)
+    if pixels is not None:
+        told["pixels"], aim["pixels"] = pixels["table"].copy(), pixels["goal"].copy()
+    return {**told, "goal": aim}
+
 
 _DRAWS = 10  # of a task, where objects do not fit
 _SEEDS = 1 << 31

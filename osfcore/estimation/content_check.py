@@ -14,13 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from osfcore.estimation.content_verdict import ContentCheck, Verdict
-from osfcore.estimation.hypotheses.scene_assembly import quick_scene, without_objects
-from osfcore.estimation.hypotheses.template_matching import match_templates, table_errors
-from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, views_of
-from osfcore.estimation.objective.photometric_loss import loss_of
-from osfcore.estimation.objective.resting_orientations import yaw_quaternions
+from osfcore.estimation.hypotheses import match_templates, quick_scene, table_errors, without_objects
+from osfcore.estimation.objective import FINE_SIDE, QUALITY, ObjectModels, loss_of, views_of, yaw_quaternions
+from osfcore.estimation.steps import ContentCheck, Verdict
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import quaternion_multiply, rotate
 from osfcore.geometry.states import Observation, SceneState

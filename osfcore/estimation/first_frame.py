@@ -15,17 +15,33 @@ from typing import Literal
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses.orientation_hypotheses import compare_orientations, side_hypotheses, yaw_hypotheses
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, ObjectView, ObservedViews, crop_to_masks, views_of
-from osfcore.estimation.objective.parametrization import LIGHT, SceneParameters
-from osfcore.estimation.objective.photometric_loss import photometric_loss, residuals
-from osfcore.estimation.search.cma_es import CMAES
-from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
-from osfcore.estimation.search.light_search import search_light
-from osfcore.estimation.search.multistart_cma import SHIFT_M, TURN_RAD, MultistartCMA
-from osfcore.estimation.search.pose_initialization import OVERHEAD, RankedPoses, initial_poses, rank_poses
-from osfcore.estimation.step_reporter import StepReporter
+from osfcore.estimation.hypotheses import compare_orientations, side_hypotheses, yaw_hypotheses
+from osfcore.estimation.objective import (
+    FINE_SIDE,
+    LIGHT,
+    ObjectModels,
+    ObjectView,
+    ObservedViews,
+    SceneParameters,
+    crop_to_masks,
+    photometric_loss,
+    residuals,
+    views_of,
+)
+from osfcore.estimation.search import (
+    CMAES,
+    OVERHEAD,
+    SHIFT_M,
+    TURN_RAD,
+    GaussNewtonState,
+    MultistartCMA,
+    RankedPoses,
+    StepReporter,
+    gauss_newton,
+    initial_poses,
+    rank_poses,
+    search_light,
+)
 from osfcore.estimation.steps import EstimateStep, Stage
 from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit, relative_allowance
 from osfcore.geometry.poses import Pose

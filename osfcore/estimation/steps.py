@@ -1,4 +1,4 @@
-"""What an estimator yields while it works."""
+"""What estimators and checks of a photo's content return; apart from them, so that reading it loads no model."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.estimation.photometry.image_model import ImageModel
-from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.estimation.camera_response import ImageModel
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.progress import Progress
+
+# What an estimator yields while it works.
+
 
 UNPLACED_BELOW_M = -0.5  # an object that was not looked at yet is put far below the table
 Stage = Literal["orientations", "light", "objects", "together", "polish", "done"]
@@ -55,3 +57,26 @@ def all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None,
         yield before
         before = step
     return before
+
+
+# What a check of a photo's content answers; apart from the check, so that whoever asks need not load its models.
+
+
+Verdict = Literal["shown", "doubtful", "others", "bare", "elsewhere"]
+
+
+@dataclass(frozen=True, slots=True)
+class ContentCheck:
+    """What a photo shows.
+
+    Attributes:
+        verdict: "shown" if the objects are in it, "doubtful" if they may be, "others" if something else is, "bare" if
+            nothing stands out from the table, "elsewhere" if it does not show the table as its camera would.
+        colours: share of the photo's colours that are the objects', times the share of theirs that is found in it.
+        template: log of the factor by which the photometric loss grows without the object that is seen best; 0
+            where the colours sufficed, or the photo shows no such table.
+    """
+
+    verdict: Verdict
+    colours: float = 0.0
+    template: float = 0.0

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, ObservedViews, views_of
-from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
-from osfcore.estimation.search.gauss_newton import difference_steps
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.estimation.objective import FINE_SIDE, LIGHT, POSE, ObjectModels, ObservedViews, SceneParameters, views_of
+from osfcore.estimation.search import difference_steps
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.render.types import SceneBatch
 
 # Calibrated on scenes that no reported figure uses.

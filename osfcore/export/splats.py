@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.spatial import KDTree
 
-from osfcore.dynamics.shapes.field_parts import field_mesh
-from osfcore.export.baked import baked
+from osfcore.dynamics.shapes import field_mesh
+from osfcore.export.meshes import baked
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from osfcore.errors import CorruptFile, UnknownName
-from osfcore.fields.field_weights import read_field
-from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.table_field import TableField, read_table
+from osfcore.fields.kiloosf import KiloOSF, read_field
+from osfcore.fields.table import TableField, read_table
 
 TABLE_NAME = "table"
 FIELD_FILE = "field.safetensors"

@@ -28,7 +28,7 @@ from torch.nn import functional
 
 from osfcore.errors import InvalidInput
 from osfcore.fields.kiloosf_query import Scatter
-from osfcore.fields.voxel_shell import FIRST_AMBIENT
+from osfcore.fields.rays import FIRST_AMBIENT
 
 DENSITY_GAIN = 50.0
 POSITION_OCTAVES = 10

@@ -56,3 +56,100 @@ class Light:
     def angle_to(self, other: Light) -> float:
         """The angle between the directions of two lights [rad]."""
         return float(np.arccos(np.clip(self.direction @ other.direction, -1, 1)))
+
+
+# A lamp at a finite distance that looks at a point: light falls off with distance and with the angle to its axis.
+#
+# A surface with normal n at a point x sees it along l = (p - x) / r, r = |p - x|, and sends out
+#
+#     radiance = albedo * (ambient + diffuse * visible * max(n . l, 0) * spot * (d0 / r)^2)
+#
+# with d0 the lamp's distance from the table's centre: as it moves away along its direction, it becomes the distant
+# light of the same direction. With a the angle between its axis and the way to x, and s = (outer - a) / (outer -
+# inner) cut to [0, 1], spot = s^2 (3 - 2 s): 1 inside the inner cone, 0 outside the outer one, a smooth step in the
+# penumbra between.
+
+
+MIN_LAMP_DISTANCE_M = 0.15
+MIN_PENUMBRA_RAD = 1e-6  # what divides where the cone has no penumbra
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SpotLamp:
+    """A white lamp with a cone.
+
+    Attributes:
+        position: in the world [m].
+        aim: the point that it looks at [m].
+        inner_deg: half-angle of the cone of full light.
+        outer_deg: half-angle of the cone beyond which it sheds no light.
+    """
+
+    position: Float[np.ndarray, "3"]
+    aim: Float[np.ndarray, "3"]
+    inner_deg: float
+    outer_deg: float
+
+    def __post_init__(self) -> None:
+        """Check the place, the aim and the cone.
+
+        Raises:
+            InvalidInput: if it is too near, too low, looks nowhere or has no sound cone.
+        """
+        object.__setattr__(self, "position", finite_vector(self.position, 3, "position of the lamp [m]"))
+        object.__setattr__(self, "aim", finite_vector(self.aim, 3, "point that the lamp looks at [m]"))
+        if self.distance < MIN_LAMP_DISTANCE_M:
+            allowed = f"at least {MIN_LAMP_DISTANCE_M:g}"
+            raise InvalidInput("distance of the lamp from the table's centre [m]", f"{self.distance:.3f}", allowed)
+        elevation_deg = float(np.rad2deg(np.arcsin(np.clip(self.direction[2], -1, 1))))
+        if elevation_deg < MIN_LIGHT_ELEVATION_DEG - 1e-6:
+            what = "elevation of the lamp above the table, seen from its centre [deg]"
+            raise InvalidInput(what, f"{elevation_deg:.1f}", f"at least {MIN_LIGHT_ELEVATION_DEG:g}")
+        if not np.linalg.norm(self.aim - self.position) > 1e-6:
+            raise InvalidInput("point that the lamp looks at [m]", self.aim.tolist(), "away from the lamp itself")
+        if not 0 < self.inner_deg <= self.outer_deg <= 90:
+            what = "half-angles of the lamp's inner and outer cone [deg]"
+            raise InvalidInput(what, f"{self.inner_deg:g} and {self.outer_deg:g}", "0 < inner <= outer <= 90")
+
+    @property
+    def distance(self) -> float:
+        """From the table's centre [m]."""
+        return float(np.linalg.norm(self.position))
+
+    @property
+    def direction(self) -> Float[np.ndarray, "3"]:
+        """Unit vector from the table's centre toward the lamp."""
+        return self.position / self.distance
+
+    @property
+    def axis(self) -> Float[np.ndarray, "3"]:
+        """Unit vector from the lamp toward the point it looks at."""
+        way = self.aim - self.position
+        return way / np.linalg.norm(way)
+
+    @property
+    def cone_rad(self) -> tuple[float, float]:
+        """The inner and the outer half-angle [rad]."""
+        return float(np.deg2rad(self.inner_deg)), float(np.deg2rad(self.outer_deg))
+
+    @property
+    def distant(self) -> Light:
+        """The distant light of the same direction, which the lamp becomes as it moves away."""
+        return Light(self.position)
+
+    def toward(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
+        """Unit vectors from points [m] toward the lamp."""
+        way = self.position - points
+        return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+
+    def falloff(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
+        """How the light spreads on its way to points [m], (d0 / r)^2: 1 at the table's centre."""
+        squared = np.sum((self.position - points) ** 2, axis=-1)
+        return np.asarray(self.distance**2 / np.maximum(squared, 1e-18))
+
+    def spot_factor(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
+        """Share of the light that the cone sends toward points [m]."""
+        inner, outer = self.cone_rad
+        angle = np.arccos(np.clip(-self.toward(points) @ self.axis, -1, 1))
+        s = np.clip((outer - angle) / max(outer - inner, MIN_PENUMBRA_RAD), 0, 1)
+        return np.asarray(s**2 * (3 - 2 * s))

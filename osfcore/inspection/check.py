@@ -4,33 +4,86 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from osfcore.errors import CorruptFile, InvalidInput, shown
-from osfcore.fields.field_weights import FORMAT as FIELD_FORMAT
-from osfcore.fields.field_weights import read_field, tensor_format
-from osfcore.fields.table_field import TABLE_FORMAT, read_table
-from osfcore.fields.training.visual_hull import carve, silhouette_box
-from osfcore.inspection.bop_sheet import bop_sheet, check_places
-from osfcore.inspection.image_set_overlay import overlay_sheet
-from osfcore.inspection.observation_overlay import observation_sheet
+from osfcore.fields.kiloosf import FORMAT as FIELD_FORMAT
+from osfcore.fields.kiloosf import read_field, tensor_format
+from osfcore.fields.table import TABLE_FORMAT, read_table
+from osfcore.fields.visual_hull import carve, silhouette_box
+from osfcore.inspection.overlays import draw_line, draw_mask, draw_text, object_colour, observation_sheet, overlay_sheet
 from osfcore.io.archives import unpack_set
 from osfcore.io.files import read_json
-from osfcore.io.image_file import write_png
+from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.image_set import read_image_set, read_splits
 from osfcore.io.observation_file import OBSERVATION_FILE, is_observation, read_observation
 from osfcore.io.output_paths import check_place
-from osfcore.io.rollout_file import actions_from_json
-from osfcore.io.scene_file import scene_from_json
-from osfcore.io.state_file import estimated_from_json, is_estimated
-from osfcore.photo.other_programs.bop_images import is_bop_scene, read_images
-from osfcore.photo.other_programs.pose_file import result_images
+from osfcore.io.scene_file import actions_from_json, estimated_from_json, is_estimated, scene_from_json
+from osfcore.photo.bop import BopImage, is_bop_scene, read_images, result_images
+
+# What a scene of BOP holds, whether its parts fit each other, and pictures of how it was understood.
+
+
+_SHARE = 0.5  # of the objects whose annotated place must fit their masks
+_LEAST_PIXELS = 20  # of a mask that counts
+_AXIS_M = 0.05
+_AXES = ((0, 0, 255), (0, 255, 0), (255, 0, 0))
+_MOST_TILES, _COLUMNS, _SIDE = 8, 4, 384
+
+
+def check_places(images: Sequence[BopImage]) -> None:
+    """Refuse a scene in which most objects are annotated elsewhere than their masks are.
+
+    An object's centre must project into the box of its visible pixels, grown by the box's own size to all sides.
+
+    Raises:
+        InvalidInput: naming the first that does not fit: K, or a pose, is of other images.
+    """
+    fits = [(image, name, _fits(image, name)) for image in images for name in image.masks if name in image.poses]
+    wrong = [(image, name) for image, name, is_fit in fits if not is_fit]
+    if len(wrong) > _SHARE * len(fits):
+        image, name = wrong[0]
+        u, v = image.camera.project(image.poses[name].position)
+        what = f"place of {name} in image {image.number} by cam_K and cam_t_m2c [px]"
+        allowed = "where its mask is; cam_K may be of another image size, or the masks of another image"
+        raise InvalidInput(what, f"({u:.0f}, {v:.0f})", allowed)
+
+
+def _fits(image: BopImage, name: str) -> bool:
+    rows, columns = np.nonzero(image.masks[name])
+    if len(rows) < _LEAST_PIXELS:
+        return True
+    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
+    place = image.camera.project(image.poses[name].position)
+    return bool(np.all((place > 2 * low - high) & (place < 2 * high - low)))
+
+
+def bop_sheet(images: Sequence[BopImage]) -> UInt8[np.ndarray, "H W 3"]:
+    """A tile for each of up to eight images, BGR: outlines of masks, and axes of 5 cm of each annotated object."""
+    tiles = [_tile(image) for image in images[:_MOST_TILES]]
+    columns = min(_COLUMNS, len(tiles))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])
+
+
+def _tile(image: BopImage) -> UInt8[np.ndarray, "h w 3"]:
+    bgr = cv2.resize(to_uint8(image.picture[..., ::-1]), (_SIDE, _SIDE * 3 // 4), interpolation=cv2.INTER_AREA)
+    camera = image.camera.resized(bgr.shape[1], bgr.shape[0])
+    for number, (name, pose) in enumerate(image.poses.items()):
+        if name in image.masks:
+            draw_mask(bgr, image.masks[name], name, object_colour(number))
+        for axis, colour in zip(np.eye(3), _AXES, strict=True):
+            draw_line(bgr, camera, pose.position, pose.apply(_AXIS_M * axis), colour, 2)
+    draw_text(bgr, f"image {image.number}", (6, 16), (255, 255, 255))
+    return bgr
+
 
 _REASON_CHARACTERS = 500
 
@@ -133,7 +186,7 @@ def _check_field(path: Path) -> Report:
         table = read_table(path)
         return Report("field", "the table", {"half_side": table.half_side})
     if kind is not None and kind != FIELD_FORMAT:
-        from osfcore.dynamics.network_weights import FORMAT, read_network
+        from osfcore.dynamics.graph import FORMAT, read_network
 
         if kind == FORMAT:
             network = read_network(path)

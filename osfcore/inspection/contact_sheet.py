@@ -1,15 +1,28 @@
-"""Contact sheets: truth, ours and the difference, below each other; and grids of images with names."""
+"""Contact sheets: truth, ours and the difference; photographed objects; one object from all around."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from osfcore.errors import InvalidInput
+from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose
+from osfcore.io.image_file import to_uint8, write_png
+from osfcore.objects.asset import TexturedMesh
+from osfcore.photo.photograph import Photograph
+from osfcore.photo.pose_loss import draw, object_windows
+from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject
+from osfcore.world.imaging import RayTracer, TracedMesh
+
+# Contact sheets: truth, ours and the difference, below each other; and grids of images with names.
+
 
 DIFFERENCE_GAIN = 4
 _LABEL_PX = 16
@@ -110,3 +123,87 @@ def put_text(sheet: UInt8[np.ndarray, "H W 3"], text: str, place: tuple[int, int
     while text and cv2.getTextSize(text, font, scale, 1)[0][0] > width:
         text = text[:-1]
     cv2.putText(sheet, text, place, font, scale, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+# Contact sheets of photographed objects: the photo, outlines, and what the surfels look like.
+
+
+_SIDE = 180  # of a mask [px]
+_MASK_COLOUR, _FOUND_COLOUR = (255, 60, 60), (60, 220, 60)
+
+
+def sheet(models: PhotoModels, photo: Photograph, found: PhotoObject) -> UInt8[np.ndarray, "H W 3"]:
+    """Photo; photo with the outlines of the mask (red) and of what was found (green); the object in its pose.
+
+    Args:
+        models: of the objects.
+        photo: in whose frame the pose is told.
+        found: in it.
+    """
+    window = object_windows([photo], found.name, _SIDE)[0]
+    surfels, pose = models.surfels(found.name, FINE_ACROSS), found.best.pose
+    index = draw(surfels, window, Pose(pose.position[None], pose.quaternion[None]))[0][0]
+    shown = index >= 0
+    picture = to_uint8(srgb_of_linear(window.image))
+    outlined = picture.copy()
+    for mask, colour in ((window.mask, _MASK_COLOUR), (shown, _FOUND_COLOUR)):
+        contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(outlined, contours, -1, colour, 1)
+    albedo = np.where(shown[..., None], surfels.albedo[np.maximum(index, 0)], 0)
+    return np.hstack([picture, outlined, to_uint8(srgb_of_linear(albedo))])
+
+
+def write_sheet(path: Path, models: PhotoModels, photo: Photograph, found: PhotoObject) -> None:
+    """Write a sheet as PNG.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_png(path, sheet(models, photo, found))
+
+
+# One object from all around in one picture, by the project's own image model: what a thumbnail turns through.
+
+
+VIEWS, SIDE = 24, 96
+_FIELD_OF_VIEW_DEG = 24.0
+_ELEVATION_RAD = np.deg2rad(22.0)
+_LIGHT_TURN_RAD, _LIGHT_ELEVATION_RAD = np.deg2rad(-50.0), np.deg2rad(48.0)  # from the left, above the camera
+
+
+def turntable(mesh: TexturedMesh, views: int = VIEWS, side: int = SIDE) -> UInt8[np.ndarray, "side width 4"]:
+    """Views of an object that turns once under a lamp that stays, side by side.
+
+    Args:
+        mesh: the object.
+        views: how many, 360 / views degrees apart.
+        side: of each [px].
+
+    Returns:
+        RGBA, transparent around the object; not premultiplied.
+    """
+    traced = TracedMesh(mesh)
+    tracer = RayTracer({"object": traced})
+    distance = 1.02 * traced.radius_m / np.sin(np.deg2rad(_FIELD_OF_VIEW_DEG) / 2)
+    pictures = []
+    for azimuth in 2 * np.pi * np.arange(views) / views:
+        position = distance * _direction(azimuth, _ELEVATION_RAD)
+        camera = Camera.look_at("turn", position, (0, 0, 0), size=side, fov_y_deg=_FIELD_OF_VIEW_DEG)
+        light = _direction(azimuth + _LIGHT_TURN_RAD, _LIGHT_ELEVATION_RAD)
+        picture = tracer.render_alone("object", light, camera)
+        alpha = picture.coverage[0]
+        colour = picture.rgb / np.maximum(alpha, 1e-3)[..., None]
+        pictures.append(np.concatenate([to_uint8(colour), to_uint8(alpha)[..., None]], axis=-1))
+    return np.concatenate(pictures, axis=1)
+
+
+def _direction(azimuth: float, elevation: float) -> np.ndarray:
+    level = np.cos(elevation)
+    return np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
+
+
+def turntable_png(mesh: TexturedMesh) -> bytes:
+    """The same as PNG."""
+    picture = turntable(mesh)
+    in_file_order = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
+    return cv2.imencode(".png", in_file_order, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()

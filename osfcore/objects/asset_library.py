@@ -182,7 +182,7 @@ class AssetLibrary:
         Raises:
             FetchFailed: if the disk is full or the folder cannot be written; nothing is changed.
         """
-        from osfcore.objects.viewer_mesh import viewer_glb
+        from osfcore.objects.asset import viewer_glb
 
         glb = viewer_glb(asset.mesh)
         with raising_fetch_failed(asset.info.name, self.root):

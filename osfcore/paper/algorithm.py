@@ -13,16 +13,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.control.estimators import Estimators
+from osfcore.control.estimators import Estimators, SceneModels
 from osfcore.control.events import ActionExecuted, Event, Finished, Looking, Observed, Planning, Stepped
 from osfcore.control.goal import GoalImage
-from osfcore.control.scene_models import SceneModels
-from osfcore.control.world_protocol import World
+from osfcore.control.world import World
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.paper.mppi import STEPS, GaussianMPPI, GaussianPlanSettings
-from osfcore.planning.image_cost import ImageCost
+from osfcore.planning.costs import ImageCost
 from osfcore.render.types import PLANNING, SceneBatch
 
 

@@ -23,16 +23,12 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import FINE_SIDE, ObservedViews, views_of
-from osfcore.estimation.objective.parametrization import SceneParameters
-from osfcore.estimation.search.cma_es import CMAES
-from osfcore.estimation.step_reporter import StepReporter
+from osfcore.estimation.objective import FINE_SIDE, ObjectModels, ObservedViews, SceneParameters, views_of
+from osfcore.estimation.search import CMAES, StepReporter
 from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.render.types import SceneBatch
 
 POSE, LIGHT = 7, 3

@@ -18,8 +18,8 @@ from osfcore.errors import check_ranges
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S
+from osfcore.planning.costs import Cost
 from osfcore.planning.mppi import PlanRound, Rollout
-from osfcore.planning.pose_cost import Cost
 
 STEPS = 30  # T, actions of an episode
 

@@ -10,18 +10,16 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.control.estimators import Estimators
-from osfcore.control.scene_models import SceneModels
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.control.estimators import Estimators, SceneModels
+from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.states import Observation, SceneState
-from osfcore.paper.dynamics.rollout import load_paper_push_model
+from osfcore.paper.dynamics import load_paper_push_model
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first, estimate_next
-from osfcore.paper.fields.tiny_field import TinyField
-from osfcore.paper.fields.weights import read_field
+from osfcore.paper.fields import TinyField, read_field
 from osfcore.paper.method import paper_field_path
-from osfcore.paper.rendering.renderer import PaperRenderer
+from osfcore.paper.rendering import PaperRenderer
 
 StageName = Literal["fields", "estimation", "dynamics", "planning"]
 STAGES: tuple[StageName, ...] = get_args(StageName)

@@ -1,24 +1,394 @@
-"""The printed calibration board, which gives the camera of one photograph of a table; single markers do it too.
-
-The table frame: the print lies flat on the table, its centre is the origin, x runs along its top edge to the right, y
-towards its top, z up.
-"""
+"""The printed board: its pattern, its page, its markers, and the camera's pose over it."""
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFont
 
-from osfcore.errors import InvalidInput, check_ranges
-from osfcore.geometry.poses import Pose
-from osfcore.photo.markers import Marker, find_markers, marker_dictionary
-from osfcore.photo.pattern import NOTHING, PATCH_CORNERS, FoundPoints, Pattern, find_points, transform
-from osfcore.photo.planar_pose import focal_length, planar_pose
+from osfcore.errors import InvalidInput, UnknownName, check_ranges
+from osfcore.geometry.poses import Pose, quaternion_from_matrix
+
+# ArUco and AprilTag markers: which dictionaries there are, and where markers lie in a photograph, roughly.
+
+
+_DETECTION_SIDE = 1920  # smaller photographs are enlarged towards it: markers of 10 px are read far more often
+_MAX_MARKER_ENLARGEMENT = 3.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Marker:
+    """One marker in a photograph; it may be a mistake, since marks are read leniently.
+
+    Attributes:
+        number: of the marker in its dictionary.
+        corners_px: of its black border: top left, top right, bottom right, bottom left of the print [px].
+    """
+
+    number: int
+    corners_px: Float[np.ndarray, "4 2"]
+
+
+def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """A predefined dictionary of OpenCV, such as "DICT_4X4_50".
+
+    Raises:
+        UnknownName: if OpenCV has none of that name.
+    """
+    known = {key: number for key, number in vars(cv2.aruco).items() if key.startswith("DICT_")}
+    if name not in known:
+        raise UnknownName("dictionary of markers", name, sorted(known))
+    return cv2.aruco.getPredefinedDictionary(known[name])
+
+
+def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: cv2.aruco.Dictionary) -> list[Marker]:
+    """Markers of a dictionary, about one pixel exact.
+
+    Bits are read leniently, which finds twice as many markers of 10 px as OpenCV's defaults, and wrong ones: whoever
+    asks has to check them against what was printed.
+
+    Args:
+        grey: the photograph.
+        dictionary: of the markers.
+    """
+    scale = min(max(_DETECTION_SIDE / max(grey.shape), 1.0), _MAX_MARKER_ENLARGEMENT)
+    large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) if scale > 1 else grey
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, _lenient_parameters()).detectMarkers(large)
+    if numbers is None:
+        return []
+    sizes = np.divide(grey.shape[::-1], large.shape[::-1])
+    return [
+        Marker(int(number), (quad.reshape(4, 2).astype(float) + 0.5) * sizes)
+        for quad, number in zip(corners, np.ravel(numbers), strict=True)
+    ]
+
+
+def _lenient_parameters() -> cv2.aruco.DetectorParameters:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = 5
+    parameters.adaptiveThreshWinSizeMax = 45
+    parameters.adaptiveThreshWinSizeStep = 8
+    parameters.minMarkerPerimeterRate = 0.01
+    parameters.perspectiveRemovePixelPerCell = 8
+    parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25
+    parameters.maxErroneousBitsInBorderRate = 0.5
+    parameters.errorCorrectionRate = 1.0
+    return parameters
+
+
+# A flat printed pattern in a photograph, aligned patch by patch to hundredths of a pixel.
+#
+# Corner detectors see a few pixels around a corner, and what else is printed there pulls them off by a tenth of a
+# pixel. Here the known print is drawn as the camera would see it, and each patch of it is shifted until it lies on
+# the photograph, so that every edge in the patch counts and the marks near a corner help instead of disturbing.
+
+
+_BLUR_PX = 0.8  # of a sharp photograph; half or twice as much hardly moves the result
+_INK = 0.06  # reflectance of black, where white is 1
+_GAMMA = 1 / 2.2  # of the photograph's values; edges look shifted where light is mixed before it is encoded
+_ROUNDS = 8
+_SETTLED_PX = 0.005
+_MAX_SHIFT_PX = 3.0
+_MIN_CORRELATION = 0.5  # between a patch and the photograph: below, something lies on it or it is not there
+_MIN_PIXELS = 30
+_UNLIKE = 0.02  # more than three times the usual lack of correlation, and a patch is left out
+_LEAST = 4  # points make a homography
+_OUTLIER_PX, _LEAST_OUTLIER_PX = 2.0, 0.1
+_RIDGE = 1e-7
+_FINE_PATCH_PX = 150  # a patch is drawn at least so large, if that is at most three times larger than it is seen
+_MAX_ENLARGEMENT = 3
+_MARGIN_PX = 2
+_FAR_PX = 1e6  # no print reaches so far
+_PIXEL_CENTRE = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from indices to coordinates [px]
+PATCH_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
+
+Homography = Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pattern:
+    """A print and the patches by which it is aligned.
+
+    Attributes:
+        image: reflectance, from 0 (black) to 1 (paper); its centre is the origin, its top lies along +y.
+        size_m: width and height of the image [m].
+        centres_m: of the square patches [m].
+        patch_m: side of a patch [m].
+    """
+
+    image: Float[np.ndarray, "h w"]
+    size_m: tuple[float, float]
+    centres_m: Float[np.ndarray, "P 2"]
+    patch_m: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FoundPoints:
+    """Centres of those patches that were found.
+
+    Attributes:
+        points_m: in the pattern's plane [m].
+        points_px: in the photograph [px].
+    """
+
+    points_m: Float[np.ndarray, "N 2"]
+    points_px: Float[np.ndarray, "N 2"]
+
+
+NOTHING = FoundPoints(np.empty((0, 2)), np.empty((0, 2)))
+
+
+def transform(homography: Homography, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    """Apply a homography to points of the plane."""
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    return mapped[..., :2] / mapped[..., 2:]
+
+
+def find_points(grey: UInt8[np.ndarray, "h w"], pattern: Pattern, guess: Homography) -> FoundPoints:
+    """Align a pattern with a photograph.
+
+    In turn each patch's shift d is found, for which the photograph is closest to a R(x - d) + b with the print R drawn
+    as the camera sees it and any contrast a and brightness b, and the homography is fitted anew to the shifted centres.
+    Patches that look different from the print, or moved otherwise than the others, are left out: something lies on
+    them, or a shadow's edge.
+
+    Args:
+        grey: the photograph, as encoded by the camera.
+        pattern: that is looked for.
+        guess: homography from the pattern's plane [m] to the photograph [px], right within 1 to 2 px.
+
+    Returns:
+        The patches that agree; none, if fewer than 4 do.
+    """
+    homography, outlier_px, found = guess, _OUTLIER_PX, NOTHING
+    for _ in range(_ROUNDS):
+        seen = _seen_patches(grey, pattern, homography)
+        if len(seen.points_m) < _LEAST:
+            return NOTHING
+        fit, inliers = cv2.findHomography(seen.points_m, seen.points_px, cv2.RANSAC, outlier_px)
+        if fit is None:
+            return NOTHING
+        fits = inliers.ravel() > 0
+        found = FoundPoints(seen.points_m[fits], seen.points_px[fits])
+        moved = transform(fit, found.points_m) - transform(homography, found.points_m)
+        residuals = np.linalg.norm(transform(fit, seen.points_m) - seen.points_px, axis=1)
+        outlier_px = float(np.clip(3 * np.median(residuals), _LEAST_OUTLIER_PX, _OUTLIER_PX))
+        homography = fit
+        if np.abs(moved).max() < _SETTLED_PX:
+            break
+    return found
+
+
+def _seen_patches(grey: UInt8[np.ndarray, "h w"], pattern: Pattern, homography: Homography) -> FoundPoints:
+    """Where patches lie, near where the homography puts them, without those that are less like the print than most."""
+    fine, enlargement = _resampled(pattern, homography)
+    seen = np.array([_patch_shift(grey, fine, homography, centre, enlargement) for centre in pattern.centres_m])
+    there = np.isfinite(seen[:, 2])
+    if not there.any():
+        return NOTHING
+    unlike = 1 - seen[:, 2]
+    there &= unlike <= 3 * np.median(unlike[there]) + _UNLIKE
+    centres = pattern.centres_m[there]
+    return FoundPoints(centres, transform(homography, centres) + seen[there, :2])
+
+
+def _resampled(pattern: Pattern, homography: Homography) -> tuple[Pattern, int]:
+    """The pattern about as fine as it is drawn, and how many times finer than the photograph it is drawn."""
+    quads = transform(homography, pattern.centres_m[:, None] + pattern.patch_m * PATCH_CORNERS)
+    side_px = float(np.median(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).max(axis=1)))
+    enlargement = int(np.clip(np.ceil(_FINE_PATCH_PX / max(side_px, 1.0)), 1, _MAX_ENLARGEMENT))
+    pixels = enlargement * side_px / pattern.patch_m * np.array(pattern.size_m)
+    if not np.all(pixels < pattern.image.shape[::-1]):
+        return pattern, enlargement
+    image = cv2.resize(pattern.image, np.maximum(pixels, 8).astype(int).tolist(), interpolation=cv2.INTER_AREA)
+    return replace(pattern, image=image), enlargement
+
+
+def _patch_shift(
+    grey: UInt8[np.ndarray, "h w"],
+    pattern: Pattern,
+    homography: Homography,
+    centre_m: Float[np.ndarray, "2"],
+    enlargement: int,
+) -> Float[np.ndarray, "3"]:
+    """How far a patch lies from where the homography puts it [px], and the correlation; NaN if it is not there."""
+    missing = np.full(3, np.nan)
+    quad = transform(homography, centre_m + pattern.patch_m * PATCH_CORNERS)
+    size = np.array(grey.shape[::-1])
+    if not np.all(np.abs(quad) < _FAR_PX) or not np.all((quad.mean(axis=0) > 0) & (quad.mean(axis=0) < size)):
+        return missing
+    low = np.maximum(np.floor(quad.min(axis=0)) - _MARGIN_PX, 0).astype(int)
+    high = np.minimum(np.ceil(quad.max(axis=0)) + _MARGIN_PX, size).astype(int)
+    drawn = _drawn(pattern, homography, low, high, enlargement)
+    mask = cv2.fillConvexPoly(np.zeros(drawn.shape, np.uint8), np.round(quad - low - 0.5).astype(np.int32), 1) > 0
+    if mask.sum() < _MIN_PIXELS:
+        return missing
+    slopes = [cv2.Scharr(drawn, cv2.CV_32F, *order, scale=1 / 32)[mask] for order in ((1, 0), (0, 1))]
+    design = np.stack([*slopes, drawn[mask], np.ones(mask.sum(), np.float32)], axis=1).astype(float)
+    seen = grey[low[1] : high[1], low[0] : high[0]][mask] / 255.0
+    correlation = np.corrcoef(design[:, 2], seen)[0, 1] if np.ptp(seen) > 0 else 0.0
+    if not correlation > _MIN_CORRELATION:
+        return missing
+    # a R(x - d) + b is a R - a d . grad R + b for small d
+    *moved, contrast, _ = np.linalg.solve(design.T @ design + _RIDGE * len(seen) * np.eye(4), design.T @ seen)
+    shift = -np.array(moved) / contrast
+    return np.append(shift, correlation) if contrast > 0 and np.linalg.norm(shift) < _MAX_SHIFT_PX else missing
+
+
+def _drawn(
+    pattern: Pattern, homography: Homography, low: Int[np.ndarray, "2"], high: Int[np.ndarray, "2"], enlargement: int
+) -> Float[np.ndarray, "h w"]:
+    """What a camera shows of a pattern between two corners of its image, with values from 0 to 1."""
+    height, width = pattern.image.shape
+    from_pixels = np.array(
+        [
+            [pattern.size_m[0] / width, 0, -pattern.size_m[0] / 2],
+            [0, -pattern.size_m[1] / height, pattern.size_m[1] / 2],
+            [0, 0, 1],
+        ]
+    )
+    shrink = np.array([[enlargement, 0, -enlargement * low[0]], [0, enlargement, -enlargement * low[1]], [0, 0, 1]])
+    warp = np.linalg.inv(_PIXEL_CENTRE) @ shrink @ homography @ from_pixels @ _PIXEL_CENTRE
+    columns, rows = (high - low).tolist()
+    light = cv2.warpPerspective(pattern.image, warp, (columns * enlargement, rows * enlargement), borderValue=(1.0,))
+    light = cv2.GaussianBlur(cv2.resize(light, (columns, rows), interpolation=cv2.INTER_AREA), (0, 0), _BLUR_PX)
+    return (_INK + (1 - _INK) * light) ** _GAMMA
+
+
+# Where a camera stands that sees known points of the table plane, and its focal length.
+
+
+_FOCAL_FLAGS = (
+    cv2.CALIB_USE_INTRINSIC_GUESS
+    | cv2.CALIB_FIX_PRINCIPAL_POINT
+    | cv2.CALIB_FIX_ASPECT_RATIO
+    | cv2.CALIB_ZERO_TANGENT_DIST
+    | cv2.CALIB_FIX_K1
+    | cv2.CALIB_FIX_K2
+    | cv2.CALIB_FIX_K3
+)
+UNTOLD = "focal length"  # of the error for a view that does not tell it
+_MAX_FOCAL_STD = 0.03  # of the focal length
+_FOCAL_RANGE = (0.3, 10.0)  # focal lengths of cameras, in longer sides of the image
+
+
+def planar_pose(
+    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], intrinsics: Float[np.ndarray, "3 3"]
+) -> tuple[Pose, float]:
+    """The pose of a camera that sees at least 4 points of the table plane.
+
+    A plane seen from afar fits two poses almost equally well (Collins and Bartoli 2014); both are refined, and the
+    one with the smaller reprojection error above the table is taken.
+
+    Args:
+        points_m: x, y of the points on the table, z = 0 [m].
+        points_px: where they appear [px].
+        intrinsics: of the camera [px].
+
+    Returns:
+        `T_world_camera`, and the root mean square distance of the points from where they should appear [px].
+
+    Raises:
+        InvalidInput: if the camera would have to be below the table.
+    """
+    points, pixels = np.pad(points_m, ((0, 0), (0, 1))), np.ascontiguousarray(points_px, float)
+    _, rotations, translations, _ = cv2.solvePnPGeneric(points, pixels, intrinsics, None, flags=cv2.SOLVEPNP_IPPE)
+    best: tuple[Pose, float] | None = None
+    for start in zip(rotations, translations, strict=True):
+        rotation, translation = cv2.solvePnPRefineLM(points, pixels, intrinsics, None, *start)
+        seen, _ = cv2.projectPoints(points, rotation, translation, intrinsics, None)
+        rms = float(np.sqrt(np.square(seen.reshape(-1, 2) - pixels).sum(axis=1).mean()))
+        T_camera_world = Pose(translation.ravel(), quaternion_from_matrix(cv2.Rodrigues(rotation)[0]))
+        T_world_camera = T_camera_world.inverse()
+        if T_world_camera.position[2] > 0 and translation[2] > 0 and (best is None or rms < best[1]):
+            best = T_world_camera, rms
+    if best is None:
+        raise InvalidInput(
+            "side of the print that the photograph shows", "its back", "its front: mirror the photograph"
+        )
+    return best
+
+
+def focal_length(
+    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], size: tuple[int, int], accuracy_px: float
+) -> tuple[float, float]:
+    """The focal length from one view of a plane, for square pixels, no distortion and a centred principal point.
+
+    Args:
+        points_m: x, y of the points on the table [m].
+        points_px: where they appear [px].
+        size: width and height of the image [px].
+        accuracy_px: the least error that is expected of the points, whatever their scatter [px].
+
+    Returns:
+        The focal length and its standard deviation [px].
+
+    Raises:
+        InvalidInput: if the standard deviation is above 3 %: seen from straight above, a plane looks the same through a
+            long lens from afar as through a short one from near by.
+    """
+    fit = calibrated(points_m, points_px, size, accuracy_px)
+    if fit is None or fit.focal_std > _MAX_FOCAL_STD * fit.focal:
+        raise InvalidInput(
+            UNTOLD, "unknown, and the print is too small in this view, or seen too steeply, to tell it",
+            "given, or the photograph taken from near by and at a slant, 30 to 60 degrees above the table",
+        )  # fmt: skip
+    return fit.focal, fit.focal_std
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Calibration:
+    """A camera with square pixels and a centred principal point that fits one view of a plane.
+
+    Attributes:
+        focal: length [px].
+        focal_std: its standard deviation [px].
+        rotation: of the table in the camera's frame, a rotation vector [rad].
+        translation: of the table's origin in it [m].
+    """
+
+    focal: float
+    focal_std: float
+    rotation: Float[np.ndarray, "3"]
+    translation: Float[np.ndarray, "3"]
+
+
+def calibrated(
+    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], size: tuple[int, int], accuracy_px: float
+) -> Calibration | None:
+    """The camera whose focal length fits best; None if no usual focal length fits. Arguments as of `focal_length`."""
+    points = [np.pad(points_m, ((0, 0), (0, 1))).astype(np.float32)]
+    pixels = [np.ascontiguousarray(points_px, np.float32)]
+    guess = cv2.initCameraMatrix2D(points, pixels, size)[0, 0]
+    low, high = np.multiply(_FOCAL_RANGE, max(size))
+    start = float(guess) if low < guess < high else float(max(size))
+    matrix = np.array([[start, 0, size[0] / 2], [0, start, size[1] / 2], [0, 0, 1]])
+    _, matrix, _, rotations, translations = cv2.calibrateCamera(
+        points, pixels, size, matrix, np.zeros(5), flags=_FOCAL_FLAGS
+    )
+    seen, jacobian = cv2.projectPoints(points[0], rotations[0], translations[0], matrix, None)
+    # The last pivot says how far the points move with the focal length in ways that no motion of the camera explains.
+    columns = np.column_stack([jacobian[:, :6], jacobian[:, 6] + jacobian[:, 7]])
+    pivot = abs(np.linalg.qr(columns).R[-1, -1])
+    scatter_px = np.linalg.norm(seen.reshape(-1, 2) - pixels[0]) / np.sqrt(max(columns.shape[0] - columns.shape[1], 1))
+    focal = float(matrix[0, 0])
+    if not low < focal < high:
+        return None
+    deviation = float(max(scatter_px, accuracy_px) / max(pivot, 1e-12))
+    return Calibration(focal, deviation, rotations[0].ravel(), translations[0].ravel())
+
+
+# The printed calibration board, which gives the camera of one photograph of a table; single markers do it too.
+#
+# The table frame: the print lies flat on the table, its centre is the origin, x runs along its top edge to the
+# right, y towards its top, z up.
+
 
 PAGE_M = (0.297, 0.21)  # A4, landscape
 TAG_DICTIONARY = "DICT_APRILTAG_36h11"
@@ -343,3 +713,55 @@ def _blur_px(grey: UInt8[np.ndarray, "h w"]) -> float:
     steepest = max(float(np.percentile(np.hypot(*slopes), 99.9)), 1e-3)
     low, high = np.percentile(smooth, (1, 99))
     return float(np.sqrt(max(((high - low) / steepest) ** 2 / (2 * np.pi) - 1, 0)))
+
+
+# The page with the calibration board, to print.
+
+
+RULER_M = 0.1
+INSTRUCTION = "Print at 100 %, check that this line is 100 mm long, and lay the sheet flat on the table."
+_PRINT_DPI = 600
+_INCH_M = 0.0254
+
+
+def page_image(board: Board, pixels_per_m: float) -> Bool[np.ndarray, "h w"]:
+    """The page to print: the board in its middle, and below it a ruler and an instruction. True is paper.
+
+    Args:
+        board: to print.
+        pixels_per_m: resolution; edges are right within half a pixel.
+    """
+    width, height = (round(side * pixels_per_m) for side in PAGE_M)
+    paper = board.image()
+    column, row = (
+        np.floor(((np.arange(count) + 0.5) / pixels_per_m - (page - side) / 2) * SQUARE_PIXELS / board.square_m)
+        for count, page, side in zip((width, height), PAGE_M, board.size_m, strict=True)
+    )
+    inside = ((row >= 0) & (row < paper.shape[0]))[:, None] & ((column >= 0) & (column < paper.shape[1]))
+    nearest = np.ix_(*(np.clip(i, 0, n - 1).astype(int) for i, n in zip((row, column), paper.shape, strict=True)))
+    page = np.where(inside, paper[nearest], True)
+    return page & _ruler_image(board, (width, height), pixels_per_m)
+
+
+def _ruler_image(board: Board, size: tuple[int, int], pixels_per_m: float) -> Bool[np.ndarray, "h w"]:
+    image = Image.new("1", size, 1)
+    draw = ImageDraw.Draw(image)
+    left = (PAGE_M[0] - board.size_m[0]) / 2
+    middle = PAGE_M[1] - (PAGE_M[1] - board.size_m[1]) / 4
+    tick, line = 0.0015, max(round(0.0002 * pixels_per_m), 1)
+    marks = [(0.0, 0.0, RULER_M, 0.0), (0.0, -tick, 0.0, tick), (RULER_M, -tick, RULER_M, tick)]
+    for mark in marks:
+        ends = [round(v * pixels_per_m) for v in np.add(mark, (left, middle, left, middle))]
+        draw.line(ends, fill=0, width=line)
+    font = ImageFont.load_default(0.0032 * pixels_per_m)
+    place = ((left + RULER_M + 0.005) * pixels_per_m, middle * pixels_per_m)
+    draw.text(place, INSTRUCTION, fill=0, font=font, anchor="lm")
+    return np.array(image)
+
+
+def board_pdf(board: Board) -> bytes:
+    """The page to print as PDF: A4, 600 dots an inch."""
+    out = io.BytesIO()
+    page = Image.fromarray(page_image(board, _PRINT_DPI / _INCH_M))
+    page.save(out, "PDF", resolution=_PRINT_DPI, title="Calibration board", subject=f"{board}")
+    return out.getvalue()

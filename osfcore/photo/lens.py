@@ -15,9 +15,7 @@ from jaxtyping import Float, UInt8
 from scipy.optimize import least_squares
 
 from osfcore.errors import InvalidInput
-from osfcore.photo.board import ACCURACY_PX, Board, BoardView, board_points, board_view
-from osfcore.photo.pattern import FoundPoints
-from osfcore.photo.planar_pose import calibrated
+from osfcore.photo.board import ACCURACY_PX, Board, BoardView, FoundPoints, board_points, board_view, calibrated
 
 CONTRADICTED = "focal length of the photo [px]"  # of the error that names it
 _ROUNDS = 3

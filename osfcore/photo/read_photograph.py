@@ -19,7 +19,7 @@ from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 
 from osfcore.errors import CorruptFile, OsfError, check_ranges, shown
-from osfcore.estimation.photometry.camera_response import Encoding, linear_from_encoded
+from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.geometry.poses import Pose
 from osfcore.photo.photograph import Photograph
 

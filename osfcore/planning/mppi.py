@@ -30,8 +30,8 @@ from osfcore.errors import check_ranges
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
-from osfcore.planning.path_planning import actions_along
-from osfcore.planning.pose_cost import Cost, PoseGoal
+from osfcore.planning.costs import Cost, PoseGoal
+from osfcore.planning.paths import actions_along
 
 _SOON, _TOUCHED_M = 3, 1e-4  # a plan is refined where it moves something by so much after as many actions or fewer
 COMPARED = 3  # sequences that are rolled out once more after the second round, over the whole horizon

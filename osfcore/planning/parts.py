@@ -12,9 +12,8 @@ from jaxtyping import Float
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import SceneState
-from osfcore.planning.image_cost import ImageCost
+from osfcore.planning.costs import Cost, ImageCost, PoseCost, PoseGoal
 from osfcore.planning.mppi import MPPIPlanner, PlanRound, PlanSettings, PushSource, Rollout
-from osfcore.planning.pose_cost import Cost, PoseCost, PoseGoal
 from osfcore.plugins import PartKind
 from osfcore.render.types import Renderer
 

@@ -12,25 +12,207 @@ unlimited resolution.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.kiloosf import EMPTY_G, FEATURES, KiloOSF, network_size
 from osfcore.fields.kiloosf_query import KiloQuery
-from osfcore.fields.table_field import TableField
+from osfcore.fields.rays import shell_field
+from osfcore.fields.table import TableField
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_PENUMBRA_RAD, SpotLamp
 from osfcore.geometry.poses import quaternion_to_matrix
-from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import SceneState
-from osfcore.render.reference_lights import FAR, DistantLight, near_light
-from osfcore.render.solids import pusher_field
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
-from osfcore.render.volume_rendering import accumulate_along_rays, final_transmittance, render_weights
+
+# The lights of the reference renderer: what points of the world see of a distant one, and of a near lamp.
+#
+# Both answer the same four questions. `SpotLamp` has the equations of the lamp.
+
+
+FAR = 1e9
+
+
+class DistantLight(NamedTuple):
+    """The same from everywhere."""
+
+    direction: Float[Tensor, "3"]
+
+    def toward(self, points: Float[Tensor, "R 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "R 3"]:
+        """Unit vectors from points [m] toward the light, in the frame into which `rotation` leads from the world."""
+        return (rotation @ self.direction).expand_as(points)
+
+    def distance(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
+        """From points to the light [m]; what lies beyond it casts no shadow."""
+        return torch.full_like(points[:, 0], FAR)
+
+    def gain(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 1"]:
+        """Share of the diffuse light that arrives at points where nothing shades them."""
+        return torch.ones_like(points[:, :1])
+
+    def on_table(self, table: TableField, points: Float[Tensor, "R 3"]) -> Float[Tensor, "#R 3"]:
+        """Direct light of three colours on a white table at points of it where nothing shades them."""
+        return torch.as_tensor(table.direct(self.direction.cpu().double().numpy()[None])).to(points)
+
+
+class NearLight(NamedTuple):
+    """A lamp at a finite distance."""
+
+    position: Float[Tensor, "3"]  # [m]
+    axis: Float[Tensor, "3"]  # unit vector from it toward what it looks at
+    inner: float  # half-angles of its cone [rad]
+    outer: float
+
+    def toward(self, points: Float[Tensor, "R 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "R 3"]:
+        """As of a distant light."""
+        return normalize(self.position - points, dim=-1) @ rotation.T
+
+    def distance(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
+        """As of a distant light."""
+        return torch.linalg.norm(self.position - points, dim=-1)
+
+    def gain(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 1"]:
+        """As of a distant light: the cone's share times the falloff, (d0 / r)^2."""
+        angle = torch.arccos((normalize(points - self.position, dim=-1) @ self.axis).clamp(-1, 1))
+        s = ((self.outer - angle) / max(self.outer - self.inner, MIN_PENUMBRA_RAD)).clamp(0, 1)
+        falloff = (self.position @ self.position) / self.distance(points) ** 2
+        return (s * s * (3 - 2 * s) * falloff)[:, None]
+
+    def on_table(self, table: TableField, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+        """As of a distant light."""
+        directions = normalize(self.position - points, dim=-1)
+        return torch.as_tensor(table.direct(directions.cpu().double().numpy())).to(points) * self.gain(points)
+
+
+def near_light(spot: SpotLamp, tensor: Callable[[object], Tensor]) -> NearLight:
+    """A lamp as tensors, which `tensor` makes of arrays."""
+    return NearLight(tensor(spot.position), tensor(spot.axis), *spot.cone_rad)
+
+
+# Volume rendering along rays: from densities at samples to the weight of each sample and to a pixel's value.
+#
+# Emission and absorption along a ray r(t) = o + t d (paper eq. 3, NeRF eq. 1) are
+#
+#     L = integral of T(t) sigma(r(t)) L_out(r(t)) dt,        T(t) = exp(-integral from t_n to t of sigma(r(s)) ds).
+#
+# With density and radiance constant over intervals of length delta_i, this is exactly the sum
+#
+#     tau_i   = sigma_i delta_i                               optical thickness
+#     alpha_i = 1 - exp(-tau_i)                               share of the light that interval i absorbs and scatters
+#     T_i     = exp(-sum of tau_j over j < i)                 share that reaches interval i
+#     w_i     = T_i alpha_i                                   weight of sample i
+#     L       = sum of w_i L_i + T_end L_behind,              T_end = exp(-sum of all tau_i).
+#
+# A worked example: one ray with an empty sample and two that each let half of the light through.
+#
+#     >>> taus = torch.log(torch.tensor([[1.0, 2.0, 2.0]]))
+#     >>> alphas_from_thickness(taus).tolist()
+#     [[0.0, 0.5, 0.5]]
+#     >>> transmittance(taus).tolist()
+#     [[1.0, 1.0, 0.5]]
+#     >>> weights = render_weights(taus)
+#     >>> weights.tolist()
+#     [[0.0, 0.5, 0.25]]
+#     >>> final_transmittance(taus).tolist()
+#     [0.25]
+#     >>> red_then_blue = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+#     >>> accumulate_along_rays(weights, red_then_blue).tolist()
+#     [[0.5, 0.0, 0.25]]
+
+
+def alphas_from_thickness(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
+    """Opacity of each sample, alpha_i = 1 - exp(-tau_i); exact for thin samples as well."""
+    return -torch.expm1(-taus)
+
+
+def transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
+    """Share of the light that reaches each sample, T_i = exp(-sum of tau_j over j < i); samples by distance."""
+    return torch.exp(-(torch.cumsum(taus, dim=1) - taus))
+
+
+def final_transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays"]:
+    """Share of the light that passes all samples, T_end."""
+    return torch.exp(-taus.sum(dim=1))
+
+
+def render_weights(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
+    """Weight of each sample, w_i = T_i alpha_i; the weights of a ray and T_end sum to 1."""
+    return transmittance(taus) * alphas_from_thickness(taus)
+
+
+def accumulate_along_rays(
+    weights: Float[Tensor, "rays samples"], values: Float[Tensor, "rays samples channels"]
+) -> Float[Tensor, "rays channels"]:
+    """Weighted sum of the samples' values: colours give the ray's radiance, distances its expected depth."""
+    return (weights[..., None] * values).sum(dim=1)
+
+
+# Fields of known shapes: the pusher, and slabs for tests. They need no training.
+
+
+_PUSHER_VOXEL_M = 0.0025
+_EDGE_G = 8.0  # g per voxel across a surface
+_SOLID_G = 10.0
+
+
+def pusher_field(hidden: int) -> KiloOSF:
+    """The pusher, around its centre: a matte cylinder of known colour."""
+    half = PUSHER_HEIGHT_M / 2
+
+    def depth(x: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
+        return np.minimum(PUSHER_RADIUS_M - np.hypot(x[..., 0], x[..., 1]), half - np.abs(x[..., 2]))
+
+    def normal(x: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
+        is_cap = half - np.abs(x[..., 2]) < PUSHER_RADIUS_M - np.hypot(x[..., 0], x[..., 1])
+        wall = x * (1, 1, 0) / np.maximum(np.hypot(x[..., 0], x[..., 1]), 1e-9)[..., None]
+        return np.where(is_cap[..., None], np.sign(x) * (0, 0, 1), wall)
+
+    size = np.array([PUSHER_RADIUS_M, PUSHER_RADIUS_M, half])
+    return solid_field(depth, normal, size, PUSHER_ALBEDO, voxel=_PUSHER_VOXEL_M, hidden=hidden)
+
+
+def solid_field(
+    depth: Callable[[np.ndarray], np.ndarray],
+    normal: Callable[[np.ndarray], np.ndarray],
+    half_size: Float[np.ndarray, "3"],
+    albedo: tuple[float, float, float],
+    *,
+    voxel: float,
+    hidden: int,
+    g: float = _SOLID_G,
+    edge_g: float = _EDGE_G,
+) -> KiloOSF:
+    """A matte solid under the world's lamp.
+
+    Args:
+        depth: how deep points lie inside the solid, negative outside [m].
+        normal: outward unit vectors at points near the surface.
+        half_size: of its box around the origin [m].
+        albedo: its reflectance.
+        voxel: side of the voxels [m].
+        hidden: width of the (empty) networks: that of the fields it is drawn with.
+        g: density feature inside.
+        edge_g: how fast the density feature grows across the surface, per voxel.
+    """
+    count = 2 * (np.ceil(np.asarray(half_size) / voxel).astype(int) + 2) + 1
+    origin = -(count - 1) / 2 * voxel
+    points = origin + voxel * np.moveaxis(np.indices(count.tolist()), 0, -1)
+    features = np.zeros((*count, FEATURES), np.float32)
+    features[..., 0] = np.clip(edge_g * depth(points) / voxel, EMPTY_G, g)
+    features[..., 1:4] = albedo
+    features[..., 4:7] = DIFFUSE * normal(points)
+    keep = features[..., 0] > EMPTY_G
+    networks = np.zeros((1, network_size(hidden)), np.float32)
+    cells = np.zeros((1, 1, 1), np.int32)
+    return shell_field(origin, voxel, features, keep, cells, networks, np.full(3, AMBIENT, np.float32))
+
 
 _RAYS_AT_ONCE = 4096
 

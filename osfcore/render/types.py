@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Float32
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import SpotLamp
 from osfcore.geometry.poses import QUATERNION_NORM_TOLERANCE, Pose, quaternion_to_matrix
-from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import SceneState
 
 OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
@@ -119,7 +119,7 @@ class Rendered:
 
 
 class Renderer(Protocol):
-    """What draws scenes: `osfcore.render.scene_renderer.SceneRenderer`, or the paper's."""
+    """What draws scenes: `osfcore.render.renderer.SceneRenderer`, or the paper's."""
 
     @property
     def names(self) -> tuple[str, ...]:

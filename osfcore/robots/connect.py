@@ -7,8 +7,7 @@ from urllib.parse import SplitResult, parse_qsl, urlsplit
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.extras import need
 from osfcore.robots.http_robot import HttpRobot
-from osfcore.robots.robot import Robot
-from osfcore.robots.safety_limits import SafetyLimits
+from osfcore.robots.robot import Robot, SafetyLimits
 
 FORMS = "http://HOST:PORT, https://HOST:PORT or ros://HOST:9090?cameras=NAME,NAME"
 _ROS_PORT = 9090

@@ -1,15 +1,117 @@
-"""What a robot must offer besides a `World`: that it can be started and stopped; what it says of itself; its errors."""
+"""A robot as a `World`, and the limits within which its pusher moves."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from osfcore.control.world_protocol import World
-from osfcore.errors import OsfError, check_ranges
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.control.world import World
+from osfcore.errors import InvalidInput, OsfError, check_ranges, finite_vector
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.workspace import PUSHER_RADIUS_M, STEP_S
-from osfcore.robots.safety_limits import SafetyLimits
+from osfcore.geometry.workspace import PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
+
+# Where a pusher may be and how fast it may go, and what of an action these limits leave.
+#
+# Frame: the table's; z up, the table's centre the origin.
+
+
+MIN_SPEED_M_S, TOP_SPEED_M_S = 0.005, 5.0  # a robot may be able to do more than any action asks
+_BOX = "x0, y0, x1, y1, finite, with x0 < x1 and y0 < y1"
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyLimits:
+    """A box that the pusher's centre never leaves, and its top speed.
+
+    Attributes:
+        box: x0, y0, x1, y1 [m].
+        top_speed_m_s: of the pusher, in any direction [m/s].
+    """
+
+    box: tuple[float, float, float, float] = (-PUSHER_REACH_M, -PUSHER_REACH_M, PUSHER_REACH_M, PUSHER_REACH_M)
+    top_speed_m_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            InvalidInput: naming what is out of range.
+        """
+        x0, y0, x1, y1 = finite_vector(self.box, 4, "safety box [m]").tolist()
+        if not (x0 < x1 and y0 < y1):
+            raise InvalidInput("safety box [m]", self.box, _BOX)
+        check_ranges(("top speed [m/s]", self.top_speed_m_s, MIN_SPEED_M_S, TOP_SPEED_M_S))
+        object.__setattr__(self, "box", (x0, y0, x1, y1))
+
+    def within(self, other: SafetyLimits) -> SafetyLimits:
+        """Both limits at once: the common part of the boxes, and the lower speed.
+
+        Raises:
+            InvalidInput: if the boxes have nothing in common.
+        """
+        (x0, y0, x1, y1), (a0, b0, a1, b1) = self.box, other.box
+        box = max(x0, a0), max(y0, b0), min(x1, a1), min(y1, b1)
+        if not (box[0] < box[2] and box[1] < box[3]):
+            raise InvalidInput("safety box [m]", self.box, f"partly inside {other.box}, which holds as well")
+        return SafetyLimits(box, min(self.top_speed_m_s, other.top_speed_m_s))
+
+    def outside_m(self, where: Whereabouts) -> float:
+        """How far outside the box the pusher may be [m]; 0 inside."""
+        low, high = np.reshape(self.box, (2, 2))
+        return float(max(0.0, (low - where.low).max(), (where.high - high).max()))
+
+    def allowed_travel(self, travel: Float[np.ndarray, "2"], where: Whereabouts) -> Float[np.ndarray, "2"]:
+        """What of a travel the box leaves: it ends at a wall, and goes on along it.
+
+        Per axis, as the simulated pusher stops at the border of its reach:
+
+            min(t, high - where.high) >= 0 for t > 0, max(t, low - where.low) <= 0 for t < 0.
+
+        Args:
+            travel: of the pusher [m].
+            where: it is.
+        """
+        low, high = np.reshape(self.box, (2, 2))
+        most, least = np.maximum(high - where.high, 0), np.minimum(low - where.low, 0)
+        return np.clip(travel, least, most)
+
+    def slow_parts(self, travel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "3"]]:
+        """Velocities (vx, vy, 0) [m/s] that are allowed, each held for `STEP_S`, and cover a travel [m] together.
+
+        Slower for longer: pushes are so slow that only the way counts, so predictions of the action still hold.
+        """
+        speed = float(np.linalg.norm(travel)) / STEP_S
+        count = max(1, int(np.ceil(speed / self.top_speed_m_s - 1e-9)))
+        return [np.array([*(travel / (count * STEP_S)), 0.0])] * count
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Whereabouts:
+    """A rectangle that the pusher's centre is in for sure, however much of what it was told it has done.
+
+    Attributes:
+        low: least x and y [m].
+        high: largest [m].
+    """
+
+    low: Float[np.ndarray, "2"]
+    high: Float[np.ndarray, "2"]
+
+    @staticmethod
+    def at(position: Float[np.ndarray, "3"]) -> Whereabouts:
+        """Where it was measured."""
+        return Whereabouts(position[:2].astype(float), position[:2].astype(float))
+
+    def after(self, travel: Float[np.ndarray, "2"]) -> Whereabouts:
+        """After a travel [m] of which nobody knows how much came about: what it met may have held it."""
+        return Whereabouts(self.low + np.minimum(travel, 0), self.high + np.maximum(travel, 0))
+
+
+# What a robot must offer besides a `World`: that it can be started and stopped; what it says of itself; its errors.
+
 
 LONGEST_DEADMAN_S = 1.0
 

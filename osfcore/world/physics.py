@@ -9,10 +9,13 @@ object and pusher. Rolling friction is a lever arm [m] chosen so that cans and f
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +24,36 @@ from scipy.spatial import ConvexHull
 from osfcore.geometry.poses import Pose, quaternion_from_matrix, rotate
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset
-from osfcore.world.bullet import pybullet
+
+# PyBullet, imported without the line about its build that it writes to stderr each time.
+
+
+@contextmanager
+def _nothing_said() -> Iterator[None]:
+    """Let the descriptor of stderr lead nowhere, for C code writes to it."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # a service may have been started without one
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def _imported() -> ModuleType:
+    with _nothing_said():
+        import pybullet
+    return pybullet
+
+
+pybullet = _imported()
+
 
 TIME_STEP_S = 1 / 240
 SUBSTEPS = round(STEP_S / TIME_STEP_S)

@@ -13,7 +13,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.objects.asset import ObjectAsset
 from osfcore.world.physics import SUBSTEPS, Physics, body_model
-from osfcore.world.placing import is_calm
+from osfcore.world.scenes import is_calm
 
 _SPARE_M = 0.003  # beyond its way, in which the pusher must meet nothing for an action to be skipped
 

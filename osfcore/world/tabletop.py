@@ -6,14 +6,15 @@ any view, move things by hand. Several may live in one process. Deterministic: t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from osfcore.control.world import SimulatedWorld
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName, finite_vector
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.geometry.light import Light
@@ -22,13 +23,22 @@ from osfcore.geometry.states import Observation, SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M, check_action
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.conditions import Conditions
-from osfcore.world.imaging.ray_tracer import Picture, RayTracer, masks_of
-from osfcore.world.imaging.tiny_renderer import TinyScene
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.plugins import PartKind
+from osfcore.world.imaging import Picture, RayTracer, TracedMesh, masks_of
 from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, body_model
-from osfcore.world.placing import above_table, is_calm, move_apart, place_randomly, refuse_overlaps
-from osfcore.world.scene_request import SceneRequest, check_object, check_place, check_request
+from osfcore.world.scenes import (
+    Conditions,
+    SceneRequest,
+    above_table,
+    check_object,
+    check_place,
+    check_request,
+    is_calm,
+    move_apart,
+    place_randomly,
+    refuse_overlaps,
+)
+from osfcore.world.tiny_renderer import TinyScene
 
 Renderer = Literal["embree", "tiny"]
 _SETTLE_LIMIT_S = 3.0
@@ -346,3 +356,29 @@ class Tabletop:
         parked = np.array([PUSHER_REACH_M, PUSHER_REACH_M, PUSHER_CENTRE_Z_M])
         self._bodies.place_pusher(parked if state.pusher is None else state.pusher)
         self._light = state.light
+
+
+# Worlds by name, and what each is made from; other packages offer more (`osfcore.plugins`).
+
+
+WORLD = PartKind("world", ("reset", "observe", "act", "close", "truth", "render"))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WorldInputs:
+    """What a world is made from.
+
+    Attributes:
+        library: where the objects' meshes are.
+        request: what `reset` puts on the table.
+    """
+
+    library: AssetLibrary
+    request: SceneRequest
+
+
+def _simulated(given: WorldInputs) -> SimulatedWorld:
+    return Tabletop(given.library, request=given.request)
+
+
+WORLDS: Mapping[str, Callable[[WorldInputs], SimulatedWorld]] = {"simulated": _simulated}

@@ -19,10 +19,10 @@ import tyro
 from app.storage.paths import default_data_dir
 from osfcore.geometry.cameras import default_cameras
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
-from osfcore.world.imaging.tiny_renderer import TinyScene
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tiny_renderer import TinyScene
 from tests.bench.machine import machine
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from osfcore.photo.calibration.calibrate import board_place
+from osfcore.photo.calibration import board_place
 from tests.app.api.routes.test_calibration import ON_TABLE, TILTS, png_of
 from tests.app.api.routes.test_table_photos import gray
 from tests.core.photo.seen_boards import K, tilted

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.io.image_file import encode_jpeg, to_uint8
 from tests.core.robots.robots import NAMES, simulated, toward_middle, until
 from tests.core.robots.ros_table import QUERY, TableStandIn

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.objects.fetch import fetch
-from osfcore.objects.sources import FolderSource, WheelSource
+from osfcore.objects.fetch import FolderSource, WheelSource, fetch
 from tests.conftest import CACHE
 from tests.e2e.conftest import watch_errors
 from tests.e2e.test_episodes import LONG_MS, WAIT_MS, Service, until

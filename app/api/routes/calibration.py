@@ -12,7 +12,7 @@ from app.api.routes import problems
 from app.api.routes.photos import PHOTO_BODY, photo_body
 from app.api.schemas.calibration import CalibrateIn, CalibrationOut, SightingOut
 from app.api.schemas.limits import GOAL_NAME, sized
-from osfcore.photo.calibration.calibrate import board_place
+from osfcore.photo.calibration import board_place
 
 UPLOAD_PATH = "/api/calibration/photos"
 router = APIRouter(prefix="/api/calibration", tags=["photos"], responses=problems(), route_class=BoundedRoute)

@@ -15,8 +15,7 @@ from app.api.schemas.jobs import JobOut
 from app.api.schemas.limits import FILE_NAME, LABEL, MASS_KG, SCALE, sized, within
 from osfcore.errors import OsfError
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.objects.fetch import NewObject
-from osfcore.objects.sources import DEFAULT_NAMES
+from osfcore.objects.fetch import DEFAULT_NAMES, NewObject
 
 UPLOAD_PATH = "/api/objects"
 router = APIRouter(prefix=UPLOAD_PATH, tags=["objects"], responses=problems())

@@ -30,9 +30,8 @@ from app.api.schemas.photos import (
     facts_of,
 )
 from app.storage.table_photos import TablePhoto
-from osfcore.photo.board import Board
-from osfcore.photo.board_page import board_pdf
-from osfcore.photo.calibration.camera_file import known_camera
+from osfcore.photo.board import Board, board_pdf
+from osfcore.photo.calibration import known_camera
 
 UPLOAD_PATH = "/api/photos"
 _ANY_FILE = "application/octet-stream"  # what browsers call formats that they do not know

@@ -17,7 +17,7 @@ from app.processes.messages.scene_messages import SceneRecord
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.rollouts import check_actions
 from osfcore.geometry.states import SceneState
-from osfcore.io.rollout_file import rollouts_to_json
+from osfcore.io.scene_file import rollouts_to_json
 
 MAX_POSES = 100_000  # some 8 MB of JSON
 _ANSWER: dict[int | str, dict[str, Any]] = {200: {"model": PredictionOut, "description": "The predicted futures."}}

@@ -8,9 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from app.api.schemas.common import Input
 from app.api.schemas.limits import BOARD_PHOTOS, BOARD_PLACE_M, BOARD_TURN_DEG, FOCAL, GOAL_NAME, NAME, sized, within
-from osfcore.photo.calibration.calibrate import Calibration
-from osfcore.photo.calibration.camera_file import CalibrationJson, calibration_to_json
-from osfcore.photo.calibration.sighting import Sighting
+from osfcore.photo.calibration import Calibration, CalibrationJson, Sighting, calibration_to_json
 
 Identifier = Annotated[str, Field(**sized(NAME))]
 

@@ -14,8 +14,7 @@ from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.jobs.kinds.episodes import method_of
 from app.services.episodes import AskedEpisode, defaults, flat
-from osfcore.control.episode_settings import CostKind, EpisodeSettings
-from osfcore.control.events import Matter
+from osfcore.control.events import CostKind, EpisodeSettings, Matter
 from osfcore.paper.method import METHODS, Method
 
 

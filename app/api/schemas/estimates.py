@@ -12,7 +12,7 @@ from app.api.schemas.paging import JobPageOut
 from app.jobs.job import Job, State
 from app.jobs.kinds.estimates import Mode
 from app.services.estimates import Asked
-from osfcore.io.state_file import EstimateJson
+from osfcore.io.scene_file import EstimateJson
 from osfcore.paper.method import Method
 
 METHOD = '"ours", or "paper": CMA-ES alone with fields as published, which is slower; not for mode "goal".'

@@ -6,13 +6,13 @@ OpenAPI tells all of them. The page writes some down again, in static/index.html
 from typing import Any
 
 from app.services.scenes import MAX_SEED
-from osfcore.control.episode_settings import MAX_STEPS
+from osfcore.control.events import MAX_STEPS
 from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.objects.fetch import MAX_MASS_KG, MAX_TEXT
-from osfcore.photo.calibration.calibrate import MOST_PHOTOS
+from osfcore.photo.calibration import MOST_PHOTOS
 
 Bounds = tuple[float, float]
 

@@ -64,8 +64,7 @@ class AssetsFetch:
 
     def run(self) -> dict[str, Any]:
         """Fetch with a progress bar; return what is there now."""
-        from osfcore.objects.fetch import fetch
-        from osfcore.objects.sources import source_from
+        from osfcore.objects.fetch import fetch, source_from
 
         library = _library(self.data_dir)
         source = source_from(self.source, self.data_dir / "cache")

@@ -64,7 +64,7 @@ class BenchRenderCommand(_Benchmark):
     """Of all scenes."""
 
     def _measure(self) -> dict[str, Any]:
-        from osfcore.experiments.benchmarks.rendering import BenchRender, bench_render
+        from osfcore.experiments.bench_rendering import BenchRender, bench_render
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.inspection.contact_sheet import contact_sheet
         from osfcore.io.image_file import write_png
@@ -93,7 +93,7 @@ class BenchEstimateCommand(_Benchmark):
     """Of all scenes."""
 
     def _measure(self) -> dict[str, Any]:
-        from osfcore.experiments.benchmarks.estimation import BenchEstimate, bench_estimate
+        from osfcore.experiments.bench_estimation import BenchEstimate, bench_estimate
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
 
@@ -120,9 +120,9 @@ class BenchDynamicsCommand(_Benchmark):
     """What computes."""
 
     def _measure(self) -> dict[str, Any]:
-        from osfcore.dynamics.network_weights import read_network
-        from osfcore.dynamics.push_models import load_shapes, network_path
-        from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, bench_rollouts
+        from osfcore.dynamics.graph import read_network
+        from osfcore.dynamics.rollout import load_shapes, network_path
+        from osfcore.experiments.bench_rollouts import BENCH_NAMES, bench_rollouts
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
 
@@ -130,7 +130,7 @@ class BenchDynamicsCommand(_Benchmark):
         return asdict(bench_rollouts(read_network(network_path(self.data_dir)), shapes, pick_device(self.device)))
 
     def _show(self, result: dict[str, Any]) -> None:
-        from osfcore.experiments.benchmarks.rollouts import BENCH_NAMES, HORIZON, SEQUENCES
+        from osfcore.experiments.bench_rollouts import BENCH_NAMES, HORIZON, SEQUENCES
 
         print(
             f"{SEQUENCES} sequences of {HORIZON} pushes among {len(BENCH_NAMES)} objects, {result['threads']} "
@@ -156,7 +156,7 @@ class BenchPlannerCommand(_Benchmark):
     """The environment's seed of the first task; the others follow."""
 
     def _measure(self) -> dict[str, Any]:
-        from osfcore.experiments.benchmarks.pusht.comparison import BenchPlanner, bench_planner
+        from osfcore.experiments.pusht import BenchPlanner, bench_planner
 
         settings = {"samples": self.samples, "horizon": self.horizon, "steps": self.steps, "seed": self.seed}
         last = follow(bench_planner(BenchPlanner(self.tasks, **settings)))

@@ -37,7 +37,7 @@ class CollectObjectCommand:
     def run(self) -> dict[str, Any]:
         """Collect; the result names the folder and the counts."""
         from osfcore.objects.asset_library import AssetLibrary
-        from osfcore.world.collection.collect_images import CollectObject, collect_object
+        from osfcore.world.collect_images import CollectObject, collect_object
 
         config = CollectObject(self.name, self.out, self.images, self.size, self.seed)
         last = follow(collect_object(config, AssetLibrary(self.data_dir / "objects")))
@@ -61,7 +61,7 @@ class CollectTableCommand:
 
     def run(self) -> dict[str, Any]:
         """Collect; the result names the folder and the counts."""
-        from osfcore.world.collection.collect_images import CollectTable, collect_table
+        from osfcore.world.collect_images import CollectTable, collect_table
 
         last = follow(collect_table(CollectTable(self.out, self.images, self.size, self.seed)))
         return {"out": str(self.out), "images": last.total if last else 0}
@@ -109,7 +109,7 @@ class CollectPushesCommand:
     def run(self) -> dict[str, Any]:
         """Collect; the result tells shares of steps with contact and motion, and the rate."""
         from osfcore.objects.asset_library import AssetLibrary
-        from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+        from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
         config = CollectPushes(self.out, self.episodes, self.steps, self.objects, self.policy, self.seed, self.images,
                                self.renderer, self.names, self.disturb, self.camera, self.size,
@@ -152,7 +152,7 @@ class CollectObservationCommand:
         """Collect; the result names the folder and what is to be seen."""
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
-        from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
+        from osfcore.world.collect_images import CollectObservation, collect_observation
 
         config = CollectObservation(self.out, self.names, self.objects, self.seed, self.size, self.goal)
         known = FieldLibrary(self.data_dir).names()

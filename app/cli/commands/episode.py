@@ -64,7 +64,7 @@ class RunEpisode:
         from app.episodes.file_names import REPORT_FILE
         from app.episodes.headless import run_episode
         from app.episodes.request import EpisodeOrder, PartNames
-        from osfcore.control.episode_settings import CostKind, EpisodeSettings
+        from osfcore.control.events import CostKind, EpisodeSettings
         from osfcore.errors import check_seed
         from osfcore.fields.devices import pick_device
         from osfcore.io.output_paths import check_place

@@ -13,10 +13,9 @@ from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from osfcore.estimation.objective.object_models import ObjectModels
+    from osfcore.estimation.objective import ObjectModels
     from osfcore.estimation.steps import EstimateStep
-    from osfcore.geometry.estimated_state import EstimatedState
-    from osfcore.geometry.states import Observation
+    from osfcore.geometry.states import EstimatedState, Observation
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Estimate:
         from app.jobs.kinds.estimates import load_models, steps_of
         from osfcore.errors import check_seed
         from osfcore.io.observation_file import read_observation
-        from osfcore.io.state_file import estimated_to_json, read_estimated, write_estimated
+        from osfcore.io.scene_file import estimated_to_json, read_estimated, write_estimated
         from osfcore.random_streams import Stream, stream_rng
 
         rng = stream_rng(check_seed(self.seed), Stream.FIRST_FRAME)

@@ -32,7 +32,7 @@ class EvaluateFieldsCommand(Evaluation):
     """With --data: the field to measure."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
-        from osfcore.experiments.fields.evaluation import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
+        from osfcore.experiments.fields import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
 
         if self.data is not None and self.weights is not None:
             return evaluate_set(EvaluateSet(self.data, self.weights, self.folder))
@@ -60,9 +60,8 @@ class EvaluateEstimateCommand(ParallelEvaluation):
     first frames are measured under each."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
-        from osfcore.experiments.estimation.evaluation import evaluate_estimate
-        from osfcore.experiments.estimation.parts import EvaluateEstimate
-        from osfcore.experiments.rearrangement.factors import FIRST_FRAME_FACTORS
+        from osfcore.experiments.estimation import EvaluateEstimate, evaluate_estimate
+        from osfcore.experiments.factors import FIRST_FRAME_FACTORS
 
         factors = FIRST_FRAME_FACTORS if self.factor == ("all",) else self.factor
         config = EvaluateEstimate(
@@ -85,7 +84,7 @@ class EvaluateDynamicsCommand(ParallelEvaluation):
     """Whose predictions: our model's; the paper's as published, with results in the folder paper within --out."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
-        from osfcore.experiments.dynamics.evaluation import EvaluateDynamics, evaluate_dynamics
+        from osfcore.experiments.dynamics import EvaluateDynamics, evaluate_dynamics
 
         config = EvaluateDynamics(self.folder, self.tasks, self.seed, self.names, self.data_dir, self.method)
         return evaluate_dynamics(config, fields, assets, executor)
@@ -131,9 +130,9 @@ class EvaluateMpcCommand(ParallelEvaluation):
     """Episodes that it has at most for each task, of which the best counts; the last with the simulator's pushes."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
-        from osfcore.control.episode_settings import EpisodeSettings
-        from osfcore.experiments.rearrangement.evaluation import ORACLE_PLAN, EvaluateMpc, evaluate_mpc
-        from osfcore.experiments.rearrangement.methods import Variant
+        from osfcore.control.events import EpisodeSettings
+        from osfcore.experiments.rearrangement import ORACLE_PLAN, EvaluateMpc, evaluate_mpc
+        from osfcore.experiments.rearrangement_runs import Variant
         from osfcore.experiments.rivals.visual_foresight import ForesightSettings
         from osfcore.paper.mppi import GaussianPlanSettings
         from osfcore.planning.mppi import PlanSettings

@@ -15,10 +15,9 @@ from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from osfcore.photo.calibration.calibrate import Calibration
+    from osfcore.photo.calibration import Calibration
     from osfcore.photo.photograph import Photograph
-    from osfcore.photo.poses.estimate_photo import PhotoModels
-    from osfcore.photo.poses.photo_steps import PhotoStep
+    from osfcore.photo.poses import PhotoModels, PhotoStep
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,7 @@ class PhotoBoard:
     def run(self) -> dict[str, Any]:
         """Write the page."""
         from osfcore.io.files import write_atomically
-        from osfcore.photo.board import Board
-        from osfcore.photo.board_page import board_pdf
+        from osfcore.photo.board import Board, board_pdf
 
         if self.out.suffix.lower() != ".pdf":
             raise InvalidInput("output file", self.out, "a path that ends in .pdf")
@@ -63,9 +61,7 @@ class PhotoCalibrate:
     def run(self) -> dict[str, Any]:
         """Calibrate; the result is what the file holds."""
         from osfcore.io.files import write_json
-        from osfcore.photo.calibration.calibrate import board_place, calibrated_camera
-        from osfcore.photo.calibration.camera_file import calibration_to_json
-        from osfcore.photo.calibration.sighting import sight
+        from osfcore.photo.calibration import board_place, calibrated_camera, calibration_to_json, sight
         from osfcore.photo.read_photograph import read_photograph
 
         if self.out.suffix.lower() != ".json":
@@ -139,8 +135,8 @@ class PhotoEstimate:
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import write_json
         from osfcore.io.json_codec import encode
-        from osfcore.photo.other_programs.pose_file import PoseChoice
-        from osfcore.photo.poses.estimate_photo import PhotoConfig, PhotoModels, estimate_photo
+        from osfcore.photo.bop import PoseChoice
+        from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
         from osfcore.photo.summary import summarised
         from osfcore.random_streams import Stream, stream_rng
 
@@ -174,7 +170,7 @@ class _Shown:
 
 def _write_sheets(folder: Path, models: PhotoModels, photos: Sequence[Photograph], step: PhotoStep) -> None:
     """NAME.png, or NAME-1.png and so on for each photo with a mask of it."""
-    from osfcore.inspection.photo_sheet import write_sheet
+    from osfcore.inspection.contact_sheet import write_sheet
 
     for found in step.found:
         for number, photo in enumerate(photos, 1):

@@ -11,12 +11,11 @@ import numpy as np
 
 from osfcore.errors import InvalidInput, UnknownName, shown
 from osfcore.geometry.poses import Pose
-from osfcore.photo.calibration.camera_file import KnownCamera, read_camera
-from osfcore.photo.located import locate, locate_calibrated
-from osfcore.photo.other_programs.mask_folder import read_masks
-from osfcore.photo.other_programs.pose_file import PoseChoice, read_poses
+from osfcore.photo.bop import PoseChoice, read_masks, read_poses
+from osfcore.photo.calibration import KnownCamera, read_camera
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, propose_mask
+from osfcore.photo.summary import locate, locate_calibrated
 
 if TYPE_CHECKING:
     from osfcore.photo.photograph import Photograph

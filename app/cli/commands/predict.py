@@ -53,8 +53,7 @@ class Predict:
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.output_paths import check_place
-        from osfcore.io.rollout_file import read_actions, write_rollouts
-        from osfcore.io.state_file import read_estimated
+        from osfcore.io.scene_file import read_actions, read_estimated, write_rollouts
 
         if self.out.suffix.lower() != ".json":
             raise InvalidInput("output file", self.out, "a path that ends in .json")
@@ -78,8 +77,8 @@ class Predict:
         return result
 
     def _loader(self) -> Callable[..., DynamicsModel]:
-        from osfcore.dynamics.push_models import load_push_model
-        from osfcore.paper.dynamics.rollout import load_paper_push_model
+        from osfcore.dynamics.rollout import load_push_model
+        from osfcore.paper.dynamics import load_paper_push_model
 
         return load_paper_push_model if self.method == "paper" else load_push_model
 
@@ -107,13 +106,13 @@ class Predict:
         self, folder: Path, state: SceneState, actions: np.ndarray, rollouts: Rollouts, camera: Camera
     ) -> dict[str, Any]:
         """Draw one sequence; PSNR by step where the simulator could be asked."""
-        from osfcore.experiments.dynamics.visual_prediction import PSNR_FILE, VisualPrediction, show_prediction
+        from osfcore.experiments.visual_prediction import PSNR_FILE, VisualPrediction, show_prediction
         from osfcore.extras import missing
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import read_json
         from osfcore.objects.asset_library import AssetLibrary
-        from osfcore.render.scene_renderer import SceneRenderer
+        from osfcore.render.renderer import SceneRenderer
 
         library, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         fields = {name: library.load(name) for name in state.names}

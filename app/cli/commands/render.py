@@ -36,7 +36,7 @@ class Render:
         from osfcore.io.image_file import write_png
         from osfcore.io.output_paths import check_place
         from osfcore.io.scene_file import read_scene
-        from osfcore.render.scene_renderer import SceneRenderer
+        from osfcore.render.renderer import SceneRenderer
         from osfcore.render.types import Quality, SceneBatch
 
         if self.out.suffix.lower() != ".png":

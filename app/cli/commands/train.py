@@ -18,8 +18,8 @@ from osfcore.errors import InvalidInput
 from osfcore.io.output_paths import SUFFIX
 
 if TYPE_CHECKING:
-    from osfcore.fields.training.kiloosf_training import FieldStep
-    from osfcore.fields.training.several import FieldSettings, TrainOne
+    from osfcore.fields.train_kiloosf import FieldStep
+    from osfcore.fields.train_several import FieldSettings, TrainOne
     from osfcore.progress import Progress
 
 
@@ -93,20 +93,19 @@ class TrainFieldCommand:
     ) -> Iterator[Progress]:
         from torch import get_num_threads
 
-        from osfcore.fields.training.several import train_several
+        from osfcore.fields.train_several import train_several
 
         threads = 1 if self.cluster is not None else max(1, get_num_threads() // workers)
         return train_several(settings, train, executor, threads=threads, shares_disk=self.cluster is None)
 
     def _ours(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
-        from osfcore.fields.training.kiloosf_training import train_field
-        from osfcore.fields.training.recipes import TrainField
+        from osfcore.fields.train_kiloosf import TrainField, train_field
 
         given = {"hollow": self.hollow, "recipe": self.recipe, "lit": self.method != "nerf", **self._common()}
         return [TrainField(data, out, **given) for data, out in places], train_field
 
     def _paper(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
-        from osfcore.paper.fields.training import TrainPaperField, train_paper_field
+        from osfcore.paper.train_fields import TrainPaperField, train_paper_field
 
         for option, is_given in (("--hollow", self.hollow), ("--recipe", self.recipe != "direct")):
             if is_given:
@@ -135,7 +134,7 @@ class TrainTableCommand:
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
-        from osfcore.fields.training.table_training import TrainTable, train_table
+        from osfcore.fields.train_table import TrainTable, train_table
 
         follow(train_table(TrainTable(self.data, self.out, self.device, self.seed)))
         metrics = _metrics(self.out)
@@ -189,8 +188,8 @@ class TrainDynamicsCommand:
         return {"out": str(self.out), **metrics}
 
     def _train_ours(self) -> Iterator[Progress]:
-        from osfcore.dynamics.push_models import load_shapes
-        from osfcore.dynamics.training.network_training import TrainDynamics, train_dynamics
+        from osfcore.dynamics.rollout import load_shapes
+        from osfcore.dynamics.train import TrainDynamics, train_dynamics
         from osfcore.fields.field_library import FieldLibrary
 
         given = self._given("iterations", "long_iterations", "patience", "hidden", "batch", "long_batch", "rate")
@@ -200,8 +199,8 @@ class TrainDynamicsCommand:
 
     def _train_paper(self) -> Iterator[Progress]:
         from osfcore.fields.field_library import FieldLibrary
-        from osfcore.paper.dynamics.graph import longest_axes
-        from osfcore.paper.dynamics.training import TrainPaperDynamics, train_paper_dynamics
+        from osfcore.paper.dynamics import longest_axes
+        from osfcore.paper.train_dynamics import TrainPaperDynamics, train_paper_dynamics
 
         for name in (*self._given("long_iterations", "long_batch"), *(("without",) if self.without else ())):
             option = f"--{name.replace('_', '-')}"
@@ -255,7 +254,7 @@ class TrainFitVidCommand:
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
-        from osfcore.experiments.rivals.fitvid.training import TrainFitVid, train_fitvid
+        from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
 
         settings = {one.name: getattr(self, one.name) for one in fields(TrainFitVid)}
         follow(train_fitvid(TrainFitVid(**settings)))

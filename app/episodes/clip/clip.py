@@ -25,8 +25,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import as_mapping, file_at_once, read_json, reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.imaging.ray_tracer import RayTracer
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import RayTracer, TracedMesh
 
 FPS = 30
 LONGEST_S, CARD_S, PAUSE_S = 12.0, 2.5, 0.6

@@ -18,8 +18,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8
-from osfcore.world.imaging.ray_tracer import RayTracer
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import RayTracer, TracedMesh
 
 GOLD, CYAN, VIOLET, GREEN = (240, 172, 48), (92, 214, 226), (178, 110, 255), (76, 199, 100)
 _EYE, _TARGET, _FIELD_OF_VIEW_DEG = (0.0, -1.0, 0.78), (0.0, -0.01, 0.02), 28.0

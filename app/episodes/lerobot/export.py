@@ -17,16 +17,21 @@ from PIL import Image, ImageOps
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE
 from app.episodes.finished import FinishedEpisode, read_episode
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
-from osfcore.export.lerobot.conventions import GOAL_IMAGE, environment_state, image_name, instruction
-from osfcore.export.lerobot.dataset import write_dataset
-from osfcore.export.lerobot.episode import DatasetSize, LeRobotEpisode
+from osfcore.export.lerobot import (
+    GOAL_IMAGE,
+    DatasetSize,
+    LeRobotEpisode,
+    environment_state,
+    image_name,
+    instruction,
+    write_dataset,
+)
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import pose_rows
 from osfcore.io.files import reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.imaging.ray_tracer import RayTracer
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import RayTracer, TracedMesh
 
 Kind = Literal["poses", "pixels", "both"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from app.episodes.file_names import CAMERAS_FOLDER
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.states import Observation
 from osfcore.io.files import write_atomically
 from osfcore.io.image_file import encode_jpeg, to_uint8

@@ -12,12 +12,11 @@ import numpy as np
 
 from app.episodes.robots.robot_record import RobotRecord
 from osfcore.control.closed_loop import Episode
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Event
+from osfcore.control.estimators import load_scene_models
+from osfcore.control.events import EpisodeSettings, Event
 from osfcore.control.goal import GoalImage
-from osfcore.control.scene_models import load_scene_models
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.estimation.photometry.camera_response import Encoding, linear_from_encoded
+from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
@@ -25,10 +24,8 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.read_photograph import read_photograph
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.robots.connect import connect
-from osfcore.robots.guarded_world import GuardedWorld
-from osfcore.robots.outlined_world import CameraBoxes, OutlinedWorld
-from osfcore.robots.robot import RobotDescription
-from osfcore.robots.safety_limits import SafetyLimits
+from osfcore.robots.guarded_world import CameraBoxes, GuardedWorld, OutlinedWorld
+from osfcore.robots.robot import RobotDescription, SafetyLimits
 
 _RADIUS_DIFFERS_M = 0.001  # more is said
 

@@ -19,7 +19,7 @@ from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, N
 from osfcore.geometry.states import Observation
 from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.io.state_file import estimated_to_json
+from osfcore.io.scene_file import estimated_to_json
 from osfcore.metrics.image_errors import ssim
 from osfcore.robots.guarded_world import GuardedWorld
 

@@ -27,13 +27,12 @@ from osfcore.random_streams import Stream, stream_rng
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
     from app.processes.plan_summary import PlanSketch
-    from osfcore.control.episode_settings import EpisodeSettings
-    from osfcore.control.events import Event
+    from osfcore.control.estimators import SceneModels
+    from osfcore.control.events import EpisodeSettings, Event
+    from osfcore.control.first_frame import PreparedLooks
     from osfcore.control.goal import GoalImage
-    from osfcore.control.prepared_look import PreparedLooks
-    from osfcore.control.scene_models import SceneModels
-    from osfcore.control.world_protocol import World
-    from osfcore.planning.pose_cost import PoseGoal
+    from osfcore.control.world import World
+    from osfcore.planning.costs import PoseGoal
 
 _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
 
@@ -140,7 +139,7 @@ def method_of(params: Mapping[str, Any]) -> Method:
 
 
 def _models(method: Method, names: tuple[str, ...], place: JobContext) -> SceneModels:
-    from osfcore.control.scene_models import load_scene_models
+    from osfcore.control.estimators import load_scene_models
     from osfcore.fields.field_library import FieldLibrary
 
     fields = FieldLibrary(place.data_dir)
@@ -217,7 +216,7 @@ def settings_of(given: Mapping[str, Any]) -> EpisodeSettings:
     Raises:
         InvalidInput: if a number is out of range.
     """
-    from osfcore.control.episode_settings import EpisodeSettings
+    from osfcore.control.events import EpisodeSettings
     from osfcore.planning.mppi import PlanSettings
 
     own = {key: value for key, value in given.items() if key != "plan"}
@@ -228,7 +227,7 @@ def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> Goa
     """The goal image among the inputs, or the poses in the parameters, with a photograph of them if there is one."""
     from app.episodes.request import read_goal
     from osfcore.control.goal import PhotoGoal
-    from osfcore.planning.pose_cost import PoseGoal
+    from osfcore.planning.costs import PoseGoal
 
     image = None if given["camera"] is None else read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
     if given["poses"] is None:
@@ -240,7 +239,7 @@ def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> Goa
 
 def _prepared(path: Path) -> PreparedLooks | None:
     """What was found out beforehand about an example, if the goal is an example's."""
-    from osfcore.control.prepared_look import prepared_from_json
+    from osfcore.control.first_frame import prepared_from_json
 
     return read_json(path, prepared_from_json) if path.is_file() else None
 

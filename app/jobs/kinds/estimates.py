@@ -24,7 +24,7 @@ from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
-    from osfcore.estimation.objective.object_models import ObjectModels
+    from osfcore.estimation.objective import ObjectModels
     from osfcore.estimation.steps import EstimateStep
     from osfcore.geometry.states import Observation, SceneState
 
@@ -67,7 +67,7 @@ def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimati
         OsfError: if the observation does not fit the mode, an object has no field, or the disk refuses.
     """
     from osfcore.io.observation_file import read_observation
-    from osfcore.io.state_file import read_estimated, write_estimated
+    from osfcore.io.scene_file import read_estimated, write_estimated
 
     yield Estimating(0, 0, "Loading fields, half a minute the first time")
     inputs = place.folder / INPUTS
@@ -97,7 +97,7 @@ def load_models(data_dir: Path, names: tuple[str, ...], method: Method = "ours")
         UnknownName: if an object has no field.
         CorruptFile: if a field is broken.
     """
-    from osfcore.estimation.objective.object_models import ObjectModels
+    from osfcore.estimation.objective import ObjectModels
     from osfcore.fields.field_library import FieldLibrary
 
     library = FieldLibrary(data_dir)

@@ -23,7 +23,7 @@ from osfcore.paper.method import Method, own_field_path
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
-    from osfcore.fields.training.kiloosf_training import FieldStep
+    from osfcore.fields.train_kiloosf import FieldStep
 
 PREVIEW, COMPARISON = "preview.png", "comparison.png"
 _COMPARING = "Comparing it with the field that is there"
@@ -122,8 +122,8 @@ def _is_compared(name: str, method: Method, place: JobContext) -> bool:
 
 def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobContext) -> TrainingStep:
     """Both fields on all held-out images; pictures of some, side by side, go to the job's folder."""
-    from osfcore.fields.field_weights import read_field
-    from osfcore.fields.training.validation import Holdout
+    from osfcore.fields.kiloosf import read_field
+    from osfcore.fields.train_osf import Holdout
     from osfcore.io.image_set import read_image_set
 
     holdout = Holdout(read_image_set(data, "test"))
@@ -157,7 +157,7 @@ def _order(params: dict[str, Any], place: JobContext) -> dict[str, Any]:
 def _collect(
     mesh: str, params: dict[str, Any], out: Path, place: JobContext, begin: TrainingStep
 ) -> Iterator[TrainingStep]:
-    from osfcore.world.collection.collect_images import CollectObject, collect_object
+    from osfcore.world.collect_images import CollectObject, collect_object
 
     if out.is_dir():  # whole, or it would not have its name
         return
@@ -191,11 +191,10 @@ def _learning(params: dict[str, Any], data: Path, out: Path) -> Iterator[FieldSt
     """The training of the method that is asked for."""
     minutes, seed = params["minutes"], params["seed"]
     if params.get("method") == "paper":
-        from osfcore.paper.fields.training import TrainPaperField, train_paper_field
+        from osfcore.paper.train_fields import TrainPaperField, train_paper_field
 
         return train_paper_field(TrainPaperField(data, out, minutes=minutes, seed=seed))
-    from osfcore.fields.training.kiloosf_training import train_field
-    from osfcore.fields.training.recipes import TrainField
+    from osfcore.fields.train_kiloosf import TrainField, train_field
 
     return train_field(TrainField(data, out, minutes=minutes, seed=seed, hollow=params["hollow"]))
 

@@ -74,8 +74,7 @@ def add_object_job(params: dict[str, Any], place: JobContext) -> Iterator[Adding
 
 def _added(new: NewObject, file_name: str, place: JobContext) -> Iterator[AddingStep]:
     from osfcore.objects.fetch import make_asset
-    from osfcore.objects.mesh import read_mesh
-    from osfcore.objects.mesh_upload import unpack_mesh
+    from osfcore.objects.mesh import read_mesh, unpack_mesh
 
     inputs = place.folder / INPUTS
     yield AddingStep(0, _STEPS, "Unpacking the mesh", new.name)

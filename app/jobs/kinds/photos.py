@@ -22,8 +22,7 @@ from osfcore.random_streams import Stream, stream_rng
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
     from osfcore.photo.photograph import Photograph
-    from osfcore.photo.poses.estimate_photo import PhotoModels
-    from osfcore.photo.poses.photo_steps import PhotoObject
+    from osfcore.photo.poses import PhotoModels, PhotoObject
 
 FOUND = "found.json"
 
@@ -71,7 +70,7 @@ def photo_job(params: dict[str, Any], place: JobContext) -> Iterator[Finding]:
         OsfError: if an object has no field, nothing can be found, or the disk refuses.
     """
     from osfcore.fields.field_library import FieldLibrary
-    from osfcore.photo.poses.estimate_photo import PhotoModels, estimate_photo
+    from osfcore.photo.poses import PhotoModels, estimate_photo
     from osfcore.photo.summary import summarised
 
     yield Finding(0, 0, "Loading fields")
@@ -114,7 +113,7 @@ def _mask(path: Path) -> np.ndarray:
 
 
 def _draw_sheets(folder: Path, models: PhotoModels, photo: Photograph, found: PhotoObject) -> None:
-    from osfcore.inspection.photo_sheet import write_sheet
+    from osfcore.inspection.contact_sheet import write_sheet
 
     for choice, pose in enumerate((found.best, *found.rivals)):
         write_sheet(folder / sheet_name(found.name, choice), models, photo, replace(found, best=pose))

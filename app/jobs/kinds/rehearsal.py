@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from osfcore.dynamics.push_models import load_push_model
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.dynamics.rollout import load_push_model
+from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.uncertainty import expected_residuals
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras

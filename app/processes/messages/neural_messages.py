@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from osfcore.estimation.content_verdict import ContentCheck
+from osfcore.estimation.steps import ContentCheck
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState

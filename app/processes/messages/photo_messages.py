@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from osfcore.geometry.poses import Pose
-from osfcore.photo.calibration.calibrate import Calibration
-from osfcore.photo.calibration.camera_file import KnownCamera
-from osfcore.photo.calibration.sighting import Sighting
+from osfcore.photo.calibration import Calibration, KnownCamera, Sighting
 
 CameraSource = Literal["board", "given", "file", "assumed"]
 Points = tuple[tuple[float, float], ...]

@@ -51,8 +51,7 @@ def carry_out(order: PhotoOrder) -> PhotoAnswer:
         PhotoRefused: if the photo cannot be used, or shows no board or one that contradicts others where it should.
         InvalidInput: if the focal length or a mark makes no sense.
     """
-    from osfcore.photo.calibration.calibrate import assess
-    from osfcore.photo.calibration.sighting import sight
+    from osfcore.photo.calibration import assess, sight
     from osfcore.photo.read_photograph import read_photograph
 
     try:
@@ -70,7 +69,7 @@ def carry_out(order: PhotoOrder) -> PhotoAnswer:
 
 
 def _read(order: ReadPhoto, raw: RawPhotograph) -> PhotoRead:
-    from osfcore.photo.located import locate, locate_calibrated
+    from osfcore.photo.summary import locate, locate_calibrated
 
     found = locate(raw, order.focal_px) if order.camera is None else locate_calibrated(raw, order.camera)
     height, width = found.raw.encoded.shape[:2]

@@ -12,7 +12,7 @@ _MEMORY_BYTES = 3 << 30  # an object with the largest texture takes one
 
 def thumbnails_main(server: ProcessServer, objects_root: Path) -> None:
     """Draw the objects that are asked for by name; answers PNGs."""
-    from osfcore.inspection.turntable import turntable_png
+    from osfcore.inspection.contact_sheet import turntable_png
     from osfcore.objects.asset_library import AssetLibrary
 
     limit_memory(_MEMORY_BYTES)

@@ -16,7 +16,7 @@ from app.services.goals.goals import Goals, NoTable
 from app.services.runner import Runner
 from app.storage.goal_store import GoalRecord
 from osfcore.errors import OsfError, UnknownName
-from osfcore.estimation.content_verdict import ContentCheck, Verdict
+from osfcore.estimation.steps import ContentCheck, Verdict
 
 GoalVerdict = Verdict | Literal["other table"]
 _MOST_REMEMBERED = 200

@@ -99,7 +99,7 @@ class OwnObjects:
             raise ObjectTaken(new.name)
 
     def _queue(self, new: NewObject, folder: Path, file_name: str) -> Job:
-        from osfcore.objects.mesh_upload import check_upload  # loads trimesh, which the page's start need not wait for
+        from osfcore.objects.mesh import check_upload  # loads trimesh, which the page's start need not wait for
 
         try:
             check_upload(folder / UPLOAD)

@@ -41,7 +41,7 @@ class Thumbnails:
         self._end()
 
     def png(self, name: str) -> bytes:
-        """The object from all around, as `osfcore.inspection.turntable` draws it. Blocks.
+        """The object from all around, as `osfcore.inspection.contact_sheet` draws it. Blocks.
 
         Raises:
             UnknownName, MissingAssets, CorruptFile: if there is no such object here, or it is damaged.

@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from app.processes.messages.photo_messages import AssessCamera, PhotoAnswer, PhotoOrder, SightBoard
 from osfcore.errors import NotThere
 from osfcore.geometry.poses import Pose
-from osfcore.photo.calibration.calibrate import Calibration
-from osfcore.photo.calibration.sighting import Sighting
+from osfcore.photo.calibration import Calibration, Sighting
 
 _MOST_KEPT = 300  # of all visitors; the oldest are forgotten
 

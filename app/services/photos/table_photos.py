@@ -24,7 +24,7 @@ from osfcore.errors import InvalidInput, NotThere, OsfError, UnknownName, check_
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
-from osfcore.photo.calibration.camera_file import KnownCamera
+from osfcore.photo.calibration import KnownCamera
 from osfcore.photo.found_scene import FoundScene
 
 KIND = "photo"

@@ -15,7 +15,7 @@ from osfcore.errors import OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_jpeg
 from osfcore.photo.read_photograph import read_photograph
-from osfcore.robots.camera_pictures import KEPT_SIDE
+from osfcore.robots.http_robot import KEPT_SIDE
 
 FRESH_S = 1.0  # nobody looks again before
 

@@ -25,8 +25,7 @@ from app.storage.database import CannotStore
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.robots.connect import check_address, connect
 from osfcore.robots.http_robot import HttpRobot
-from osfcore.robots.robot import RobotDescription
-from osfcore.robots.safety_limits import SafetyLimits
+from osfcore.robots.robot import RobotDescription, SafetyLimits
 
 KIND = "robot"
 LEASE_S = 3.0  # without a word from the page that let the robot move

@@ -18,9 +18,9 @@ from app.viewer.nodes.ghosts import mesh_of
 from app.viewer.nodes.label_layout import Label
 from app.viewer.nodes.push_nodes import PREDICTED
 from osfcore.control.events import Looking
-from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import EstimatedState
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 
 Part = Literal["goal", "plan", "estimate"]
 PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")

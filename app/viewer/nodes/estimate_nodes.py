@@ -26,9 +26,9 @@ from app.viewer.nodes.label_layout import Label, separated
 from app.viewer.nodes.light_marker import AT, LightMarker
 from app.viewer.nodes.scene_nodes import LIGHT_COLOUR
 from osfcore.estimation.steps import UNPLACED_BELOW_M, EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import EstimatedState
 from osfcore.objects.asset_library import AssetLibrary
 
 GHOSTS = 24  # candidates of each object that are drawn

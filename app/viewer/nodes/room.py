@@ -7,7 +7,7 @@ import viser
 
 from osfcore.geometry.light import AMBIENT
 from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.world.imaging.optics import TABLE_ALBEDO
+from osfcore.world.imaging import TABLE_ALBEDO
 
 # From where the goal camera is, further back: the whole table is in view, and left is left as in the goal image.
 VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.0, -1.31, 0.97), (0.0, 0.02, 0.0), 0.7

@@ -22,7 +22,7 @@ from osfcore.geometry.poses import rotate
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.imaging.optics import TABLE_ALBEDO
+from osfcore.world.imaging import TABLE_ALBEDO
 
 _ABOVE_M = 0.0007  # the table, so that it does not flicker
 _CORNERS = 20  # of the pusher's rim

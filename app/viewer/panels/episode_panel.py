@@ -22,8 +22,8 @@ from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.panel import Panel
 from osfcore.control.events import GoalFound, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.geometry.states import EstimatedState
+from osfcore.planning.costs import PoseGoal
 
 DRAW_INTERVAL_S = 0.08
 _SHOWN: tuple[tuple[Part, str, str], ...] = (

@@ -8,7 +8,7 @@ import numpy as np
 import osfcore.environments  # noqa: F401  registers what is made below
 from osfcore.environments.registration import TABLETOP_ID
 from osfcore.environments.tabletop_env import TabletopEnv
-from osfcore.export.lerobot.conventions import GOAL_IMAGE, environment_state, image_name, instruction
+from osfcore.export.lerobot import GOAL_IMAGE, environment_state, image_name, instruction
 from osfcore.geometry.cameras import default_cameras
 
 

@@ -11,9 +11,9 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.planning.mppi import PlanRound
 from osfcore.planning.parts import CostInputs, PlannerInputs
-from osfcore.planning.pose_cost import Cost, PoseGoal, object_costs
-from osfcore.world.conditions import Conditions
-from osfcore.world.parts import WorldInputs
+from osfcore.planning.costs import Cost, PoseGoal, object_costs
+from osfcore.world.scenes import Conditions
+from osfcore.world.tabletop import WorldInputs
 from osfcore.world.tabletop import Tabletop
 
 

@@ -11,15 +11,15 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, get_args
 
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
-from osfcore.experiments.rearrangement.factors import EPISODE_FACTORS
-from osfcore.experiments.rearrangement.methods import TRUTHS, Variant
+from osfcore.control.events import EpisodeSettings
+from osfcore.experiments.factors import EPISODE_FACTORS
+from osfcore.experiments.rearrangement import EvaluateMpc
+from osfcore.experiments.rearrangement_runs import TRUTHS, Variant
 from osfcore.experiments.rivals.visual_foresight import ForesightSettings
 from osfcore.paper.mppi import STEPS, GaussianPlanSettings
 from osfcore.paper.stages import StageName
 from osfcore.planning.mppi import PlanSettings
-from osfcore.world.rearrangement_tasks import Family
+from osfcore.world.tasks import Family
 
 SectionName = Literal["methods", "families", "ablations", "ladder", "factors", "attribution"]
 SECTIONS: tuple[SectionName, ...] = get_args(SectionName)

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from osfcore.control.scene_models import SceneModels
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.control.estimators import SceneModels
+from osfcore.estimation.objective import ObjectModels
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.table_field import TableField
+from osfcore.fields.table import TableField
 from osfcore.geometry.cameras import Camera
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch
 
 _FOLDER = "nerf"

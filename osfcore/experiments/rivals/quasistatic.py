@@ -16,10 +16,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from osfcore.dynamics.contact_geometry import outlines
-from osfcore.dynamics.limit_surface import friction_arm, push_motion
-from osfcore.dynamics.motion import Motion
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.motion import Motion, friction_arm, push_motion
+from osfcore.dynamics.shapes import ShapeTable, outlines
 from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import dot, gap_between, gap_to_point
 from osfcore.geometry.workspace import PUSHER_RADIUS_M

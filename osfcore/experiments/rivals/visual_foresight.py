@@ -25,10 +25,10 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.control.goal import GoalImage
-from osfcore.control.world_protocol import World
+from osfcore.control.world import World
 from osfcore.errors import InvalidInput, check_ranges
-from osfcore.experiments.rearrangement.factors import Factor, VariedWorld
-from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.experiments.factors import Factor, VariedWorld
+from osfcore.experiments.rearrangement_runs import Ended
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.workspace import MAX_SPEED_M_S
@@ -39,7 +39,7 @@ _AXES = 2
 
 
 class FramePredictor(Protocol):
-    """Predicts images; `osfcore.experiments.rivals.fitvid.model.FitVidModel` is one."""
+    """Predicts images; `osfcore.experiments.rivals.fitvid.FitVidModel` is one."""
 
     def predict(
         self,

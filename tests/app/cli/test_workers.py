@@ -13,15 +13,13 @@ from app.cli import workers
 from app.cli.commands.train import TrainFieldCommand
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
-from osfcore.experiments.pieces import Piece, results_of
-from osfcore.experiments.task_cache import TaskCache
+from osfcore.experiments.harness import Piece, TaskCache, results_of
 from osfcore.fields.devices import computing_threads
-from osfcore.fields.field_weights import read_field
-from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.recipes import TrainField
-from osfcore.fields.training.several import train_several
+from osfcore.fields.kiloosf import read_field
+from osfcore.fields.train_kiloosf import TrainField, train_field
+from osfcore.fields.train_several import train_several
 from osfcore.io.push_file import read_pushes
-from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 from tests.clusters import deadly, local_cluster, number_of, number_that_kills, training_that_dies
 from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set
 

@@ -12,13 +12,12 @@ from jsonschema import Draft202012Validator
 from app.api.app_factory import create_app
 from app.jobs.job import FINISHED, State
 from osfcore.client import Client, Episode, Estimate, Health, ServiceError
-from osfcore.client.client import Mode
-from osfcore.client.connection import Connection
+from osfcore.client.client import Connection, Mode
 from osfcore.errors import InvalidInput
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import encode_png, to_uint8
-from osfcore.world.collection.collect_observation import CollectObservation, collect_observation
+from osfcore.world.collect_images import CollectObservation, collect_observation
 from tests.app.conftest import LONG
 
 SLOW = pytest.mark.slow

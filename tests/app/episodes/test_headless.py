@@ -9,12 +9,21 @@ from app.episodes.event_notes import stage_of
 from app.episodes.file_names import RECORDING_FILE, REPORT_FILE
 from app.episodes.headless import run_episode
 from app.episodes.request import EpisodeOrder
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Observed, Planning, Stepped
+from osfcore.control.events import (
+    ActionExecuted,
+    EpisodeSettings,
+    Finished,
+    GoalFound,
+    Looking,
+    Noticed,
+    Observed,
+    Planning,
+    Stepped,
+)
 from osfcore.errors import CorruptFile, OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.geometry.states import EstimatedState
+from osfcore.planning.costs import PoseGoal
 from osfcore.progress import Progress
 
 NAMES = ("009_gelatin_box",)

@@ -16,15 +16,14 @@ from app.episodes.finished import NoEpisode
 from app.episodes.lerobot.export import NothingPushed, write_lerobot
 from app.episodes.trajectory import Trajectory, write_trajectory
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.export.lerobot.episode import DatasetSize
+from osfcore.export.lerobot import DatasetSize
 from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.world.imaging.ray_tracer import RayTracer
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import RayTracer, TracedMesh
 
 BOX, CAN = "009_gelatin_box", "005_tomato_soup_can"
 LENGTHS = (3, 2)

@@ -15,11 +15,10 @@ from app.episodes.trajectory import Round, Trajectory, write_trajectory
 from app.processes.plan_summary import PlanSketch
 from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import goal_camera
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.image_file import write_png
 from osfcore.objects.asset_library import AssetLibrary
 

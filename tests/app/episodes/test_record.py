@@ -12,16 +12,15 @@ from app.episodes.frames import HEIGHT, WIDTH, part_of, read_frame
 from app.episodes.record import About, EpisodeRecord
 from app.episodes.request import SimulatedTable
 from app.episodes.trajectory import read_trajectory
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Observed, Stepped
+from osfcore.control.events import ActionExecuted, EpisodeSettings, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.errors import CannotWrite
 from osfcore.geometry.cameras import default_cameras, goal_camera
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import EstimatedState
 from osfcore.io.image_file import to_uint8
-from osfcore.planning.pose_cost import PoseGoal
-from osfcore.world.scene_request import SceneRequest
+from osfcore.planning.costs import PoseGoal
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 CAN, BOX = NAMES = ("005_tomato_soup_can", "009_gelatin_box")

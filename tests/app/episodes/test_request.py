@@ -11,15 +11,14 @@ from PIL import Image
 from app.episodes import request as orders
 from app.episodes.request import EpisodeOrder, read_goal
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, NoRoom, OsfError, UnknownName
-from osfcore.experiments.estimation.tasks import SHIFT_M
+from osfcore.experiments.estimation_tasks import SHIFT_M
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
 from osfcore.io.scene_file import camera_to_json
 from osfcore.photo.table_layout import NoPhotographedTable
-from osfcore.world import goal_layouts
-from osfcore.world.parts import WORLDS
-from osfcore.world.scene_request import SceneRequest
-from osfcore.world.tabletop import Tabletop
+from osfcore.world import tasks
+from osfcore.world.scenes import SceneRequest
+from osfcore.world.tabletop import WORLDS, Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box", "006_mustard_bottle")
 
@@ -148,7 +147,7 @@ def test_an_order_that_cannot_be_met_is_told_in_one_sentence(order, changes, kin
 
 
 def test_where_no_goal_has_room_that_is_told(order, monkeypatch):
-    monkeypatch.setattr(goal_layouts, "draw_goal", lambda *_: None)
+    monkeypatch.setattr(tasks, "draw_goal", lambda *_: None)
     with pytest.raises(NoRoom, match="after 30 tries"):
         orders.given(order)
 

@@ -8,11 +8,10 @@ from app.processes.plan_summary import PlanSketch
 from osfcore.control.events import ActionExecuted, Looking, Observed, Stepped
 from osfcore.errors import CorruptFile
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.geometry.workspace import STEP_S
 from osfcore.progress import Progress
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from osfcore.fields.field_library import FIELD_FILE
-from osfcore.fields.field_weights import write_field
-from osfcore.fields.table_field import TableField, write_table
+from osfcore.fields.kiloosf import write_field
+from osfcore.fields.table import TableField, write_table
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.render.solids import solid_field
-from osfcore.world.imaging.optics import BACKGROUND_RADIANCE, TABLE_ALBEDO
+from osfcore.render.reference import solid_field
+from osfcore.world.imaging import BACKGROUND_RADIANCE, TABLE_ALBEDO
 
 
 def write_exact_table(data_dir: Path) -> None:

@@ -12,7 +12,7 @@ from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
 from osfcore.progress import Progress
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import PLANNING, SceneBatch
 from tests.app.processes.conftest import BOX
 

@@ -5,7 +5,7 @@ import pytest
 
 from app.processes.messages.neural_messages import DrawView, Predicted, PredictPushes
 from app.processes.predict_process import PushPredictor
-from osfcore.dynamics import push_models
+from osfcore.dynamics import rollout
 from osfcore.dynamics.rollout import PushModel
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName
 from osfcore.geometry.cameras import goal_camera
@@ -60,8 +60,8 @@ def test_what_is_not_finite_is_not_told(oracle, state, monkeypatch):
 
 
 def test_models_are_kept_until_a_field_changes_and_order_does_not_matter(fields_dir, state, tmp_path, monkeypatch):
-    loads, real = [], push_models.load_push_model
-    monkeypatch.setattr(push_models, "load_push_model", lambda *args: (loads.append(args), real(*args))[1])
+    loads, real = [], rollout.load_push_model
+    monkeypatch.setattr(rollout, "load_push_model", lambda *args: (loads.append(args), real(*args))[1])
     shutil.copytree(fields_dir, tmp_path / "own")
     other = "006_mustard_bottle"
     write_box(tmp_path / "own", other, SIZE_M, (0.1, 0.1, 0.1))

@@ -17,7 +17,7 @@ from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.metrics.image_errors import psnr
-from osfcore.world.imaging.optics import TABLE_ALBEDO
+from osfcore.world.imaging import TABLE_ALBEDO
 from tests.app.processes.conftest import ALBEDO, BOX, SIZE_M
 from tests.app.processes.fields import write_box
 

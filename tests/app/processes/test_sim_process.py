@@ -34,7 +34,7 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.workspace import STEP_S
-from osfcore.inspection.mask_tint import MASK_COLOURS, tint_masks
+from osfcore.inspection.overlays import MASK_COLOURS, tint_masks
 from osfcore.io.observation_file import read_observation
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"

@@ -19,12 +19,11 @@ from app.storage.uploads import UploadRefused
 from app.storage.usage import StorageMeter
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_multiply
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.io.observation_file import read_observation, write_observation
-from osfcore.io.state_file import write_estimated
+from osfcore.io.scene_file import write_estimated
 from tests.app.services.test_image_sets import zipped
 from tests.app.storage.test_database import record
 

@@ -103,7 +103,7 @@ def test_a_zip_bomb_is_refused(sets, tmp_path):
 
 
 def test_images_of_the_table_are_told_apart(tmp_path):
-    from osfcore.world.collection.collect_images import CollectTable, collect_table
+    from osfcore.world.collect_images import CollectTable, collect_table
 
     for _ in collect_table(CollectTable(tmp_path / "table", images=60, size=16)):
         pass

@@ -2,16 +2,15 @@
 
 import numpy as np
 
-from osfcore.control.scene_models import SceneModels
-from osfcore.dynamics.push_models import load_push_model, load_shapes
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.control.estimators import SceneModels
+from osfcore.dynamics.rollout import load_push_model, load_shapes
+from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.uncertainty import FitQuality
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset import Symmetry
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 GELATIN, CAN = NAMES = ("009_gelatin_box", "005_tomato_soup_can")

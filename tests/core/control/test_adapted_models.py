@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from osfcore.control import adapted_models as module
-from osfcore.control.adapted_models import AdaptedModels, estimate_goal_image
+from osfcore.control import closed_loop as module
+from osfcore.control.closed_loop import AdaptedModels, estimate_goal_image
 from osfcore.control.goal import GoalImage
-from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.camera_response import ImageModel
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose

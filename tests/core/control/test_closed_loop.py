@@ -7,18 +7,25 @@ import pytest
 from osfcore.control import closed_loop as module
 from osfcore.control import estimators
 from osfcore.control.closed_loop import Episode
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import ActionExecuted, Finished, GoalFound, Looking, Noticed, Planning, Stepped
+from osfcore.control.events import (
+    ActionExecuted,
+    EpisodeSettings,
+    Finished,
+    GoalFound,
+    Looking,
+    Noticed,
+    Planning,
+    Stepped,
+)
 from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
-from osfcore.estimation.photometry.image_model import ImageModel
+from osfcore.estimation.camera_response import ImageModel, srgb_of_linear
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
+from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSettings
-from osfcore.planning.pose_cost import PoseGoal
 from osfcore.progress import Progress
 from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, models, perfect_fit, sure, table
 

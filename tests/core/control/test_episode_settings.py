@@ -1,6 +1,6 @@
 import pytest
 
-from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput
 
 

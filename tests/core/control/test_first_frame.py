@@ -7,13 +7,12 @@ import pytest
 
 from osfcore.control.first_frame import estimate_first
 from osfcore.errors import InvalidInput
+from osfcore.estimation.camera_response import ImageModel, srgb_of_linear
 from osfcore.estimation.first_frame import FirstFrameConfig
 from osfcore.estimation.first_frame import estimate_first as estimate_usual
-from osfcore.estimation.objective.observed_views import views_of
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
-from osfcore.estimation.photometry.image_model import ImageModel
-from osfcore.estimation.photometry.scaled_fields import adapted
-from osfcore.estimation.photometry.table_check import check_table
+from osfcore.estimation.objective import views_of
+from osfcore.estimation.photometry import adapted
+from osfcore.estimation.search import check_table
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, apart, lying, observe, scene, shipped_models

@@ -12,7 +12,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset import Symmetry
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 from tests.core.control.scenes import CAN, GELATIN, models, sure, table
 
 ABOUT_Z = np.array([0.0, 0.0, 1.0])

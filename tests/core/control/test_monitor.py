@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.monitor import ProgressMonitor, lamp_moved, lies_otherwise, moved_by_hand, offsets
+from osfcore.control.closed_loop import ProgressMonitor, lamp_moved, lies_otherwise, moved_by_hand, offsets
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 STATE = SceneState(

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from osfcore.control.closed_loop import Episode
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import GoalFound, Looking, Noticed, Stepped
+from osfcore.control.events import EpisodeSettings, GoalFound, Looking, Noticed, Stepped
+from osfcore.control.first_frame import PreparedLook, PreparedLooks, prepared_from_json, prepared_to_json
 from osfcore.control.goal import GoalImage
-from osfcore.control.prepared_look import PreparedLook, PreparedLooks, prepared_from_json, prepared_to_json
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.relocalization import relocalize
+from osfcore.control.closed_loop import relocalize
 from osfcore.geometry.poses import Pose
 from tests.core.control.scenes import CAN, GELATIN, models, sure, table
 

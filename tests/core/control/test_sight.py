@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.sight import Sight, blind_cameras, brightness_change, without_cameras
+from osfcore.control.world import Sight, blind_cameras, brightness_change, without_cameras
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import Observation
 

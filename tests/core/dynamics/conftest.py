@@ -1,7 +1,7 @@
 import pytest
 
-from osfcore.dynamics.push_models import load_shapes
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.rollout import load_shapes
+from osfcore.dynamics.shapes import ShapeTable
 from osfcore.fields.field_library import FieldLibrary
 from tests.core.dynamics.scenes import NAMES
 

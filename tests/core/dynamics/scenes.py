@@ -5,11 +5,9 @@ import itertools
 import numpy as np
 import torch
 
-from osfcore.dynamics.motion import Motion, Sweep, headings, lowest_point
-from osfcore.dynamics.propagation_network import PropagationNetwork
-from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
-from osfcore.dynamics.shapes.object_shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
-from osfcore.dynamics.substep import unroll
+from osfcore.dynamics.graph import PropagationNetwork, unroll
+from osfcore.dynamics.motion import SUBSTEPS, Motion, Sweep, headings, lowest_point, pusher_path
+from osfcore.dynamics.shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.states import SceneState

@@ -3,7 +3,7 @@
 import numpy as np
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.render.solids import solid_field
+from osfcore.render.reference import solid_field
 
 VOXEL = 0.004
 ARM = np.array([0.05, 0.015, 0.02])

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.contact_geometry import PAIR_REACH_M, outlines, pair_contact, pusher_contact, solids
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.shapes import PAIR_REACH_M, ShapeTable, outlines, pair_contact, pusher_contact, solids
 from osfcore.geometry.polygons import gap_to_point
 from osfcore.geometry.torch_rotations import facing
 from osfcore.geometry.workspace import PUSHER_RADIUS_M

@@ -4,9 +4,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.contact_geometry import PAIR_REACH_M, TOUCH_M
-from osfcore.dynamics.contact_graph import TRAVEL_M, adjacency, build_graph
+from osfcore.dynamics.graph import TRAVEL_M, adjacency, build_graph
 from osfcore.dynamics.motion import Motion, Sweep
+from osfcore.dynamics.shapes import PAIR_REACH_M, TOUCH_M
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, crowd, moved_state, scene, start, sweep_of
 

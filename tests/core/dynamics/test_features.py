@@ -4,11 +4,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.contact_graph import build_graph
-from osfcore.dynamics.features import EDGE_FEATURES, NODE_FEATURES, SHIFT_M, TURN_RAD, inputs, mirrored
+from osfcore.dynamics.graph import (
+    EDGE_FEATURES,
+    MOTION,
+    NODE_FEATURES,
+    SHIFT_M,
+    TURN_RAD,
+    build_graph,
+    inputs,
+    mirrored,
+)
 from osfcore.dynamics.motion import Motion, Sweep
-from osfcore.dynamics.propagation_network import MOTION
-from osfcore.dynamics.shapes.object_shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
+from osfcore.dynamics.shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
 from osfcore.geometry.poses import quaternion_exp
 from tests.core.dynamics.scenes import CAN, crowd, moved_state, scene, start, sweep_of
 

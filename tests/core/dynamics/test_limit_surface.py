@@ -5,7 +5,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.limit_surface import FRICTION, friction_arm, push_motion
+from osfcore.dynamics.motion import FRICTION, friction_arm, push_motion
 from osfcore.geometry.polygons import circle
 
 angles = st.floats(-3.1, 3.1)

@@ -2,8 +2,7 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from osfcore.dynamics.network_weights import FORMAT, network_bytes, read_network, shipped, write_network
-from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.graph import FORMAT, PropagationNetwork, network_bytes, read_network, shipped, write_network
 from osfcore.errors import CannotWrite, CorruptFile
 from tests.core.dynamics.scenes import network
 from tests.core.dynamics.test_propagation_network import graph

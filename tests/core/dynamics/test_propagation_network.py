@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from osfcore.dynamics.features import EDGE_FEATURES, NODE_FEATURES
-from osfcore.dynamics.propagation_network import MOTION, PropagationNetwork
+from osfcore.dynamics.graph import EDGE_FEATURES, MOTION, NODE_FEATURES, PropagationNetwork
 from tests.core.dynamics.scenes import network
 
 

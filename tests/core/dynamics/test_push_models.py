@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from osfcore.dynamics.network_weights import shipped, write_network
-from osfcore.dynamics.push_models import NETWORK_FILE, load_push_model, load_shapes, network_path
-from osfcore.dynamics.shapes.field_parts import field_parts
-from osfcore.dynamics.shapes.object_shapes import object_shape
+from osfcore.dynamics import shapes as field_parts
+from osfcore.dynamics.graph import shipped, write_network
+from osfcore.dynamics.rollout import NETWORK_FILE, load_push_model, load_shapes, network_path
+from osfcore.dynamics.shapes import object_shape
 from osfcore.errors import CorruptFile, UnknownName
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
-from osfcore.fields.field_weights import write_field
+from osfcore.fields.kiloosf import write_field
 from tests.core.dynamics.scenes import APPLE, CAN, network, scene
 from tests.core.dynamics.solids import bracket
 from tests.core.render.scenes import ball
@@ -42,9 +42,7 @@ def trained(tmp_path):
 
 @pytest.mark.slow
 def test_shipped_parts_are_those_of_the_shipped_fields(monkeypatch):
-    monkeypatch.setattr(
-        "osfcore.dynamics.push_models.field_parts", lambda _: pytest.fail("parts do not fit their field")
-    )
+    monkeypatch.setattr("osfcore.dynamics.rollout.field_parts", lambda _: pytest.fail("parts do not fit their field"))
     counts = {name: len(shape.parts) for name, shape in load_shapes(None, FIELDS, FIELDS.names()).items()}
     assert {name for name, count in counts.items() if count} == HOLLOW
 
@@ -61,7 +59,7 @@ def test_shipped_parts_can_be_made_again():
 def test_parts_of_an_own_field_are_made_once(tmp_path, trained, monkeypatch):
     first = load_shapes(tmp_path, trained, ["bracket"])["bracket"]
     assert len(first.parts) >= 2
-    monkeypatch.setattr("osfcore.dynamics.push_models.field_parts", lambda _: pytest.fail("made again"))
+    monkeypatch.setattr("osfcore.dynamics.rollout.field_parts", lambda _: pytest.fail("made again"))
     again = load_shapes(tmp_path, trained, ["bracket"])["bracket"]
     assert all(np.array_equal(a, b) for a, b in zip(first.parts, again.parts, strict=True))
 

@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.motion import SUBSTEPS, pusher_path
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
-from osfcore.world.collection.collect_pushes import SUBSTATES
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.collect_pushes import SUBSTATES
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 speeds = st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), min_size=1, max_size=20)

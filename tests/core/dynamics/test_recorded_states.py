@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.dynamics.pusher_path import SUBSTEPS
-from osfcore.dynamics.recorded_states import is_on_table, substates
+from osfcore.dynamics.motion import SUBSTEPS, is_on_table, substates
 from osfcore.errors import InvalidInput
 from tests.core.dynamics.scenes import CAN, GELATIN, episode, scene
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import osfcore.dynamics.rollout as module
-from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.motion import SUBSTEPS, pusher_path
 from osfcore.dynamics.rollout import PushModel
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.motion import going_on
-from osfcore.dynamics.pusher_path import SUBSTEPS
+from osfcore.dynamics.graph import unroll
+from osfcore.dynamics.motion import SUBSTEPS, going_on
 from osfcore.dynamics.rollout import PushModel
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.dynamics.substep import unroll
+from osfcore.dynamics.shapes import ShapeTable
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle
 from osfcore.geometry.states import SceneState
 from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, angle_bracket, network, scene, start

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, lowest_point
-from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
-from osfcore.dynamics.substep import advance, unroll
+from osfcore.dynamics.graph import advance, unroll
+from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, SUBSTEPS, lowest_point, pusher_path
 from tests.core.dynamics.scenes import BOX, CAN, crowd, network, scene, start, sweep_of
 
 NETWORKS = {"first guess": {"silent": True}, "random": {}}

@@ -18,9 +18,9 @@ from osfcore.errors import InvalidInput, OsfError
 from osfcore.extras import MissingExtra
 from osfcore.geometry.workspace import STEP_S
 from osfcore.metrics.success import RearrangementTask
-from osfcore.world.rearrangement_tasks import DrawnTask, TaskSet, draw_task
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tasks import DrawnTask, TaskSet, draw_task
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 STAND = np.zeros(2, np.float32)

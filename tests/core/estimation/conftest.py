@@ -1,6 +1,6 @@
 import pytest
 
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective import ObjectModels
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOTTLE, BOX, lying, observe, scene, shipped_models
 from tests.core.render.scenes import ball, block, wooden_table

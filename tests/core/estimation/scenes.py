@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import QUALITY, ObservedViews
-from osfcore.estimation.objective.parametrization import SceneParameters
+from osfcore.estimation.objective import QUALITY, ObjectModels, ObservedViews, SceneParameters
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, rotate, rotation_angle

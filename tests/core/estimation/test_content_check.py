@@ -7,7 +7,7 @@ import pytest
 
 from osfcore.errors import UnknownName
 from osfcore.estimation.content_check import ContentChecker
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective import ObjectModels
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.estimation.goal_image import estimate_goal
-from osfcore.estimation.goal_refinement import GoalImageConfig
-from osfcore.estimation.objective.resting_orientations import yaw_quaternions
+from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.objective import yaw_quaternions
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_multiply

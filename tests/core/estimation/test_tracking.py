@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.estimation.objective.resting_orientations import yaw_quaternions
+from osfcore.estimation.objective import yaw_quaternions
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light

@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.observed_views import QUALITY, views_of
-from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
-from osfcore.estimation.search.gauss_newton import GaussNewtonState, gauss_newton
+from osfcore.estimation.objective import LIGHT, POSE, QUALITY, SceneParameters, views_of
+from osfcore.estimation.search import GaussNewtonState, gauss_newton
 from osfcore.estimation.uncertainty import (
     FitQuality,
     allowed_residuals,

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
-from osfcore.fields.field_weights import write_field
-from osfcore.fields.kiloosf import without_light
+from osfcore.fields.kiloosf import without_light, write_field
 from tests.core.experiments.solids import SOLIDS
 
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-import osfcore.experiments.estimation.parts as parts
-import osfcore.experiments.estimation.tasks as tasks
+import osfcore.experiments.estimation as parts
+import osfcore.experiments.estimation_tasks as tasks
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective.object_models import ObjectModels
+from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import EstimatedState
 from osfcore.progress import Progress
 
 SHIFT_M = 0.0015  # by which all its positions are off along x

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from osfcore.dynamics.push_models import load_shapes
+from osfcore.dynamics.rollout import load_shapes
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import quaternion_exp
 from osfcore.io.push_file import PushEpisode

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from osfcore.estimation.first_frame import FirstFrameConfig
-from osfcore.estimation.goal_refinement import GoalImageConfig
+from osfcore.estimation.goal_image import GoalImageConfig
 from osfcore.estimation.tracking import TrackingConfig
-from osfcore.experiments.estimation.parts import EvaluateEstimate
+from osfcore.experiments.estimation import EvaluateEstimate
 from tests.core.experiments.solids import SOLIDS
 
 EFFORT = FirstFrameConfig(

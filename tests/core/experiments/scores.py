@@ -1,8 +1,8 @@
 """Handmade scores, for what is computed and drawn from them."""
 
-from osfcore.experiments.estimation.report import EstimateReport
-from osfcore.experiments.estimation.scores import FrameScore, ObjectScore, TrackScore
-from osfcore.experiments.estimation.spoiled_inputs import KINDS, BadScore
+from osfcore.experiments.estimation import EstimateReport
+from osfcore.experiments.estimation_scores import FrameScore, ObjectScore, TrackScore
+from osfcore.experiments.estimation_tasks import KINDS, BadScore
 
 
 def score(position_mm=1.0, rotation_deg=1.0, *, flagged=False, ratios=(1.0, 1.0, 1.0), name="can", std_mm=1.0):

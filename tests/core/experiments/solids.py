@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME
-from osfcore.fields.field_weights import write_field
-from osfcore.fields.table_field import TableField, write_table
+from osfcore.fields.kiloosf import write_field
+from osfcore.fields.table import TableField, write_table
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.render.solids import solid_field
-from osfcore.world.imaging.optics import BACKGROUND_RADIANCE, TABLE_ALBEDO
+from osfcore.render.reference import solid_field
+from osfcore.world.imaging import BACKGROUND_RADIANCE, TABLE_ALBEDO
 
 SOLIDS = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box")
 

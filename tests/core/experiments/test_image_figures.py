@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from osfcore.experiments.charts import Axis
-from osfcore.experiments.image_figures import chart_of, measured, summary, tables_of
-from osfcore.experiments.pieces import Piece
-from osfcore.experiments.task_cache import TaskCache, TaskResult
+from osfcore.experiments.harness import Piece, TaskCache, TaskResult
+from osfcore.experiments.images import chart_of, measured, summary, tables_of
 from osfcore.inspection.contact_sheet import Comparison
 
 NONE = float("nan")

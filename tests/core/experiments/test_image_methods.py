@@ -1,14 +1,7 @@
 import pytest
 
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.image_methods import (
-    FIELD_METHODS,
-    TITLES,
-    check_methods,
-    common_names,
-    field_path,
-    load_appearance,
-)
+from osfcore.experiments.images import FIELD_METHODS, TITLES, check_methods, common_names, field_path, load_appearance
 from osfcore.fields.field_library import FieldLibrary
 from tests.core.experiments.nerfs import write_nerfs
 from tests.core.experiments.solids import SOLIDS

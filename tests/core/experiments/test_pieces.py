@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from osfcore.errors import WorkerDied
-from osfcore.experiments.pieces import Piece, results_of
-from osfcore.experiments.task_cache import TaskCache, TaskResult
+from osfcore.experiments.harness import Piece, TaskCache, TaskResult, results_of
 from tests.clusters import deadly, number_of
 
 

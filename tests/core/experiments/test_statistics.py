@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.experiments.statistics import compare_means, compare_shares, holm, mean_interval, share_interval
+from osfcore.experiments.harness import compare_means, compare_shares, holm, mean_interval, share_interval
 
 OUTCOMES = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=30)
 

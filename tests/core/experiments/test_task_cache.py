@@ -1,4 +1,3 @@
-import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,7 +5,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CannotWrite, CorruptFile
-from osfcore.experiments.task_cache import TaskCache, TaskResult, code_sha256, file_sha256, table_sha256
+from osfcore.experiments.harness import TaskCache, TaskResult, file_sha256, table_sha256
 from osfcore.inspection.contact_sheet import Comparison
 from tests.core.experiments.solids import exact_table
 

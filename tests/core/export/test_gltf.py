@@ -10,10 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from osfcore.estimation.photometry.camera_response import linear_of_srgb
-from osfcore.export.field_mesh import field_glb
-from osfcore.export.gltf import glb
-from osfcore.export.scene_glb import scene_glb
+from osfcore.estimation.camera_response import linear_of_srgb
+from osfcore.export.meshes import field_glb, glb, scene_glb
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light

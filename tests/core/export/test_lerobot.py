@@ -10,10 +10,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from osfcore.errors import InvalidInput
-from osfcore.export.lerobot.conventions import environment_names, environment_state, instruction
-from osfcore.export.lerobot.dataset import write_dataset
-from osfcore.export.lerobot.episode import DatasetSize, LeRobotEpisode
-from osfcore.export.lerobot.statistics import image_statistics, pooled, statistics_of
+from osfcore.export.lerobot import (
+    DatasetSize,
+    LeRobotEpisode,
+    environment_names,
+    environment_state,
+    image_statistics,
+    instruction,
+    pooled,
+    statistics_of,
+    write_dataset,
+)
 
 VALUES = st.floats(-10, 10, width=32)
 BOX, MUG, CAN = "009_gelatin_box", "025_mug", "005_tomato_soup_can"

@@ -9,8 +9,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
-from osfcore.render.reference import render_reference
-from osfcore.render.solids import solid_field
+from osfcore.render.reference import render_reference, solid_field
 
 LIGHT = Light(np.array([0.6, -0.4, 1.0]))
 HALF = np.array([0.03, 0.02, 0.04])

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from pxr import Ar, Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
-from osfcore.estimation.photometry.camera_response import linear_of_srgb
+from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.export.usd.export import field_usd, scene_usdz
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera, default_cameras

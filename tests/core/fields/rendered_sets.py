@@ -8,10 +8,10 @@ import numpy as np
 from PIL import Image
 
 from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.table_field import TableField
-from osfcore.fields.training.recipes import Recipe
+from osfcore.fields.table import TableField
+from osfcore.fields.train_kiloosf import Recipe
 from osfcore.geometry.cameras import Camera
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, coloured
 

@@ -5,8 +5,8 @@ import pytest
 
 from osfcore.errors import CorruptFile, UnknownName
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.fields.field_weights import write_field
-from osfcore.fields.table_field import write_table
+from osfcore.fields.kiloosf import write_field
+from osfcore.fields.table import write_table
 from tests.core.render.scenes import ball, block, plain_table, wooden_table
 
 

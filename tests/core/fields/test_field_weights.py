@@ -8,16 +8,19 @@ from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
 from osfcore.errors import CannotWrite, CorruptFile
-from osfcore.fields.field_weights import (
+from osfcore.fields.kiloosf import (
+    EMPTY_G,
+    FEATURES,
     FORMAT,
     MAX_FILE_BYTES,
+    KiloOSF,
     field_bytes,
     field_from_bytes,
+    network_size,
     read_field,
     read_tensors,
     write_field,
 )
-from osfcore.fields.kiloosf import EMPTY_G, FEATURES, KiloOSF, network_size
 from tests.core.render.scenes import HIDDEN, ball, random_field
 
 

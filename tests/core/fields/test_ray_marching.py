@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, FLOOR_G, KiloOSF
-from osfcore.fields.ray_marching import march
+from osfcore.fields.rays import march
 from tests.core.render.scenes import ball, block, fog, fog_depth
 
 EVERYTHING = {"min_weight": -1.0, "min_transmittance": -1.0, "most": 4096}  # also where float32 leaves no light

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.fields.ray_sampling import RaySource, camera_rays, shares_of_views
+from osfcore.fields.rays import RaySource, camera_rays, shares_of_views
 from osfcore.io.image_set import ImageSet
 from tests.core.fields.rendered_sets import directions
 from tests.core.render.scenes import view

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
 from osfcore.errors import CorruptFile
-from osfcore.fields.field_weights import FORMAT
-from osfcore.fields.table_field import TABLE_FORMAT, TableField, read_table, write_table
+from osfcore.fields.kiloosf import FORMAT
+from osfcore.fields.table import TABLE_FORMAT, TableField, read_table, write_table
 from tests.core.render.scenes import wooden_table
 
 NAMES = ("albedo", "ambient", "background", "w1", "b1", "w2", "b2")

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from osfcore.fields.kiloosf import EMPTY_G, FEATURES, FLOOR_G, network_size
 from osfcore.fields.kiloosf_query import KiloQuery
-from osfcore.fields.training.visual_hull import silhouette_box
-from osfcore.fields.voxel_shell import first_shell, grid_over, refine, seen_corners, shell_field
+from osfcore.fields.rays import first_shell, grid_over, refine, seen_corners, shell_field
+from osfcore.fields.visual_hull import silhouette_box
 from osfcore.io.image_set import read_image_set
 from tests.core.fields.rendered_sets import painted_ball, write_object_set
 from tests.core.render.scenes import ball, corners_of

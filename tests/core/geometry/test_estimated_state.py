@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 
 STATE = SceneState(("a", "b"), Pose.identity(2), Light(np.array([0, 0, 1.0])), None)
 GOOD = {"state": STATE, "position_std": np.array([0.001, np.inf]), "rotation_std": np.zeros(2), "light_std": 0.0,

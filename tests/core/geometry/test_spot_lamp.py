@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
-from osfcore.geometry.spot_lamp import SpotLamp
+from osfcore.geometry.light import SpotLamp
 
 POINTS = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 3))
 

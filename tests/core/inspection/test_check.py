@@ -7,19 +7,17 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from osfcore.dynamics.network_weights import write_network
-from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.graph import PropagationNetwork, write_network
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.inspection.check import check_path, draw_overlay
 from osfcore.io.observation_file import write_observation
 from osfcore.io.push_file import EpisodeFolder, PushEpisode, save_episode
-from osfcore.io.state_file import write_estimated
-from osfcore.world.collection.collect_images import CollectTable, collect_table
+from osfcore.io.scene_file import write_estimated
+from osfcore.world.collect_images import CollectTable, collect_table
 from tests.core.fields.sets import edit, turn_cameras, write_set
 
 

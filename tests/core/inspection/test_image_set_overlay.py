@@ -1,7 +1,7 @@
 import numpy as np
 
-from osfcore.fields.training.visual_hull import carve
-from osfcore.inspection.image_set_overlay import overlay_sheet
+from osfcore.fields.visual_hull import carve
+from osfcore.inspection.overlays import overlay_sheet
 from osfcore.io.image_set import read_image_set
 from tests.core.fields.sets import turn_cameras
 

@@ -5,7 +5,7 @@ import numpy as np
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.geometry.states import MAX_OBJECTS, Observation
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
-from osfcore.inspection.observation_overlay import object_colour, observation_sheet
+from osfcore.inspection.overlays import object_colour, observation_sheet
 
 WHITE, YELLOW, AXES = (255, 255, 255), (0, 255, 255), ((0, 0, 255), (0, 255, 0), (255, 0, 0))
 TILE = 384

@@ -10,7 +10,7 @@ import pytest
 import osfcore.io.image_set as module
 from osfcore.errors import CorruptFile
 from osfcore.io.image_set import read_annotations, read_image_set, read_splits
-from osfcore.world.collection.collect_images import CollectTable, collect_table
+from osfcore.world.collect_images import CollectTable, collect_table
 from tests.core.fields.sets import edit
 
 

@@ -7,13 +7,7 @@ from hypothesis import strategies as st
 
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.io.rollout_file import (
-    actions_from_json,
-    read_actions,
-    rollouts_from_json,
-    rollouts_to_json,
-    write_rollouts,
-)
+from osfcore.io.scene_file import actions_from_json, read_actions, rollouts_from_json, rollouts_to_json, write_rollouts
 
 GOOD = {"actions": [[[0.1, -0.2, 0.0], [0.3, 0.0, 0.0]]], "step_s": 0.2}
 

@@ -8,12 +8,19 @@ from hypothesis import strategies as st
 
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
-from osfcore.geometry.states import SceneState
-from osfcore.io.scene_file import Scene, read_scene, scene_to_json
-from osfcore.io.state_file import estimated_from_json, estimated_to_json, is_estimated, read_estimated, write_estimated
+from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.io.scene_file import (
+    Scene,
+    estimated_from_json,
+    estimated_to_json,
+    is_estimated,
+    read_estimated,
+    read_scene,
+    scene_to_json,
+    write_estimated,
+)
 
 numbers = st.floats(-10, 10)
 deviations = st.floats(0, 10) | st.just(float("inf"))

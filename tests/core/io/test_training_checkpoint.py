@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from osfcore.errors import CorruptFile
-from osfcore.io.training_checkpoint import resume_from, write_checkpoint
+from osfcore.io.checkpoint import resume_from, write_checkpoint
 
 
 @pytest.fixture

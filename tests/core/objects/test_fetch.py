@@ -8,8 +8,7 @@ from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.objects.fetch import NewObject, add_object, convert, fetch
-from osfcore.objects.sources import FolderSource, MeshFiles
+from osfcore.objects.fetch import FolderSource, MeshFiles, NewObject, add_object, convert, fetch
 
 NAMES = ("003_cracker_box", "006_mustard_bottle", "009_gelatin_box")
 

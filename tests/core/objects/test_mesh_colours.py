@@ -5,7 +5,7 @@ import trimesh
 from PIL import Image
 
 from osfcore.errors import InvalidInput
-from osfcore.objects.mesh_colours import joined, piece_of
+from osfcore.objects.mesh import joined, piece_of
 
 RNG = np.random.default_rng(3)
 

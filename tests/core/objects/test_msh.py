@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.errors import CorruptFile
-from osfcore.objects.msh import read_msh
+from osfcore.objects.mesh import read_msh
 
 VERTICES = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], np.float32)
 UV = np.array([[0, 0], [1, 0], [0, 1], [0.25, 0.75]], np.float32)

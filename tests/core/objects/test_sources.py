@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName
+from osfcore.objects.fetch import FolderSource, UrlSource, WheelSource, source_from
 from osfcore.objects.mesh import read_mesh
-from osfcore.objects.sources import FolderSource, UrlSource, WheelSource, source_from
 
 NAME, OTHER = "006_mustard_bottle", "003_cracker_box"
 

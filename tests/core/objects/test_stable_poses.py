@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from osfcore.geometry.poses import quaternion_conjugate, rotate
-from osfcore.objects.stable_poses import MAX_POSES, resting_poses
+from osfcore.objects.mesh import MAX_POSES, resting_poses
 
 
 def box_parts(sides):

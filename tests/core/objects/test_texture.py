@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from osfcore.objects.texture import clean_texture, coverage
+from osfcore.objects.mesh import clean_texture, coverage
 
 SQUARE_UV = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])

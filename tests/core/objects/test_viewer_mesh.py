@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from osfcore.objects.asset import TexturedMesh
-from osfcore.objects.viewer_mesh import viewer_glb
+from osfcore.objects.asset import TexturedMesh, viewer_glb
 
 
 @pytest.mark.parametrize("side", [32, 1500])

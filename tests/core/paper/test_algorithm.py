@@ -3,15 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import ActionExecuted, Finished, Looking, Observed, Planning, Stepped
 from osfcore.control.goal import GoalImage
-from osfcore.control.scene_models import load_scene_models
-from osfcore.experiments.rearrangement.methods import TrueEstimators
+from osfcore.experiments.rearrangement_runs import TrueEstimators
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
 from osfcore.paper.mppi import GaussianPlanSettings
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 NAME = "009_gelatin_box"

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective.object_models import ObjectModels
-from osfcore.estimation.objective.observed_views import views_of
+from osfcore.estimation.objective import ObjectModels, views_of
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first, estimate_next, masked_error, scene_error

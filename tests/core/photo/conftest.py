@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from osfcore.estimation.photometry.camera_response import linear_from_encoded, srgb_of_linear
+from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.photograph import Photograph
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 
 NAME = "009_gelatin_box"

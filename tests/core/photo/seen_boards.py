@@ -5,7 +5,7 @@ import numpy as np
 
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.photo.board import Board
-from osfcore.photo.calibration.sighting import Sighting
+from osfcore.photo.calibration import Sighting
 
 SIZE = (640, 480)
 K = np.array([[560.0, 0, 323], [0, 560, 236], [0, 0, 1]])

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.experiments.photos.board_views import (
+from osfcore.experiments.board_views import (
     board_errors,
     board_photograph,
     photograph,

@@ -3,8 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from osfcore.photo.board import Board
-from osfcore.photo.board_page import RULER_M, board_pdf, page_image
+from osfcore.photo.board import RULER_M, Board, board_pdf, page_image
 
 DOT_M = 0.0254 / 600
 BOARDS = [Board(), Board(7, 5, 0.036, 0.027, "DICT_5X5_50"), Board(8, 6, 0.0322, 0.0241)]

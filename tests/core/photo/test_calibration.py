@@ -10,8 +10,8 @@ from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
-from osfcore.photo.calibration.calibrate import TooLittleSeen, assess, board_place, calibrated_camera
-from osfcore.photo.planar_pose import planar_pose
+from osfcore.photo.board import planar_pose
+from osfcore.photo.calibration import TooLittleSeen, assess, board_place, calibrated_camera
 from tests.core.photo.seen_boards import RADIAL, VARIED, K, on_table, project, sighting, sightings
 
 TABLE_CAMERA = Camera.look_at("table", (0.0, -0.5, 0.65), (0.0, 0.0, 0.0)).T_world_camera

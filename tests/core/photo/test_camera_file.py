@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.photos.board_views import board_photograph
+from osfcore.experiments.board_views import board_photograph
 from osfcore.geometry.cameras import Camera
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import CameraJson, camera_from_json
-from osfcore.photo.calibration.calibrate import calibrated_camera
-from osfcore.photo.calibration.camera_file import calibration_to_json, known_camera, read_camera
-from osfcore.photo.calibration.sighting import sight
-from osfcore.photo.located import locate_calibrated
+from osfcore.photo.calibration import calibrated_camera, calibration_to_json, known_camera, read_camera, sight
 from osfcore.photo.read_photograph import RawPhotograph
+from osfcore.photo.summary import locate_calibrated
 from tests.core.photo.seen_boards import RADIAL, SIZE, K, sighting, sightings
 
 POSE = Camera.look_at("table", (0.0, -0.35, 0.4), (0.0, 0.0, 0.0)).T_world_camera

@@ -7,9 +7,8 @@ import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
-from osfcore.photo.light.photo_light import photo_light
-from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoConfig, PhotoModels, estimate_photo
-from osfcore.photo.poses.photo_steps import PhotoObject, PhotoPose
+from osfcore.photo.lamp import photo_light
+from osfcore.photo.poses import FINE_ACROSS, PhotoConfig, PhotoModels, PhotoObject, PhotoPose, estimate_photo
 from tests.core.photo.conftest import NAME, take
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
-from osfcore.photo.light.lamp import ShadedPixels, fit_lamp
+from osfcore.estimation.objective import fibonacci_sphere
+from osfcore.photo.lamp import ShadedPixels, fit_lamp
 
 
 def ball(rng, count=3000):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.photos.board_views import board_errors, board_photograph, random_camera
+from osfcore.experiments.board_views import board_errors, board_photograph, random_camera
 from osfcore.photo.board import Board, locate_board
 from osfcore.photo.lens import Lens, locate_board_through_lens
 

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective.resting_orientations import fibonacci_sphere
+from osfcore.estimation.objective import fibonacci_sphere
+from osfcore.geometry.light import SpotLamp
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.spot_lamp import SpotLamp
-from osfcore.photo.light.lit_pixels import TABLE, LitPixels
-from osfcore.photo.light.near_lamp import fit_near_lamp
-from osfcore.photo.light.shadows import Shadows
-from osfcore.photo.poses.surfels import Surfels
+from osfcore.photo.lamp import TABLE, LitPixels, Shadows, fit_near_lamp
+from osfcore.photo.pose_loss import Surfels
 
 BALLS = ((np.array([0.09, 0.0, 0.05]), 0.05), (np.array([-0.06, 0.08, 0.04]), 0.04))
 CENTRE = np.zeros(3)

@@ -4,7 +4,7 @@ import pytest
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.poses.object_window import object_windows, signed_distance
+from osfcore.photo.pose_loss import object_windows, signed_distance
 
 K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
 

@@ -7,10 +7,8 @@ import pytest
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
-from osfcore.photo.poses.estimate_photo import FINE_ACROSS, PhotoModels, estimate_photo
-from osfcore.photo.poses.occlusion import without_others
-from osfcore.photo.poses.photo_steps import PhotoObject, PhotoPose
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, estimate_photo, without_others
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 from tests.core.photo.conftest import NAME
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.photos.board_views import random_camera
+from osfcore.experiments.board_views import random_camera
 from osfcore.geometry.poses import rotation_angle
-from osfcore.photo.planar_pose import focal_length, planar_pose
+from osfcore.photo.board import focal_length, planar_pose
 
 SIZE = (640, 480)
 POINTS = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(-0.06, 0.06, 3)), axis=-1).reshape(-1, 2)

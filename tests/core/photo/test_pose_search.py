@@ -2,10 +2,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
-from osfcore.photo.poses.object_window import object_windows
-from osfcore.photo.poses.pose_loss import PoseLoss, draw
-from osfcore.photo.poses.pose_search import distinct, moved, poses_around, poses_from_mask, super_fibonacci
-from osfcore.photo.poses.surfels import surfels_of
+from osfcore.photo.pose_loss import PoseLoss, draw, object_windows, surfels_of
+from osfcore.photo.poses import distinct, moved, poses_around, poses_from_mask, super_fibonacci
 from tests.core.photo.conftest import NAME
 
 

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image, ImageCms
 from pillow_heif import register_heif_opener
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.estimation.photometry.camera_response import linear_of_srgb
+from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.geometry.poses import Pose
 from osfcore.photo.read_photograph import (
     KEPT_SIDE,

@@ -5,9 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from osfcore.geometry.poses import Pose
-from osfcore.photo.poses.object_window import object_windows
-from osfcore.photo.poses.pose_loss import PoseLoss, draw
-from osfcore.photo.poses.surfels import surfels_of
+from osfcore.photo.pose_loss import PoseLoss, draw, object_windows, surfels_of
 from tests.core.photo.conftest import NAME
 
 

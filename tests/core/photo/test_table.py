@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective.resting_orientations import resting_orientations
+from osfcore.estimation import objective as resting_orientations
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
-from osfcore.photo.poses.table_plane import table_from_points
-from osfcore.photo.poses.table_prior import TablePrior
+from osfcore.photo.pose_loss import TablePrior
+from osfcore.photo.poses import table_from_points
 from tests.core.photo.conftest import NAME
 
 

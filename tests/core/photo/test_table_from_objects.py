@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.resting_orientations import resting_orientations
+from osfcore.estimation.objective import resting_orientations
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
-from osfcore.photo.poses.table_from_objects import table_from_objects
-from osfcore.photo.poses.table_prior import TablePrior
+from osfcore.photo.pose_loss import TablePrior
+from osfcore.photo.poses import table_from_objects
 
 T_CAMERA_WORLD = Pose(np.array([0.05, -0.02, 0.8]), quaternion_exp(np.array([2.3, 0.2, 0.1])))
 

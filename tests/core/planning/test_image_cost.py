@@ -7,8 +7,8 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.planning.image_cost import SIDE, ImageCost
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.planning.costs import SIDE, ImageCost
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 from tests.core.dynamics.scenes import CAN, GELATIN, boxes, scene
 

@@ -3,16 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.dynamics.rollout import load_push_model, load_shapes
 from osfcore.errors import InvalidInput
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
+from osfcore.planning.costs import PoseCost, PoseGoal
 from osfcore.planning.mppi import MPPIPlanner, PlanSettings
-from osfcore.planning.pose_cost import PoseCost, PoseGoal
-from osfcore.planning.push_proposals import PushProposals
+from osfcore.planning.pushes import PushProposals
 from tests.core.dynamics.scenes import APPLE, CAN, scene
 
 FIELDS = FieldLibrary(None)

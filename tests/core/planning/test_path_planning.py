@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
-from osfcore.planning.path_planning import CELL_M, CLEARANCE_M, FreeSpace, actions_along, duration_s
+from osfcore.planning.paths import CELL_M, CLEARANCE_M, FreeSpace, actions_along, duration_s
 
 BOX = np.array([[-0.05, -0.03], [0.05, -0.03], [0.05, 0.03], [-0.05, 0.03]])
 place = st.floats(-0.3, 0.3)

@@ -6,7 +6,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.planning.pose_cost import PoseCost, PoseGoal
+from osfcore.planning.costs import PoseCost, PoseGoal
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 STATE = SceneState(

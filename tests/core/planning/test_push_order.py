@@ -5,7 +5,7 @@ import pytest
 
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
-from osfcore.planning.push_order import push_orders
+from osfcore.planning.pushes import push_orders
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 SQUARE = 0.025  # half a side

@@ -6,7 +6,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_RADIUS_M, STEP_S
-from osfcore.planning.push_outcomes import push_outcomes, silhouette
+from osfcore.planning.pushes import push_outcomes, silhouette
 
 CENTRE = np.array([0.0, 0.0, 0.01])
 UPRIGHT = np.array([1.0, 0, 0, 0])

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
-from osfcore.planning.path_planning import CLEARANCE_M
-from osfcore.planning.push_primitives import straight_pushes
+from osfcore.planning.paths import CLEARANCE_M
+from osfcore.planning.pushes import straight_pushes
 
 angle = st.floats(-np.pi, np.pi)
 half = st.floats(0.01, 0.1)

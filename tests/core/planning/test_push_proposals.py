@@ -3,12 +3,12 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from osfcore.dynamics.push_models import load_push_model, load_shapes
+from osfcore.dynamics.rollout import load_push_model, load_shapes
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
-from osfcore.planning.pose_cost import PoseGoal
-from osfcore.planning.push_proposals import PushProposals
+from osfcore.planning.costs import PoseGoal
+from osfcore.planning.pushes import PushProposals
 from tests.core.dynamics.scenes import BOX, CAN, GELATIN, boxes, scene
 
 FIELDS = FieldLibrary(None)

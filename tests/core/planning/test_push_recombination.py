@@ -8,9 +8,9 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
-from osfcore.planning.path_planning import actions_along
-from osfcore.planning.pose_cost import PoseCost, PoseGoal, object_costs
-from osfcore.planning.push_recombination import push_stages, recombined
+from osfcore.planning.costs import PoseCost, PoseGoal, object_costs
+from osfcore.planning.paths import actions_along
+from osfcore.planning.pushes import push_stages, recombined
 
 HANDLE = np.array([-0.03, 0.0])  # of an object: at its left
 HORIZON = 24

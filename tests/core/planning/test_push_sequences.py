@@ -3,15 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.dynamics.contact_geometry import part_outlines
-from osfcore.dynamics.push_models import load_push_model, load_shapes
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
+from osfcore.dynamics.rollout import load_push_model, load_shapes
+from osfcore.dynamics.shapes import ShapeTable, part_outlines
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.geometry.workspace import PUSHER_REACH_M
-from osfcore.planning.path_planning import FreeSpace, actions_along
-from osfcore.planning.push_outcomes import push_outcomes
-from osfcore.planning.push_sequences import ObjectPushes, around_loop
+from osfcore.planning.paths import FreeSpace, actions_along
+from osfcore.planning.pushes import ObjectPushes, around_loop, push_outcomes
 from tests.core.dynamics.scenes import BOX, CAN, scene
 
 FIELDS = FieldLibrary(None)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, KiloOSF, network_size
-from osfcore.fields.table_field import TableField
+from osfcore.fields.table import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.render.solids import solid_field
+from osfcore.render.reference import solid_field
 
 HIDDEN = 8
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from osfcore.render.kernels import MOST_OBJECTS as ROOM
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import MOST_OBJECTS, OUTPUTS, PLANNING, SceneBatch
 from tests.core.render.scenes import random_scene, view, wooden_table
 
@@ -48,8 +48,8 @@ _CROWD = """
 import threading
 import numba
 import numpy as np
-from osfcore.fields.ray_marching import march
-from osfcore.render.scene_renderer import SceneBatch, SceneRenderer
+from osfcore.fields.rays import march
+from osfcore.render.renderer import SceneBatch, SceneRenderer
 from tests.core.render.scenes import ball, plain_table, state, view
 
 renderer, batch = SceneRenderer({"ball": ball()}, plain_table()), SceneBatch.of(state({"ball": (0, 0, 0.05)}))

@@ -4,12 +4,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.kernels import render_batch
-from osfcore.render.launch import screen_boxes
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer, screen_boxes
 from osfcore.render.types import EXACT, OUTPUTS, PLANNING, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, state, view
 

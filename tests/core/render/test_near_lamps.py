@@ -7,12 +7,12 @@ import pytest
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import SpotLamp
 from osfcore.geometry.poses import quaternion_exp
-from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.paper.rendering.renderer import PaperRenderer
+from osfcore.paper.rendering import PaperRenderer
 from osfcore.render.reference import render_on_device, render_reference
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, OUTPUTS, PLANNING, Quality, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, random_scene, state, view, wooden_table
 

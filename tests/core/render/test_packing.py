@@ -5,7 +5,7 @@ import pytest
 
 from osfcore.errors import InvalidInput
 from osfcore.fields.kiloosf import MOST_HIDDEN, network_size
-from osfcore.render.packing import pack
+from osfcore.render.renderer import pack
 from tests.core.render.scenes import HIDDEN, ball, block, random_field
 
 

@@ -11,7 +11,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import quaternion_multiply, rotate
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_CENTRE_Z_M, PUSHER_CLEARANCE_M, PUSHER_HEIGHT_M
 from osfcore.render.reference import render_on_device, render_reference
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, OUTPUTS, Quality, SceneBatch
 from tests.core.render.scenes import (
     UPRIGHT,

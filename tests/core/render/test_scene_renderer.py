@@ -9,7 +9,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import quaternion_exp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.reference import render_reference
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, MASK_OPACITY, MOST_OBJECTS, OUTPUTS, PLANNING, Quality, SceneBatch
 from tests.core.render.scenes import UPRIGHT, ball, block, fog, plain_table, random_scene, state, view, wooden_table
 

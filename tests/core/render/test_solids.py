@@ -3,8 +3,8 @@ import pytest
 
 from osfcore.fields.kiloosf import FLOOR_G
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.render.solids import pusher_field, solid_field
+from osfcore.render.reference import pusher_field, solid_field
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import OUTPUTS, SceneBatch
 from tests.core.render.scenes import corners_of, state, view
 

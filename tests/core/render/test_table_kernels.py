@@ -4,7 +4,7 @@ import numpy as np
 
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, Quality, SceneBatch
 from tests.core.render.scenes import plain_table
 

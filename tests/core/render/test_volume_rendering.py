@@ -5,14 +5,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.render import volume_rendering
-from osfcore.render.volume_rendering import accumulate_along_rays, final_transmittance, render_weights, transmittance
+from osfcore.render import reference
+from osfcore.render.reference import accumulate_along_rays, final_transmittance, render_weights, transmittance
 
 TAUS = st.lists(st.floats(0, 20), min_size=1, max_size=30).map(lambda taus: torch.tensor([taus], dtype=torch.float64))
 
 
 def test_the_worked_example_is_right():
-    failed, tried = doctest.testmod(volume_rendering, extraglobs={"torch": torch})
+    failed, tried = doctest.testmod(reference, extraglobs={"torch": torch})
     assert (failed, tried) == (0, 8)
 
 

@@ -17,7 +17,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S
 from osfcore.progress import Progress
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.core.control.scenes import perfect_fit, sure
 from tests.live import free_port

@@ -6,7 +6,7 @@ import threading
 import cv2
 import numpy as np
 
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.image_file import to_uint8

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_png, to_uint8
-from osfcore.robots.camera_pictures import SentCamera, observation_of
+from osfcore.robots.http_robot import SentCamera, observation_of
 
 LOOK = Camera.look_at("side", (0.6, 0.1, 0.5), (0, 0, 0), size=64)
 

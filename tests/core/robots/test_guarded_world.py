@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from osfcore.errors import InvalidInput
 from osfcore.geometry.workspace import STEP_S
 from osfcore.robots.guarded_world import GuardedWorld
-from osfcore.robots.robot import ConnectionLost, RobotStopped
-from osfcore.robots.safety_limits import SafetyLimits
+from osfcore.robots.robot import ConnectionLost, RobotStopped, SafetyLimits
 from tests.core.robots.robots import Marble
 
 BOX = (-0.1, -0.05, 0.12, 0.2)

@@ -14,8 +14,7 @@ from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.robots.connect import connect
 from osfcore.robots.guarded_world import GuardedWorld
 from osfcore.robots.http_robot import HttpRobot
-from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped
-from osfcore.robots.safety_limits import SafetyLimits
+from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
 from tests.core.robots.robots import NAMES, example, serving, until
 from tests.live import free_port
 

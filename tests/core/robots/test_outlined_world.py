@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.robots.outlined_world import OutlinedWorld
+from osfcore.robots.guarded_world import OutlinedWorld
 from tests.core.robots.robots import NAMES, simulated
 
 

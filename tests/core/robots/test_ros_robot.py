@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
-from osfcore.estimation.photometry.camera_response import linear_of_srgb
+from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.robots.connect import connect
 from osfcore.robots.guarded_world import GuardedWorld
-from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped
+from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
 from osfcore.robots.ros_robot import RosNames, RosRobot
-from osfcore.robots.safety_limits import SafetyLimits
 from tests.core.robots.robots import until
 from tests.core.robots.ros_stand_in import CAMERAS, StandIn
 from tests.live import free_port

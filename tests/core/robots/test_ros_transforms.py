@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.robots.ros_transforms import TransformTree
+from osfcore.robots.ros_robot import TransformTree
 from tests.core.robots.ros_stand_in import transform
 
 

@@ -5,12 +5,10 @@ import pytest
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.light import Light
-from osfcore.geometry.spot_lamp import SpotLamp
+from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.world.conditions import Conditions
-from osfcore.world.imaging.optics import Lamp, TableSurface
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.imaging import Lamp, TableSurface
+from osfcore.world.scenes import Conditions, SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 FLAT = 1  # the seed of a scene in which the box lies flat

@@ -7,10 +7,10 @@ import pytest
 from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects, UnknownName
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.world import goal_layouts
-from osfcore.world.goal_layouts import arranged_goal, random_goal
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world import tasks
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tasks import arranged_goal, random_goal
 
 CAN, BOX, BOTTLE = NAMES = ("005_tomato_soup_can", "009_gelatin_box", "006_mustard_bottle")
 
@@ -106,7 +106,7 @@ def test_every_try_begins_where_things_are_now_and_there_is_an_end_to_them(table
         begun.append((count, away(before, world.truth())))
         world.move_object(BOX, aside(world.truth(), BOX, z_m=0.3))
 
-    monkeypatch.setattr(goal_layouts, "draw_goal", none)
+    monkeypatch.setattr(tasks, "draw_goal", none)
     with pytest.raises(NoRoom, match=BOX):
         random_goal(table, 0, 2)
     assert len(begun) > 5

@@ -4,7 +4,7 @@ import pytest
 from osfcore.errors import OverlappingObjects
 from osfcore.geometry.poses import Pose
 from osfcore.world.physics import Physics, body_model
-from osfcore.world.placing import move_apart, refuse_overlaps
+from osfcore.world.scenes import move_apart, refuse_overlaps
 from tests.core.world.boxes import box_asset
 
 SIDE = 0.1

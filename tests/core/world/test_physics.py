@@ -4,7 +4,7 @@ import pytest
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, PUSHER_REACH_M
 from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, Physics, body_model, lowest_point, mass_properties
-from osfcore.world.placing import settle
+from osfcore.world.scenes import settle
 from tests.core.world.boxes import box_asset
 
 BOX = box_asset("box", (0.08, 0.06, 0.04), mass_kg=0.3)

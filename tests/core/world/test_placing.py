@@ -5,7 +5,7 @@ from osfcore.errors import NoRoom
 from osfcore.geometry.poses import Pose, quaternion_to_matrix, rotate
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.world.physics import Physics, body_model
-from osfcore.world.placing import is_calm, place_randomly, random_rest, settle
+from osfcore.world.scenes import is_calm, place_randomly, random_rest, settle
 from tests.core.world.boxes import box_asset
 
 

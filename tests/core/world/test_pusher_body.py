@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
-from osfcore.world.pusher_body import pusher_mesh
+from osfcore.world.imaging import pusher_mesh
 
 
 def test_pusher_is_a_closed_cylinder_of_the_stated_size():

@@ -3,14 +3,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
-import osfcore.world.rearrangement_tasks as module
+import osfcore.world.tasks as module
 from osfcore.errors import InvalidInput, MissingAssets, NoRoom
 from osfcore.geometry.poses import rotate, rotation_angle
 from osfcore.geometry.workspace import PUSHER_REACH_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.placing import GAP_M
-from osfcore.world.rearrangement_tasks import FAMILIES, MIN_SHIFT_M, TURN_DEG, TaskSet, draw_task
+from osfcore.world.scenes import GAP_M
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tasks import FAMILIES, MIN_SHIFT_M, TURN_DEG, TaskSet, draw_task
 
 NAMES = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box")
 NUMBERS = range(6)

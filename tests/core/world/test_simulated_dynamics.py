@@ -4,7 +4,7 @@ import pytest
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import rotation_angle
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.simulated_dynamics import SimulatedPushes
 from osfcore.world.tabletop import Tabletop
 

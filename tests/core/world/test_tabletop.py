@@ -3,14 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.world_protocol import World
+from osfcore.control.world import World
 from osfcore.errors import InvalidInput, MissingAssets, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 ACTIONS = np.column_stack([np.random.default_rng(0).uniform(-0.3, 0.3, (15, 2)), np.zeros(15)])

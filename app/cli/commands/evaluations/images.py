@@ -26,7 +26,7 @@ class EvaluateRelightingCommand(ParallelEvaluation):
     """Of the lights above the table [deg]."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
-        from osfcore.experiments.fields.relighting import CompareRelighting, compare_relighting
+        from osfcore.experiments.relighting import CompareRelighting, compare_relighting
 
         config = CompareRelighting(
             self.folder, self.data_dir, self.names, self.tasks, self.seed, self.methods, self.objects, self.elevations
@@ -53,7 +53,7 @@ class EvaluateVideoCommand(ParallelEvaluation):
     """Actions of 0.2 s that are predicted."""
 
     def _steps(self, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None) -> Iterator[Any]:
-        from osfcore.experiments.dynamics.video_prediction import CompareVideos, compare_videos
+        from osfcore.experiments.video_prediction import CompareVideos, compare_videos
 
         config = CompareVideos(
             self.folder, self.data_dir, self.names, self.tasks, self.seed, self.methods, self.objects, self.steps

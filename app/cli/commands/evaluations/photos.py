@@ -46,7 +46,7 @@ class EvaluatePhotosCommand:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what report.json does."""
-        from osfcore.experiments.photos.evaluation import EvaluatePhotos, evaluate_photos
+        from osfcore.experiments.photos import EvaluatePhotos, evaluate_photos
         from osfcore.fields.field_library import FieldLibrary
 
         if self.lamps == "simulated":
@@ -67,7 +67,7 @@ class EvaluatePhotosCommand:
 
     def _simulated_lamps(self) -> dict[str, Any]:
         """Measure lamps in simulated scenes."""
-        from osfcore.experiments.photos.lamp_evaluation import EvaluateLamps, evaluate_lamps
+        from osfcore.experiments.lamps import EvaluateLamps, evaluate_lamps
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
 

@@ -56,8 +56,7 @@ class ReproduceCommand:
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds all figures of the report."""
         from osfcore.experiments.charts import check_matplotlib
-        from osfcore.experiments.reproduction.page import About
-        from osfcore.experiments.reproduction.reproduction import PAGE_FILE, PARTS, Reproduce, reproduce
+        from osfcore.experiments.reproduction.reproduction import PAGE_FILE, PARTS, About, Reproduce, reproduce
         from osfcore.experiments.reproduction.sections import QUICK, Scale
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary

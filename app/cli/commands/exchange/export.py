@@ -42,7 +42,7 @@ class ExportScene:
 
         suffix = _check_out(self.out, ".glb", ".usdz")
         if suffix == ".glb":
-            from osfcore.export.scene_glb import scene_glb as export
+            from osfcore.export.meshes import scene_glb as export
         else:
             from osfcore.export.usd.export import scene_usdz as export
         scene = read_scene(self.scene)
@@ -78,7 +78,7 @@ class ExportField:
         """Export; the result tells what the colours are."""
         suffix = _check_out(self.out, ".glb", ".usdz", ".usdc")
         if suffix == ".glb":
-            from osfcore.export.field_mesh import field_glb as export
+            from osfcore.export.meshes import field_glb as export
         else:
             from osfcore.export.usd.export import field_usd
 
@@ -139,7 +139,7 @@ def _light(direction: tuple[float, float, float]) -> Light:
 
 def _field(name: str, data_dir: Path) -> KiloOSF:
     from osfcore.fields.field_library import FieldLibrary
-    from osfcore.fields.field_weights import read_field
+    from osfcore.fields.kiloosf import read_field
 
     return read_field(Path(name)) if name.endswith(".safetensors") else FieldLibrary(data_dir).load(name)
 

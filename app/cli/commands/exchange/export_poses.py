@@ -33,8 +33,8 @@ class ExportPoses:
         from osfcore.io.files import write_atomically
         from osfcore.io.observation_file import read_observation
         from osfcore.io.output_paths import check_place
-        from osfcore.io.state_file import read_estimated
-        from osfcore.photo.other_programs.bop_results import bop_results
+        from osfcore.io.scene_file import read_estimated
+        from osfcore.photo.bop import bop_results
 
         if self.out.suffix.lower() != ".csv":
             raise InvalidInput("output file", self.out, "a path that ends in .csv")

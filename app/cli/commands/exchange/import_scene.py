@@ -44,8 +44,7 @@ class Import:
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import folder_at_once, write_json
         from osfcore.io.observation_file import write_observation
-        from osfcore.photo.other_programs.bop_images import BopChoice
-        from osfcore.photo.other_programs.bop_scene import read_bop_scene
+        from osfcore.photo.bop import BopChoice, read_bop_scene
 
         out = self.out.absolute()
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -71,8 +70,8 @@ class Import:
         return {"out": str(self.out), "images": [int(i) for i in images], "objects": names, "left_out": left_out}
 
     def _prior(self, name: str) -> Any:  # noqa: ANN401  TablePrior, which the start of the command line must not load
-        from osfcore.estimation.objective.resting_orientations import resting_orientations
+        from osfcore.estimation.objective import resting_orientations
         from osfcore.fields.field_library import FieldLibrary
-        from osfcore.photo.poses.table_prior import TablePrior
+        from osfcore.photo.pose_loss import TablePrior
 
         return TablePrior(resting_orientations(FieldLibrary(self.data_dir).load(name)))

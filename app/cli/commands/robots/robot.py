@@ -16,9 +16,8 @@ from osfcore.errors import InvalidInput
 if TYPE_CHECKING:
     from app.episodes.robots.robot_drive import RobotDrive
     from osfcore.geometry.states import Observation
-    from osfcore.robots.outlined_world import CameraBoxes
-    from osfcore.robots.robot import Robot, RobotDescription
-    from osfcore.robots.safety_limits import SafetyLimits
+    from osfcore.robots.guarded_world import CameraBoxes
+    from osfcore.robots.robot import Robot, RobotDescription, SafetyLimits
 
 _LOOKS = 3
 _FORM = "CAMERA:NAME:LEFT,TOP,RIGHT,BOTTOM, such as left:025_mug:120,80,260,210"
@@ -130,7 +129,7 @@ class RobotDriveCommand:
     def _order(self) -> Any:  # noqa: ANN401  a DriveOrder, whose module is heavy
         from app.episodes.file_names import REPORT_FILE
         from app.episodes.robots.robot_drive import DriveOrder
-        from osfcore.control.episode_settings import EpisodeSettings
+        from osfcore.control.events import EpisodeSettings
         from osfcore.errors import check_seed
         from osfcore.fields.devices import pick_device
         from osfcore.io.output_paths import check_place
@@ -145,7 +144,7 @@ class RobotDriveCommand:
         )  # fmt: skip
 
     def _limits(self) -> SafetyLimits:
-        from osfcore.robots.safety_limits import SafetyLimits
+        from osfcore.robots.robot import SafetyLimits
 
         return SafetyLimits(top_speed_m_s=self.top_speed, **({} if self.box is None else {"box": self.box}))
 
@@ -194,8 +193,8 @@ def _asked(drive: RobotDrive, url: str) -> bool:
 def _write_pictures(folder: Path, seen: Observation) -> None:
     """All cameras with the table's axes, and what each sees as cameras encode it."""
     from osfcore.errors import shown
-    from osfcore.estimation.photometry.camera_response import srgb_of_linear
-    from osfcore.inspection.observation_overlay import observation_sheet
+    from osfcore.estimation.camera_response import srgb_of_linear
+    from osfcore.inspection.overlays import observation_sheet
     from osfcore.io.image_file import to_uint8, write_png
 
     write_png(folder / "overlay.png", observation_sheet(seen)[..., ::-1])

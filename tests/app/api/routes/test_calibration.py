@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from osfcore.experiments.photos.board_views import board_photograph
+from osfcore.experiments.board_views import board_photograph
 from osfcore.geometry.cameras import Camera
 from tests.app.api.routes.test_table_photos import ANY, gray, refuses
 from tests.core.photo.seen_boards import SIZE, K, tilted

@@ -13,7 +13,7 @@ from app.cli.commands.collect import CollectObservationCommand
 from osfcore.geometry.cameras import default_cameras
 from osfcore.io.files import write_json
 from osfcore.io.observation_file import read_observation, write_observation
-from osfcore.io.state_file import estimated_from_json, read_estimated
+from osfcore.io.scene_file import estimated_from_json, read_estimated
 from osfcore.objects.asset_library import AssetLibrary
 from tests.app.api.routes.test_jobs import finished
 from tests.app.api.test_problems import is_problem

@@ -3,7 +3,7 @@ from importlib.metadata import version
 import pytest
 
 from app.api.schemas.episodes import SettingsIn
-from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import full_disk, until

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.cameras import goal_camera
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import until

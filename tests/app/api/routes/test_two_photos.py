@@ -10,9 +10,9 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import Board
-from osfcore.world.conditions import Conditions
-from osfcore.world.imaging.optics import TableSurface
+from osfcore.world.imaging import TableSurface
 from osfcore.world.physics import lowest_point
+from osfcore.world.scenes import Conditions
 from osfcore.world.tabletop import Tabletop
 from tests.app.api.routes.test_table_photos import ANY, WAIT_S, box_around, jpeg_of, mark
 from tests.app.conftest import until

@@ -8,7 +8,7 @@ from app.api.schemas.episodes import EpisodeIn, EpisodeOut, ServiceSettings, Set
 from app.jobs.job import Job
 from app.jobs.kinds.episodes import settings_of
 from app.services.episodes import nested
-from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import EpisodeSettings
 from osfcore.paper.mppi import GaussianPlanSettings
 
 PARAMS = {"scene": "s", "names": ["box"], "seed": 3, "settings": nested({"steps": 5}), "goal": {"id": "g"}}

@@ -8,7 +8,7 @@ import pytest
 from app.api.app_factory import create_app
 from app.api.schemas.limits import IMAGES, SEED
 from app.storage.paths import static_folder
-from osfcore.world.collection.collect_images import MAX_IMAGES, MIN_IMAGES
+from osfcore.world.collect_images import MAX_IMAGES, MIN_IMAGES
 from tests.app.api.routes.test_jobs import finished
 from tests.app.api.test_problems import is_problem
 

@@ -5,9 +5,8 @@ from pydantic import ValidationError
 from app.api.schemas.predictions import PredictionIn, StateIn
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.estimated_state import EstimatedState
-from osfcore.io.scene_file import Scene, scene_to_json
-from osfcore.io.state_file import estimated_to_json
+from osfcore.geometry.states import EstimatedState
+from osfcore.io.scene_file import Scene, estimated_to_json, scene_to_json
 from tests.app.storage.test_database import record
 
 STATE = record().state

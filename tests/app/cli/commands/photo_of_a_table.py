@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
-from osfcore.experiments.photos.board_views import board_photograph
+from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.experiments.board_views import board_photograph
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.board import Board
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 
 SIZE = (640, 480)

@@ -4,12 +4,12 @@ from functools import partial
 
 import pytest
 
-import osfcore.experiments.benchmarks.estimation as bench_estimate
-import osfcore.experiments.benchmarks.rendering as bench
+import osfcore.experiments.bench_estimation as bench_estimate
+import osfcore.experiments.bench_rendering as bench
 from app.cli.main import main
-from osfcore.experiments.benchmarks import rollouts as bench_dynamics
-from osfcore.experiments.benchmarks.estimation import BenchEstimate
-from osfcore.experiments.benchmarks.rendering import BenchRender
+from osfcore.experiments import bench_rollouts as bench_dynamics
+from osfcore.experiments.bench_estimation import BenchEstimate
+from osfcore.experiments.bench_rendering import BenchRender
 from tests.core.experiments.oracle import Oracle
 from tests.core.experiments.solids import write_fields
 

@@ -7,7 +7,7 @@ import pytest
 
 from app.cli.commands.check import Check
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.world.collection.collect_images import CollectTable, collect_table
+from osfcore.world.collect_images import CollectTable, collect_table
 from tests.core.fields.sets import turn_cameras, write_set
 
 

@@ -11,11 +11,10 @@ from app.cli.commands.estimate import Estimate
 from app.cli.main import main
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import rotation_angle
+from osfcore.geometry.states import EstimatedState
 from osfcore.io.observation_file import OBSERVATION_FILE, read_observation, write_observation
-from osfcore.io.scene_file import read_scene
-from osfcore.io.state_file import read_estimated
+from osfcore.io.scene_file import read_estimated, read_scene
 from osfcore.progress import Progress
 
 MUSTARD = "006_mustard_bottle"

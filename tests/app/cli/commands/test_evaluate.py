@@ -5,19 +5,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import osfcore.experiments.estimation.parts
-import osfcore.experiments.fields.evaluation
+import osfcore.experiments.estimation
+import osfcore.experiments.fields
 from app.cli.commands.evaluate import EvaluateFieldsCommand
 from app.cli.main import main
 from osfcore.control.events import Finished
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.benchmarks import rollouts as bench_dynamics
-from osfcore.experiments.dynamics import evaluation as dynamics
-from osfcore.experiments.estimation.parts import EvaluateEstimate
-from osfcore.experiments.fields.evaluation import EvaluateFields
-from osfcore.experiments.rearrangement import measured_episodes as mpc
-from osfcore.experiments.rearrangement.runs import Ended
-from osfcore.world.collection.collect_images import CollectObject, collect_object
+from osfcore.experiments import bench_rollouts as bench_dynamics
+from osfcore.experiments import dynamics
+from osfcore.experiments import rearrangement as mpc
+from osfcore.experiments.estimation import EvaluateEstimate
+from osfcore.experiments.fields import EvaluateFields
+from osfcore.experiments.rearrangement_runs import Ended
+from osfcore.world.collect_images import CollectObject, collect_object
 from tests.core.experiments.oracle import Oracle
 from tests.core.experiments.solids import SOLIDS, write_fields
 
@@ -26,7 +26,7 @@ from tests.core.experiments.solids import SOLIDS, write_fields
 def fields_dir(data_dir, library, monkeypatch):
     """Solids for fields, and small images."""
     write_fields(data_dir, library)
-    monkeypatch.setattr(osfcore.experiments.fields.evaluation, "EvaluateFields", partial(EvaluateFields, size=32))
+    monkeypatch.setattr(osfcore.experiments.fields, "EvaluateFields", partial(EvaluateFields, size=32))
     return data_dir
 
 
@@ -67,7 +67,7 @@ def test_any_set_and_weights(fields_dir, library, tmp_path):
 def oracle(fields_dir, monkeypatch):
     """Estimators that know the truth, and little to do for them."""
     small = partial(EvaluateEstimate, size=32, steps=2)
-    monkeypatch.setattr(osfcore.experiments.estimation.parts, "EvaluateEstimate", small)
+    monkeypatch.setattr(osfcore.experiments.estimation, "EvaluateEstimate", small)
     oracle = Oracle()
     oracle.install(monkeypatch)
     return oracle

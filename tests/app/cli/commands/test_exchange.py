@@ -11,11 +11,11 @@ import trimesh
 from pxr import Usd, UsdGeom
 
 from app.cli.main import main
-from osfcore.fields.field_weights import write_field
+from osfcore.fields.kiloosf import write_field
 from osfcore.geometry.cameras import default_cameras
 from osfcore.io.observation_file import read_observation
 from osfcore.io.scene_file import Scene, scene_to_json
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.core.export.test_splats import HALF, ellipsoid_field
 from tests.core.photo.other_programs.bop_scenes import write_bop_scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from osfcore.experiments.photos.board_views import board_photograph
+from osfcore.experiments.board_views import board_photograph
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import write_png

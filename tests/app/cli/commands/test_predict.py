@@ -14,7 +14,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import Scene, scene_to_json
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
@@ -192,7 +192,7 @@ def test_the_scenes_own_cameras_can_look(files, state, data_dir, capsys):
 
 @pytest.mark.slow
 def test_every_shipped_field_has_a_shape():
-    code = "from osfcore.dynamics.push_models import load_push_model; "
+    code = "from osfcore.dynamics.rollout import load_push_model; "
     code += "from osfcore.fields.field_library import FieldLibrary; "
     code += "f = FieldLibrary(None); print(len(load_push_model(None, f, f.names()).names))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

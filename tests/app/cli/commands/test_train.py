@@ -8,11 +8,11 @@ import pytest
 
 from app.cli.commands.train import TrainFieldCommand
 from app.cli.main import main
-from osfcore.dynamics.network_weights import read_network
+from osfcore.dynamics.graph import read_network
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.fields.field_weights import read_field
-from osfcore.paper.dynamics.weights import read_network as read_paper_network
-from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from osfcore.fields.kiloosf import read_field
+from osfcore.paper.dynamics import read_network as read_paper_network
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 from tests.core.experiments.rivals.fitvid.videos import write_videos
 from tests.core.fields.sets import write_set
 from tests.core.paper.dynamics.scenes import episode, write

@@ -13,11 +13,10 @@ from app.episodes.clip.scene_view import GOLD, SceneView
 from app.episodes.file_names import REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.trajectory import Round, Trajectory, write_trajectory
 from osfcore.errors import CannotWrite
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import SceneState
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.world.imaging import TracedMesh
 
 BOX = "009_gelatin_box"
 UPRIGHT = np.array([[1.0, 0, 0, 0]])

@@ -21,9 +21,8 @@ from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
 from app.jobs.worker import KINDS, run_job
 from app.processes.messages.job_messages import RunJob
 from app.processes.plan_summary import PlanSketch
-from osfcore.control import adapted_models, estimators
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
+from osfcore.control import estimators
+from osfcore.control.events import ActionExecuted, EpisodeSettings, Looking, Observed, Planning, Stepped
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
@@ -189,7 +188,7 @@ def test_a_goal_image_is_read_from_the_inputs_as_its_own_camera_saw_it(place, st
         state = stage.world.truth()
         yield core.EstimateStep(Progress(1, 1, "Done"), "done", state, estimate=sure(state))
 
-    monkeypatch.setattr(adapted_models, "estimate_goal", explained)
+    monkeypatch.setattr(core, "estimate_goal", explained)
     monkeypatch.setattr(core, "prefer_current_poses", lambda _models, _goal, found, _now: found)
     goal = {"id": "g", "camera": camera_to_json(camera), "poses": None, "truth": entries(stage.world.truth())}
     told = list(episode_job(params(stage, **goal), place))

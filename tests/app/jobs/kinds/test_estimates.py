@@ -10,12 +10,11 @@ from app.jobs.kinds.estimates import STATE, STEPS, estimate_job, load_models, re
 from osfcore.errors import CannotWrite, CorruptFile, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.io.observation_file import write_observation
-from osfcore.io.state_file import read_estimated, write_estimated
+from osfcore.io.scene_file import read_estimated, write_estimated
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import osfcore.fields.training.kiloosf_training as training
-import osfcore.paper.fields.training as paper_training
+import osfcore.fields.train_kiloosf as training
+import osfcore.paper.train_fields as paper_training
 from app.jobs.context import JobContext
 from app.jobs.kinds.fields import COMPARISON, PREVIEW, train_field_job
 from app.storage.field_files import workshop
 from osfcore.errors import MissingAssets
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.fields.field_weights import field_bytes
+from osfcore.fields.kiloosf import field_bytes
 from osfcore.paper.method import own_field_path, paper_field_path
 from osfcore.progress import Progress
 from tests.app.processes.fields import write_box

@@ -9,7 +9,7 @@ from app.processes.messages.scene_messages import Act, ObserveScene, SceneRecord
 from osfcore.errors import InvalidInput, NotThere, OsfError
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.io.observation_file import write_observation
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")

@@ -13,9 +13,9 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState, shifted_poses
 from osfcore.objects.catalogue import DEFAULT_NAMES
-from osfcore.world.goal_layouts import arranged_goal
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tasks import arranged_goal
 from tests.app.storage.test_database import record
 
 STAYS_M, STAYS_RAD = 0.003, 0.05  # putting everything back to rest may shift it this much

@@ -13,7 +13,7 @@ from app.services.goals.goals import NoTable
 from app.storage.goal_store import GoalRecord, GoalStore, PhotoRecord
 from app.storage.photo_crop import PhotoCrop
 from osfcore.errors import UnknownName
-from osfcore.estimation.content_verdict import ContentCheck
+from osfcore.estimation.steps import ContentCheck
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose

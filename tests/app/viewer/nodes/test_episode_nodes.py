@@ -7,12 +7,11 @@ from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.nodes.light_marker import AT
 from osfcore.control.events import Look, Looking
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.planning.costs import PoseGoal
 from osfcore.progress import Progress
 
 BOX, CAN = "003_cracker_box", "005_tomato_soup_can"

@@ -7,10 +7,9 @@ from app.viewer.nodes.light_marker import AT
 from app.viewer.nodes.room import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.progress import Progress
 
 BOX, UNKNOWN = "003_cracker_box", "055_baseball"  # the second has no mesh here

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from app.viewer.nodes.shadow_nodes import clipped, shadow_colour, shadow_mesh
 from osfcore.geometry.light import AMBIENT, Light
 from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.world.imaging.optics import TABLE_ALBEDO
+from osfcore.world.imaging import TABLE_ALBEDO
 
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (0, 2)], float) * 0.05
 HALF_M = TABLE_SIDE_M / 2

@@ -16,7 +16,7 @@ from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.episode_panel import DRAW_INTERVAL_S, EpisodePanel
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Stepped
 from osfcore.geometry.cameras import goal_camera
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 from tests.app.conftest import until
 from tests.app.storage.test_database import record
 from tests.app.viewer.conftest import ViewerDriver

@@ -9,10 +9,9 @@ from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.scene_nodes import SceneNodes
 from app.viewer.panels.estimate_panel import EstimatePanel
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.progress import Progress
 from tests.app.conftest import until
 from tests.app.storage.test_database import record

@@ -5,7 +5,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 from scipy.spatial import ConvexHull
 
-from osfcore.dynamics.shapes.field_parts import field_mesh, field_parts, read_parts, write_parts
+from osfcore.dynamics.shapes import field_mesh, field_parts, read_parts, write_parts
 from osfcore.errors import CannotWrite, InvalidInput
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import EMPTY_G

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.shapes.object_shapes import (
-    MAP_SIDE,
-    ShapeTable,
-    object_shape,
-    octahedral_directions,
-    octahedral_index,
-)
+from osfcore.dynamics.shapes import MAP_SIDE, ShapeTable, object_shape, octahedral_directions, octahedral_index
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import quaternion_exp, quaternion_to_matrix, rotate
 from tests.core.dynamics.scenes import BOX, NAMES, hull

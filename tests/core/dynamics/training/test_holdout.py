@@ -3,7 +3,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.dynamics.training.holdout import has_held_out_pair, is_for_validation, is_held_out_pair
+from osfcore.dynamics.train import has_held_out_pair, is_for_validation, is_held_out_pair
 from osfcore.fields.field_library import FieldLibrary
 
 NAMES = FieldLibrary(None).names()

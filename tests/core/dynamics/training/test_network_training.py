@@ -6,13 +6,9 @@ import pytest
 import torch
 from safetensors.torch import load
 
-from osfcore.dynamics.network_weights import read_network
-from osfcore.dynamics.substep import unroll
-from osfcore.dynamics.training import network_training as training
-from osfcore.dynamics.training.holdout import is_held_out_pair
-from osfcore.dynamics.training.network_training import TrainDynamics, train_dynamics
-from osfcore.dynamics.training.validation import distance, validate
-from osfcore.dynamics.training.windows import batch, record
+from osfcore.dynamics import train as training
+from osfcore.dynamics.graph import read_network, unroll
+from osfcore.dynamics.train import TrainDynamics, batch, distance, is_held_out_pair, record, train_dynamics, validate
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from osfcore.io.push_file import EpisodeFolder, save_episode
 from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, episode, network, scene

@@ -3,8 +3,8 @@ import copy
 import pytest
 import torch
 
-from osfcore.dynamics.features import EDGE_FEATURES, NODE_FEATURES
-from osfcore.dynamics.training.optimizers import Optimizers
+from osfcore.dynamics.graph import EDGE_FEATURES, NODE_FEATURES
+from osfcore.dynamics.train import Optimizers
 from tests.core.dynamics.scenes import network
 
 

@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.contact_graph import build_graph
-from osfcore.dynamics.motion import Sweep, headings, sleeping
-from osfcore.dynamics.propagation_network import MOTION
-from osfcore.dynamics.pusher_path import SUBSTEPS
-from osfcore.dynamics.recorded_states import substates
-from osfcore.dynamics.substep import advance
-from osfcore.dynamics.training.samples import disturbed_substeps, samples
-from osfcore.dynamics.training.windows import batch, record, turn_between
+from osfcore.dynamics.graph import MOTION, advance, build_graph
+from osfcore.dynamics.motion import SUBSTEPS, Sweep, headings, sleeping, substates
+from osfcore.dynamics.train import batch, disturbed_substeps, record, samples, turn_between
 from osfcore.geometry.poses import quaternion_conjugate, quaternion_log, quaternion_multiply
 from osfcore.io.push_file import Disturbed
 from tests.core.dynamics.scenes import CAN, GELATIN, episode, network, scene

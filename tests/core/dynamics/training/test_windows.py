@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.dynamics.push_models import load_shapes
-from osfcore.dynamics.pusher_path import SUBSTEPS
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.dynamics.substep import unroll
-from osfcore.dynamics.training.windows import batch, record
+from osfcore.dynamics.graph import unroll
+from osfcore.dynamics.motion import SUBSTEPS
+from osfcore.dynamics.rollout import load_shapes
+from osfcore.dynamics.shapes import ShapeTable
+from osfcore.dynamics.train import batch, record
 from osfcore.errors import InvalidInput
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotate
 from osfcore.io.push_file import read_pushes
-from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 from tests.core.dynamics.scenes import BOX, CAN, GELATIN, crowd, episode, network, picked, scene
 
 PUSH = [[0.3, 0.0, 0], [0.2, 0.05, 0], [0.1, -0.1, 0], [-0.3, 0, 0], [-0.3, 0, 0], [0, 0, 0]]

@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.motion_hypotheses import (
-    joint_push_hypotheses,
-    push_hypotheses,
-    resting_hypotheses,
-    rolling_hypotheses,
-)
+from osfcore.estimation.tracking import joint_push_hypotheses, push_hypotheses, resting_hypotheses, rolling_hypotheses
 from osfcore.geometry.poses import rotate, rotation_angle
 from tests.core.estimation.scenes import lying, params_of, scene
 

@@ -3,15 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.orientation_hypotheses import (
-    compare_orientations,
-    side_hypotheses,
-    with_pose,
-    yaw_hypotheses,
-)
-from osfcore.estimation.objective.observed_views import QUALITY
-from osfcore.estimation.objective.parametrization import SceneParameters
-from osfcore.estimation.search.gauss_newton import GaussNewtonState
+from osfcore.estimation.hypotheses import compare_orientations, side_hypotheses, with_pose, yaw_hypotheses
+from osfcore.estimation.objective import QUALITY, SceneParameters
+from osfcore.estimation.search import GaussNewtonState
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import rotate, rotation_angle
 from tests.core.estimation.scenes import apart, own_views, params_of

@@ -3,10 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.orientation_hypotheses import with_pose
-from osfcore.estimation.hypotheses.scene_assembly import OUT_OF_VIEW, assemble_scene, count_of_scenes, reassign_poses
-from osfcore.estimation.hypotheses.template_matching import TemplateMatches
-from osfcore.estimation.objective.observed_views import views_of
+from osfcore.estimation.hypotheses import (
+    OUT_OF_VIEW,
+    TemplateMatches,
+    assemble_scene,
+    count_of_scenes,
+    reassign_poses,
+    with_pose,
+)
+from osfcore.estimation.objective import views_of
 from osfcore.geometry.cameras import goal_camera
 from tests.core.estimation.scenes import apart, observe, params_of
 

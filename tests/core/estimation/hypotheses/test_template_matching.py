@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.hypotheses.scene_assembly import without_objects
-from osfcore.estimation.hypotheses.template_matching import TemplateMatches, match_templates, scene_errors, table_errors
-from osfcore.estimation.objective.observed_views import views_of
-from osfcore.estimation.photometry.table_check import lit_table_level
+from osfcore.estimation.hypotheses import TemplateMatches, match_templates, scene_errors, table_errors, without_objects
+from osfcore.estimation.objective import views_of
+from osfcore.estimation.search import lit_table_level
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.poses import rotate, rotation_angle
 from tests.core.estimation.scenes import BOTTLE, BOX, lying, observe, params_of, scene, shipped_models

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.masked_loss import COLOUR_WEIGHT, RenderedObject, masked_loss, render_poses
-from osfcore.estimation.objective.observed_views import QUALITY, ObjectView
+from osfcore.estimation.objective import COLOUR_WEIGHT, QUALITY, ObjectView, RenderedObject, masked_loss, render_poses
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOX
 from tests.core.render.scenes import UPRIGHT

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.estimation.objective.object_models import QUALITY, ObjectModels
+from osfcore.estimation.objective import QUALITY, ObjectModels
 from osfcore.geometry.poses import quaternion_exp
 from osfcore.objects.asset import Symmetry
 from osfcore.render.types import SceneBatch

@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.estimation.objective.observed_views import (
+from osfcore.estimation.objective import (
     QUALITY,
     ObservedViews,
     crop_camera,
     crop_to_masks,
     crop_to_object,
     crop_to_silhouette,
+    residuals,
     views_of,
 )
-from osfcore.estimation.objective.photometric_loss import residuals
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import Observation

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.estimation.objective.parametrization import LIGHT, POSE, SceneParameters
+from osfcore.estimation.objective import LIGHT, POSE, SceneParameters
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import orthogonal_basis, quaternion_exp, quaternion_multiply, rotation_angle
 from tests.core.estimation.scenes import angle

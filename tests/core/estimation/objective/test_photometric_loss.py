@@ -3,8 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import huber
 
-from osfcore.estimation.objective.observed_views import ObservedViews
-from osfcore.estimation.objective.photometric_loss import HUBER, loss_of, photometric_loss, residuals
+from osfcore.estimation.objective import HUBER, ObservedViews, loss_of, photometric_loss, residuals
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import own_views, params_of
 from tests.core.render.scenes import state, view

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.resting_orientations import fibonacci_sphere, resting_orientations, yaw_quaternions
+from osfcore.estimation.objective import fibonacci_sphere, resting_orientations, yaw_quaternions
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from tests.core.render.scenes import ball, block
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.observed_views import views_of
-from osfcore.estimation.photometry.calibration import Calibrator
-from osfcore.estimation.photometry.image_model import ImageModel
-from osfcore.estimation.photometry.scaled_fields import adapted
-from osfcore.estimation.photometry.table_check import check_table
+from osfcore.estimation.camera_response import ImageModel
+from osfcore.estimation.objective import views_of
+from osfcore.estimation.photometry import Calibrator, adapted
+from osfcore.estimation.search import check_table
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, lying, observe, params_of, scene
 

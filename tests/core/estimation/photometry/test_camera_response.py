@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.estimation.photometry.camera_response import linear_from_encoded, linear_of_srgb, srgb_of_linear
+from osfcore.estimation.camera_response import linear_from_encoded, linear_of_srgb, srgb_of_linear
 
 
 def test_srgb_has_its_well_known_values():

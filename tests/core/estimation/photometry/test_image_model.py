@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
-from osfcore.estimation.photometry.image_model import ImageModel
-from osfcore.estimation.photometry.scaled_fields import adapted
+from osfcore.estimation.camera_response import ImageModel, srgb_of_linear
+from osfcore.estimation.photometry import adapted
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.render.types import SceneBatch

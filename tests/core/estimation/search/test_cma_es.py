@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.estimation.search.cma_es import CMAES
+from osfcore.estimation.search import CMAES
 
 SCALES = np.array([0.5, 0.0, 2.0, 0.1])
 TARGET = np.array([0.4, 0.0, -1.0, 0.12])

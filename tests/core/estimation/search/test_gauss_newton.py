@@ -3,10 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.observed_views import QUALITY
-from osfcore.estimation.objective.parametrization import LIGHT, POSE
-from osfcore.estimation.objective.photometric_loss import photometric_loss, residuals
-from osfcore.estimation.search.gauss_newton import PLANAR_PARAMETERS, GaussNewtonState, difference_steps, gauss_newton
+from osfcore.estimation.objective import LIGHT, POSE, QUALITY, photometric_loss, residuals
+from osfcore.estimation.search import PLANAR_PARAMETERS, GaussNewtonState, difference_steps, gauss_newton
 from osfcore.geometry.cameras import default_cameras
 from tests.core.estimation.scenes import apart, own_views, params_of
 

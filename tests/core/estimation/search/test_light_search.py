@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.observed_views import views_of
-from osfcore.estimation.search.light_search import light_loss_ratio, search_light
+from osfcore.estimation.objective import views_of
+from osfcore.estimation.search import light_loss_ratio, search_light
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from tests.core.estimation.scenes import BOTTLE, BOX, angle, lying, observe, params_of, scene

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.masked_loss import masked_loss, render_poses
-from osfcore.estimation.objective.observed_views import crop_to_masks, views_of
-from osfcore.estimation.search.multistart_cma import MultistartCMA
-from osfcore.estimation.search.pose_initialization import RankedPoses
+from osfcore.estimation.objective import crop_to_masks, masked_loss, render_poses, views_of
+from osfcore.estimation.search import MultistartCMA, RankedPoses
 from tests.core.estimation.scenes import BOX
 
 

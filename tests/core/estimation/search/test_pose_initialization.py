@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.objective.masked_loss import render_poses
-from osfcore.estimation.objective.observed_views import crop_to_masks, views_of
-from osfcore.estimation.search.pose_initialization import OVERHEAD, RankedPoses, initial_poses, rank_poses
+from osfcore.estimation.objective import crop_to_masks, render_poses, views_of
+from osfcore.estimation.search import OVERHEAD, RankedPoses, initial_poses, rank_poses
 from osfcore.geometry.poses import quaternion_exp, rotation_angle
 from tests.core.estimation.scenes import BOTTLE, BOX
 

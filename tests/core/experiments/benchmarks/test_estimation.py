@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import pytest
 
-import osfcore.experiments.benchmarks.estimation as module
+import osfcore.experiments.bench_estimation as module
 from osfcore.errors import InvalidInput, MissingAssets
-from osfcore.experiments.benchmarks.estimation import BenchEstimate, bench_estimate
+from osfcore.experiments.bench_estimation import BenchEstimate, bench_estimate
 from osfcore.objects.asset_library import AssetLibrary
 from tests.core.experiments.oracle import Oracle
 

@@ -3,10 +3,9 @@ import json
 import numpy as np
 import pytest
 
-import osfcore.experiments.benchmarks.rendering as module
+import osfcore.experiments.bench_rendering as module
 from osfcore.errors import InvalidInput, MissingAssets
-from osfcore.experiments.benchmarks.render_report import slope
-from osfcore.experiments.benchmarks.rendering import BenchRender, bench_render, lay_out, rollouts
+from osfcore.experiments.bench_rendering import BenchRender, bench_render, lay_out, rollouts, slope
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import rotate
 from osfcore.objects.asset_library import AssetLibrary

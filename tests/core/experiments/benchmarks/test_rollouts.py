@@ -1,9 +1,9 @@
 import numpy as np
 
-from osfcore.dynamics.propagation_network import PropagationNetwork
+from osfcore.dynamics.graph import PropagationNetwork
 from osfcore.dynamics.rollout import PushModel
-from osfcore.experiments.benchmarks import rollouts as bench_dynamics
-from osfcore.experiments.benchmarks.rollouts import bench_rollouts, rollout_rate
+from osfcore.experiments import bench_rollouts as bench_dynamics
+from osfcore.experiments.bench_rollouts import bench_rollouts, rollout_rate
 from tests.core.experiments.pushes import shapes
 
 

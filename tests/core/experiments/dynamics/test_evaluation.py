@@ -4,9 +4,9 @@ from dataclasses import replace
 import pytest
 
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.benchmarks import rollouts as bench_dynamics
-from osfcore.experiments.dynamics import evaluation as dynamics
-from osfcore.experiments.dynamics.evaluation import REPORT_FILE, EvaluateDynamics, evaluate_dynamics
+from osfcore.experiments import bench_rollouts as bench_dynamics
+from osfcore.experiments import dynamics
+from osfcore.experiments.dynamics import REPORT_FILE, EvaluateDynamics, evaluate_dynamics
 from osfcore.fields.field_library import FieldLibrary
 
 NAMES = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box")

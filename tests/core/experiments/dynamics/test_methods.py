@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.dynamics.methods import METHODS, as_published, check_method, load_predictor
-from osfcore.experiments.dynamics.scores import learned, windows_of
+from osfcore.experiments.dynamics import METHODS, as_published, check_method, load_predictor
+from osfcore.experiments.dynamics_scores import learned, windows_of
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from osfcore.paper.dynamics.rollout import PaperPushModel
-from osfcore.paper.dynamics.weights import WEIGHTS_FILE, write_network
+from osfcore.paper.dynamics import WEIGHTS_FILE, PaperPushModel, write_network
 from tests.core.dynamics.scenes import network as our_network
 from tests.core.experiments.pushes import NAMES, episode, shapes
 from tests.core.paper.dynamics.scenes import KAPPAS, network

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from osfcore.experiments.dynamics.plots import write_gallery, write_plots
+from osfcore.experiments.dynamics import write_gallery, write_plots
 from tests.core.experiments.dynamics.test_report import report, scored
 from tests.core.experiments.pushes import shapes
 

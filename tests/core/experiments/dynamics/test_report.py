@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from osfcore.experiments.dynamics.report import DynamicsReport, Scored, report_json
-from osfcore.experiments.dynamics.scores import Predicted, constant, errors, windows_of
+from osfcore.experiments.dynamics import DynamicsReport, Scored, report_json
+from osfcore.experiments.dynamics_scores import Predicted, constant, errors, windows_of
 from osfcore.objects.asset import Symmetry
 from tests.core.experiments.pushes import NAMES, episode
 

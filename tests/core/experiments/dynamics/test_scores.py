@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from osfcore.dynamics.propagation_network import PropagationNetwork
-from osfcore.experiments.dynamics.scores import (
+from osfcore.dynamics.graph import PropagationNetwork
+from osfcore.experiments.dynamics_scores import (
     HORIZONS,
     LONGEST,
     Predicted,

@@ -4,19 +4,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import osfcore.experiments.dynamics.video_episodes as videos
-import osfcore.experiments.estimation.tasks as tasks
-from osfcore.control.estimators import Estimators
-from osfcore.control.scene_models import load_scene_models
-from osfcore.experiments.dynamics.video_episodes import VideoEpisodes, predict_through_fields, simulate_video
-from osfcore.experiments.rearrangement.methods import TrueEstimators
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
-from osfcore.experiments.rivals.fitvid.weights import write_fitvid
+import osfcore.experiments.estimation_tasks as tasks
+import osfcore.experiments.video_prediction as videos
+from osfcore.control.estimators import Estimators, load_scene_models
+from osfcore.experiments.rearrangement_runs import TrueEstimators
+from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
+from osfcore.experiments.video_prediction import VideoEpisodes, predict_through_fields, simulate_video
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import goal_camera
 from osfcore.metrics.image_errors import psnr
 from osfcore.random_streams import Stream
-from osfcore.world.random_scenes import draw_scene
+from osfcore.world.tasks import draw_scene
 from tests.core.experiments.solids import SOLIDS
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -5,18 +5,11 @@ import cv2
 import numpy as np
 import pytest
 
-import osfcore.experiments.dynamics.video_episodes as videos
-import osfcore.experiments.estimation.tasks as tasks
+import osfcore.experiments.estimation_tasks as tasks
+import osfcore.experiments.video_prediction as videos
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.dynamics.video_prediction import (
-    CHART_FILE,
-    IMAGES_FILE,
-    REPORT_FILE,
-    CompareVideos,
-    compare_videos,
-)
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
-from osfcore.experiments.rivals.fitvid.weights import write_fitvid
+from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
+from osfcore.experiments.video_prediction import CHART_FILE, IMAGES_FILE, REPORT_FILE, CompareVideos, compare_videos
 from osfcore.fields.field_library import FieldLibrary
 from tests.core.experiments.nerfs import write_nerfs
 from tests.core.experiments.solids import SOLIDS

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from osfcore.dynamics.push_models import load_push_model
-from osfcore.experiments.dynamics.visual_prediction import VisualPrediction, predicted_states, show_prediction
+from osfcore.dynamics.rollout import load_push_model
+from osfcore.experiments.visual_prediction import VisualPrediction, predicted_states, show_prediction
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.metrics.image_errors import psnr
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.world.scene_request import SceneRequest
+from osfcore.render.renderer import SceneRenderer
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")

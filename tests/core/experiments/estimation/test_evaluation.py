@@ -5,9 +5,9 @@ from multiprocessing import get_context
 
 import pytest
 
-import osfcore.experiments.estimation.parts as parts
+import osfcore.experiments.estimation as parts
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.estimation.evaluation import REPORT_FILE, evaluate_estimate
+from osfcore.experiments.estimation import REPORT_FILE, evaluate_estimate
 from osfcore.objects.asset_library import AssetLibrary
 from tests.core.experiments.oracle import SHIFT_M, Oracle
 from tests.core.experiments.quick import quick

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from osfcore.experiments.estimation.parts import PARTS, VIEWS, TaskRunner, state_of
-from osfcore.experiments.estimation.scores import FrameScore, TrackScore
-from osfcore.experiments.estimation.spoiled_inputs import KINDS, BadScore
-from osfcore.experiments.pieces import results_of
+from osfcore.experiments.estimation import PARTS, VIEWS, TaskRunner, state_of
+from osfcore.experiments.estimation_scores import FrameScore, TrackScore
+from osfcore.experiments.estimation_tasks import KINDS, BadScore
+from osfcore.experiments.harness import results_of
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import rotate
 from osfcore.io.json_codec import decode

@@ -4,11 +4,17 @@ import cv2
 import numpy as np
 import pytest
 
-import osfcore.experiments.estimation.plots as module
-from osfcore.experiments.estimation.plots import bad_failure, frame_failure, track_failure, write_gallery, write_plots
-from osfcore.experiments.estimation.report import EstimateReport
-from osfcore.experiments.estimation.scores import refused_frame
-from osfcore.experiments.estimation.spoiled_inputs import KINDS, BadScore
+import osfcore.experiments.estimation as module
+from osfcore.experiments.estimation import (
+    EstimateReport,
+    bad_failure,
+    frame_failure,
+    track_failure,
+    write_gallery,
+    write_plots,
+)
+from osfcore.experiments.estimation_scores import refused_frame
+from osfcore.experiments.estimation_tasks import KINDS, BadScore
 from osfcore.inspection.contact_sheet import Comparison
 from tests.core.experiments.scores import frame, report, score, track
 

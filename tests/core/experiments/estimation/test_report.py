@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import pytest
 
-from osfcore.experiments.estimation.report import EstimateReport, drift
-from osfcore.experiments.estimation.scores import refused_frame
+from osfcore.experiments.estimation import EstimateReport, drift
+from osfcore.experiments.estimation_scores import refused_frame
 from tests.core.experiments.scores import frame, report, score, track
 
 KEYS = {

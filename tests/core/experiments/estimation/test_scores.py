@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.experiments.estimation.scores import (
+from osfcore.experiments.estimation_scores import (
     FrameScore,
     TrackScore,
     coverage,
@@ -22,10 +22,9 @@ from osfcore.experiments.estimation.scores import (
     score_frame,
     share_right,
 )
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.json_codec import decode, encode
 from tests.core.experiments.scores import frame, score, track
 

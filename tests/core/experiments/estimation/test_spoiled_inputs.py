@@ -3,11 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from osfcore.experiments.estimation.spoiled_inputs import FIRST_SCENE, KINDS, BadScore, bad_case, summary
-from osfcore.experiments.estimation.tasks import first_frame
+from osfcore.experiments.estimation_tasks import FIRST_SCENE, KINDS, BadScore, bad_case, first_frame, summary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.io.json_codec import decode, encode
-from osfcore.world.random_scenes import draw_scene
+from osfcore.world.tasks import draw_scene
 from tests.core.experiments.solids import SOLIDS
 
 

@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-import osfcore.experiments.estimation.tasks as module
+import osfcore.experiments.estimation_tasks as module
 from osfcore.errors import NoRoom
-from osfcore.experiments.estimation.tasks import episode, first_frame, goals, take_frame
+from osfcore.experiments.estimation_tasks import episode, first_frame, goals, take_frame
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from osfcore.geometry.states import SceneState
-from osfcore.world.collection.policies import DirectedPolicy
-from osfcore.world.random_scenes import draw_scene, opened
+from osfcore.world.collect_pushes import DirectedPolicy
+from osfcore.world.tasks import draw_scene, opened
 from tests.core.experiments.solids import SOLIDS
 
 CAMERAS = default_cameras(32)[:2]

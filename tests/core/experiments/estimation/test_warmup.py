@@ -1,10 +1,10 @@
 import pytest
 
-import osfcore.experiments.estimation.warmup as module
-from osfcore.estimation.objective import object_models
-from osfcore.experiments.estimation.warmup import WARM_SCENE, last_estimate, warm_models
-from osfcore.experiments.fields.evaluation import MAX_TASKS
-from osfcore.world.random_scenes import draw_scene
+import osfcore.experiments.estimation_warmup as module
+from osfcore.estimation import objective as object_models
+from osfcore.experiments.estimation_warmup import WARM_SCENE, last_estimate, warm_models
+from osfcore.experiments.fields import MAX_TASKS
+from osfcore.world.tasks import draw_scene
 from tests.core.experiments.oracle import Oracle
 from tests.core.experiments.solids import SOLIDS
 

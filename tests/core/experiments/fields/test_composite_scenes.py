@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import MissingAssets
-from osfcore.experiments.fields.composite_scenes import (
+from osfcore.experiments.fields import (
     MIN_PIXELS,
     compare_scene,
     figures_of,
@@ -15,9 +15,9 @@ from osfcore.experiments.fields.composite_scenes import (
 )
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.world.imaging.optics import TABLE_ALBEDO
-from osfcore.world.random_scenes import Draw, draw_scene
+from osfcore.render.renderer import SceneRenderer
+from osfcore.world.imaging import TABLE_ALBEDO
+from osfcore.world.tasks import Draw, draw_scene
 from tests.core.experiments.solids import SOLIDS
 
 

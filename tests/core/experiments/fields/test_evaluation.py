@@ -5,14 +5,20 @@ from dataclasses import replace
 import cv2
 import pytest
 
-import osfcore.experiments.fields.evaluation as module
+import osfcore.experiments.fields as module
 from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.fields.evaluation import EvaluateFields, EvaluateSet, evaluate_fields, evaluate_set
-from osfcore.experiments.fields.report import FieldFigures, FieldsReport
+from osfcore.experiments.fields import (
+    EvaluateFields,
+    EvaluateSet,
+    FieldFigures,
+    FieldsReport,
+    evaluate_fields,
+    evaluate_set,
+)
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.fields.field_weights import read_field, write_field
+from osfcore.fields.kiloosf import read_field, write_field
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.world.collection.collect_images import CollectTable, collect_table
+from osfcore.world.collect_images import CollectTable, collect_table
 from tests.core.experiments.solids import SOLIDS, write_fields
 
 KEYS = {

@@ -5,19 +5,20 @@ import cv2
 import numpy as np
 import pytest
 
-import osfcore.experiments.fields.relit_scenes as relit
+import osfcore.experiments.relighting as relit
 from osfcore.errors import InvalidInput
-from osfcore.experiments.fields.relighting import (
+from osfcore.experiments.images import FIELD_METHODS
+from osfcore.experiments.relighting import (
     CHART_FILE,
     IMAGES_FILE,
+    MEASURES,
     REPORT_FILE,
     CompareRelighting,
+    RelitScenes,
     compare_relighting,
 )
-from osfcore.experiments.fields.relit_scenes import MEASURES, RelitScenes
-from osfcore.experiments.image_methods import FIELD_METHODS
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.world.random_scenes import draw_scene
+from osfcore.world.tasks import draw_scene
 from tests.core.experiments.nerfs import write_nerfs
 from tests.core.experiments.solids import SOLIDS
 

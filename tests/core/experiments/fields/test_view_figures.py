@@ -3,12 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.experiments.fields.view_figures import compare_views
-from osfcore.fields.training.validation import Holdout
+from osfcore.experiments.fields import compare_views
+from osfcore.fields.train_osf import Holdout
 from osfcore.io.image_file import to_uint8
 from osfcore.io.image_set import read_image_set
 from osfcore.metrics.image_errors import dilated, psnr
-from osfcore.render.solids import solid_field
+from osfcore.render.reference import solid_field
 from tests.core.fields.sets import CENTRE, HALF, write_set
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.experiments.photos.board_views import board_errors, board_photograph, random_camera
+from osfcore.experiments.board_views import board_errors, board_photograph, random_camera
 from osfcore.photo.board import Board
 
 VGA = (640, 480)

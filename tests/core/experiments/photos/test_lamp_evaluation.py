@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.photos.lamp_evaluation import EvaluateLamps, LampReport, LampScore, evaluate_lamps
-from osfcore.experiments.photos.simulated_lamps import lamp_scene, random_spot
+from osfcore.experiments.lamps import EvaluateLamps, LampReport, LampScore, evaluate_lamps, lamp_scene, random_spot
 from osfcore.fields.field_library import FieldLibrary
 
 SCORE = LampScore(0, True, False, 2.0, 1.0, 1.0, 1.1, False, 3, 2, 0.5)

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.photos.evaluation import EvaluatePhotos, evaluate_photos
-from osfcore.experiments.photos.folders import read_lamps, read_scene
-from osfcore.experiments.photos.lamp_errors import lamp_errors_deg
-from osfcore.experiments.photos.marked_masks import box_and_click
+from osfcore.experiments.photos import (
+    EvaluatePhotos,
+    box_and_click,
+    evaluate_photos,
+    lamp_errors_deg,
+    read_lamps,
+    read_scene,
+)
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotate
 from osfcore.io.image_file import write_png

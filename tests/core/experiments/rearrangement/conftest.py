@@ -5,16 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import osfcore.experiments.rearrangement.measured_episodes as measured
+import osfcore.experiments.rearrangement as measured
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Noticed, Stepped
-from osfcore.experiments.rearrangement import methods
-from osfcore.experiments.rearrangement.factors import Factor
-from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.experiments import rearrangement_runs as methods
+from osfcore.experiments.factors import Factor
+from osfcore.experiments.rearrangement_runs import Ended
 from osfcore.experiments.rivals.visual_foresight import Foreseen, ForesightPlan
 from osfcore.geometry.cameras import goal_camera
-from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import EstimatedState
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.planning.pose_cost import PoseGoal
+from osfcore.planning.costs import PoseGoal
 
 SYMMETRIES = {name: info.symmetry for name, info in CATALOGUE.items()}
 PAPER = np.full((16, 16, 3), 0.5)

@@ -5,19 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import osfcore.experiments.rearrangement.measured_episodes as measured
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.events import Finished
+import osfcore.experiments.rearrangement as measured
+from osfcore.control.events import EpisodeSettings, Finished
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.rearrangement.evaluation import REPORT_FILE, EvaluateMpc, evaluate_mpc
-from osfcore.experiments.rearrangement.methods import METHODS, Variant
-from osfcore.experiments.rearrangement.runs import Ended
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
-from osfcore.experiments.rivals.fitvid.weights import write_fitvid
+from osfcore.experiments.rearrangement import REPORT_FILE, EvaluateMpc, evaluate_mpc
+from osfcore.experiments.rearrangement_runs import METHODS, Ended, Variant
+from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
-from osfcore.world.rearrangement_tasks import TaskSet, draw_task
+from osfcore.world.tasks import TaskSet, draw_task
 
 NAME = "005_tomato_soup_can"
 FEW = PlanSettings(samples=8, horizon=4)

@@ -4,21 +4,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.world_protocol import World
+from osfcore.control.world import World
 from osfcore.errors import UnknownName
-from osfcore.experiments.rearrangement.factors import (
+from osfcore.experiments.factors import (
     EPISODE_FACTORS,
     FACTORS,
     FIRST_FRAME_FACTORS,
     Factor,
     VariedWorld,
     factor_named,
+    received,
 )
-from osfcore.experiments.rearrangement.sensor import received
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.metrics.success import RearrangementTask
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 CAN = SceneRequest(names=("005_tomato_soup_can",))

@@ -2,15 +2,15 @@ from pathlib import Path
 
 import pytest
 
-from osfcore.control.scene_models import load_scene_models
+from osfcore.control.estimators import load_scene_models
 from osfcore.errors import InvalidInput
-from osfcore.experiments.rearrangement.methods import METHODS, TRUTHS, Variant, check_variant, loop_parts
+from osfcore.experiments.rearrangement_runs import METHODS, TRUTHS, Variant, check_variant, loop_parts
 from osfcore.experiments.rivals.nerf import UnlitRenderer
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.paper.rendering.renderer import PaperRenderer
+from osfcore.paper.rendering import PaperRenderer
 from osfcore.paper.stages import STAGES, PaperEstimators
-from osfcore.render.scene_renderer import SceneRenderer
-from osfcore.world.rearrangement_tasks import TaskSet, draw_task
+from osfcore.render.renderer import SceneRenderer
+from osfcore.world.tasks import TaskSet, draw_task
 
 NAME = "009_gelatin_box"
 

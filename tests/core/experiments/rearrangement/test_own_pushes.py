@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.control.scene_models import load_scene_models
-from osfcore.experiments.rearrangement.own_pushes import Course, prediction_errors
+from osfcore.control.estimators import load_scene_models
+from osfcore.experiments.rearrangement import Course, prediction_errors
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 BOX = "009_gelatin_box"

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from osfcore.experiments.rearrangement.report import CURVE_MM, MpcReport, scores_of, write_pictures
-from osfcore.experiments.task_cache import TaskResult
+from osfcore.experiments.harness import TaskResult
+from osfcore.experiments.rearrangement_report import CURVE_MM, MpcReport, scores_of, write_pictures
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.metrics.success import ObjectScore, RearrangementScore
 

@@ -3,27 +3,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import osfcore.control.adapted_models as adapted_models
+import osfcore.control.closed_loop as adapted_models
 import osfcore.control.estimators as estimators
-import osfcore.experiments.rearrangement.runs as module
-from osfcore.control.episode_settings import EpisodeSettings
-from osfcore.control.estimators import Estimators
-from osfcore.control.events import ActionExecuted, Finished, GoalFound, Observed, Stepped
-from osfcore.control.scene_models import load_scene_models
+import osfcore.experiments.rearrangement_runs as module
+from osfcore.control.estimators import Estimators, load_scene_models
+from osfcore.control.events import ActionExecuted, EpisodeSettings, Finished, GoalFound, Observed, Stepped
 from osfcore.errors import OsfError, UnknownName
 from osfcore.estimation.steps import EstimateStep
-from osfcore.experiments.rearrangement.factors import VariedWorld
-from osfcore.experiments.rearrangement.methods import TRUTHS, LoopParts, SimulatedModel, Variant
-from osfcore.experiments.rearrangement.runs import Ended, run_from_images, run_told_the_truth
+from osfcore.experiments.factors import VariedWorld
+from osfcore.experiments.rearrangement_runs import (
+    TRUTHS,
+    Ended,
+    LoopParts,
+    SimulatedModel,
+    Variant,
+    run_from_images,
+    run_told_the_truth,
+)
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras, goal_camera
-from osfcore.geometry.estimated_state import EstimatedState
+from osfcore.geometry.states import EstimatedState
 from osfcore.metrics.success import score_of
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.planning.mppi import PlanSettings
 from osfcore.progress import Progress
-from osfcore.world.rearrangement_tasks import TaskSet, draw_task
 from osfcore.world.tabletop import Tabletop
+from osfcore.world.tasks import TaskSet, draw_task
 
 NAME = "009_gelatin_box"
 QUICK = EpisodeSettings(steps=2, plan=PlanSettings(samples=8, horizon=4), despite_doubts=True)

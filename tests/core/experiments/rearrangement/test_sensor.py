@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from osfcore.estimation.photometry.camera_response import srgb_of_linear
-from osfcore.experiments.rearrangement.sensor import CameraError, received, resized_masks
+from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.experiments.factors import CameraError, received, resized_masks
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import rotation_angle
 

@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from osfcore.control.episode_settings import EpisodeSettings
+from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput
-from osfcore.experiments.reproduction.page import About
-from osfcore.experiments.reproduction.reproduction import FIGURES_FILE, PAGE_FILE, Reproduce, reproduce
+from osfcore.experiments.reproduction.reproduction import FIGURES_FILE, PAGE_FILE, About, Reproduce, reproduce
 from osfcore.experiments.reproduction.sections import QUICK
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
-from osfcore.experiments.rivals.fitvid.weights import write_fitvid
+from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.planning.mppi import PlanSettings
 

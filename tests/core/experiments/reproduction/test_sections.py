@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from osfcore.experiments.rearrangement.evaluation import EvaluateMpc
-from osfcore.experiments.rearrangement.factors import EPISODE_FACTORS
-from osfcore.experiments.rearrangement.methods import Variant, check_variant
+from osfcore.experiments.factors import EPISODE_FACTORS
+from osfcore.experiments.rearrangement import EvaluateMpc
+from osfcore.experiments.rearrangement_runs import Variant, check_variant
 from osfcore.experiments.reproduction.sections import QUICK, SECTIONS, Scale, sections_of
 
 BASE = EvaluateMpc(Path("out"), Path("data"), names=("a", "b"), seed=7)

@@ -8,7 +8,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import without_light
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 
 NAME = "009_gelatin_box"

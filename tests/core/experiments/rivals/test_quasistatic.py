@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from osfcore.dynamics.motion import Motion
-from osfcore.dynamics.shapes.object_shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
+from osfcore.dynamics.shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
 from osfcore.experiments.rivals.quasistatic import push
 from osfcore.geometry import torch_rotations as rotations
 from osfcore.geometry.polygons import circle, gap_between, gap_to_point

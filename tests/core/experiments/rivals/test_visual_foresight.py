@@ -5,7 +5,7 @@ import pytest
 
 from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
-from osfcore.experiments.rearrangement.runs import Ended
+from osfcore.experiments.rearrangement_runs import Ended
 from osfcore.experiments.rivals.visual_foresight import (
     Foreseen,
     ForesightSettings,
@@ -16,7 +16,7 @@ from osfcore.experiments.rivals.visual_foresight import (
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
-from osfcore.world.rearrangement_tasks import TaskSet, draw_task
+from osfcore.world.tasks import TaskSet, draw_task
 
 SIDE, SPREAD_M = 16, 0.15
 SETTINGS = ForesightSettings(samples=48, horizon=4, rounds=2, temperature=0.1)

@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from osfcore.errors import CannotWrite, CorruptFile
-from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from osfcore.fields.training.optimization import Rates, Stage
+from osfcore.fields.train_osf import Checkpoint, Rates, Stage, read_checkpoint, write_checkpoint
 from tests.core.render.scenes import random_field
 
 MARK = {"settings": {"seed": 3, "minutes": 0.5, "iterations": None}, "images": 7}

@@ -4,18 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.fields.field_weights import read_field
-from osfcore.fields.kiloosf import FLOOR_G
+from osfcore.fields.kiloosf import FLOOR_G, read_field
 from osfcore.fields.kiloosf_query import KiloQuery, Scatter
 from osfcore.fields.osf import OSF, OSFSize
-from osfcore.fields.ray_sampling import RaySource
-from osfcore.fields.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from osfcore.fields.training.distillation import Distillation, first_student
-from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.network_stage import corners
-from osfcore.fields.training.recipes import Recipe, TrainField
-from osfcore.fields.training.visual_hull import silhouette_box
-from osfcore.fields.voxel_shell import first_shell
+from osfcore.fields.rays import RaySource, first_shell
+from osfcore.fields.train_kiloosf import Distillation, Recipe, TrainField, first_student, train_field
+from osfcore.fields.train_osf import Checkpoint, corners, read_checkpoint, write_checkpoint
+from osfcore.fields.visual_hull import silhouette_box
 from tests.core.fields.sets import CENTRE, HALF
 
 CPU = torch.device("cpu")

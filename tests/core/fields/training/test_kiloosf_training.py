@@ -12,12 +12,11 @@ import pytest
 import torch
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.fields.field_weights import read_field
-from osfcore.fields.training import kiloosf_training as training
-from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.recipes import Pace, TrainField
+from osfcore.fields import train_kiloosf as training
+from osfcore.fields.kiloosf import read_field
+from osfcore.fields.train_kiloosf import Pace, TrainField, train_field
 from osfcore.io.image_set import read_image_set
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set, write_table_set
 from tests.core.render.scenes import plain_table
@@ -117,8 +116,8 @@ def test_a_time_budget_is_kept(block_set, tmp_path):
 _KILLED = """
 import sys
 from pathlib import Path
-from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.recipes import Pace, TrainField
+from osfcore.fields.train_kiloosf import train_field
+from osfcore.fields.train_kiloosf import Pace, TrainField
 from tests.core.fields.rendered_sets import QUICK
 config = TrainField(Path(sys.argv[1]), Path(sys.argv[2]), iterations=240, device="cpu")
 for step in train_field(config, QUICK, Pace(0.2, 0.2)):

@@ -4,10 +4,10 @@ import torch
 
 from osfcore.fields.kiloosf import EMPTY_G
 from osfcore.fields.kiloosf_query import KiloQuery
-from osfcore.fields.ray_sampling import RayBatch, RaySource, camera_rays
-from osfcore.fields.training.optimization import Rates, Stage, composite
+from osfcore.fields.rays import RayBatch, RaySource, camera_rays
+from osfcore.fields.train_osf import Rates, Stage, composite
 from osfcore.io.image_set import read_image_set
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 from tests.core.fields.rendered_sets import painted_block, write_object_set
 from tests.core.render.scenes import ball, fog, fog_depth, random_field, state, view

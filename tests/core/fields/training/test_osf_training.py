@@ -8,17 +8,21 @@ from osfcore.errors import InvalidInput
 from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G
 from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.osf import DENSITY_GAIN, OSFSize
-from osfcore.fields.ray_sampling import RayBatch, RaySource
-from osfcore.fields.training.network_stage import MOST_G, baked_g, corners, inverse_density
-from osfcore.fields.training.optimization import Rates, composite
-from osfcore.fields.training.osf_training import (
+from osfcore.fields.rays import RayBatch, RaySource
+from osfcore.fields.train_osf import (
+    MOST_G,
+    Rates,
     TeacherRecipe,
     TrainTeacher,
+    baked_g,
+    composite,
+    corners,
     first_teacher,
+    inverse_density,
     restored_teacher,
     train_teacher,
 )
-from osfcore.fields.training.visual_hull import silhouette_box
+from osfcore.fields.visual_hull import silhouette_box
 
 CPU = torch.device("cpu")
 SMALL = TeacherRecipe(OSFSize(2, 32), across=24, rays=256, rebake=20, rates=Rates(1e-2, 2e-3))

@@ -1,16 +1,15 @@
 import numpy as np
 import pytest
 
+from osfcore.fields.hollow import open_hollows, surface_misfit, without_fog
 from osfcore.fields.kiloosf import FLOOR_G, KiloOSF
-from osfcore.fields.training.photo_consistency import open_hollows, surface_misfit, without_fog
-from osfcore.fields.training.visual_hull import silhouette_box
-from osfcore.fields.training.voxel_fit import fit_voxels
-from osfcore.fields.voxel_shell import first_shell
+from osfcore.fields.rays import first_shell
+from osfcore.fields.train_kiloosf import fit_voxels
+from osfcore.fields.visual_hull import silhouette_box
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_set import ImageSet
 from osfcore.objects.asset import TexturedMesh
-from osfcore.world.imaging.ray_tracer import RayTracer
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import RayTracer, TracedMesh
 from tests.core.fields.rendered_sets import directions
 
 HALF, DEEP, THIN = 0.05, 0.03, 0.006  # half the width, half the height and the walls of the cup

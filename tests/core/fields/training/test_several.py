@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput, WorkerDied
-from osfcore.fields.field_weights import read_field
-from osfcore.fields.training.kiloosf_training import train_field
-from osfcore.fields.training.osf_training import TeacherRecipe
-from osfcore.fields.training.recipes import TrainField
-from osfcore.fields.training.several import train_several
-from osfcore.paper.fields.training import PaperFieldRecipe, TrainPaperField, train_paper_field
+from osfcore.fields.kiloosf import read_field
+from osfcore.fields.train_kiloosf import TrainField, train_field
+from osfcore.fields.train_osf import TeacherRecipe
+from osfcore.fields.train_several import train_several
+from osfcore.paper.train_fields import PaperFieldRecipe, TrainPaperField, train_paper_field
 from tests.clusters import training_that_dies
 from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set, write_table_set
 from tests.core.render.scenes import plain_table

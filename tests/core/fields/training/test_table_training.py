@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.fields.table_field import TableField, read_table
-from osfcore.fields.training import table_training as training_table
-from osfcore.fields.training.table_training import TrainTable, train_table
+from osfcore.fields import train_table as training_table
+from osfcore.fields.table import TableField, read_table
+from osfcore.fields.train_table import TrainTable, train_table
 from tests.core.fields.rendered_sets import painted_ball, write_object_set, write_table_set
 from tests.core.render.scenes import wooden_table
 

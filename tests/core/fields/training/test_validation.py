@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.fields.training.validation import Holdout, dilated_mask
+from osfcore.fields.train_osf import Holdout, dilated_mask
 from osfcore.io.image_set import ImageSet, read_image_set
 from tests.core.fields.rendered_sets import painted_block, write_object_set
 

@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
 from osfcore.errors import CorruptFile
-from osfcore.fields.training.visual_hull import carve, silhouette_box
+from osfcore.fields.visual_hull import carve, silhouette_box
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.io.image_set import ImageSet, read_image_set
-from osfcore.world.collection.collect_images import CollectObject, collect_object
+from osfcore.world.collect_images import CollectObject, collect_object
 from tests.core.fields.sets import CENTRE, HALF, turn_cameras, write_set
 
 OPENGL = np.diag([1.0, -1, -1])

@@ -8,8 +8,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
 from osfcore.io.push_file import EpisodeFolder, PushEpisode, save_episode
-from osfcore.paper.dynamics.graph import LENGTH_M, Scenes
-from osfcore.paper.dynamics.graph_network import GraphNetwork
+from osfcore.paper.dynamics import LENGTH_M, GraphNetwork, Scenes
 
 NAMES = CAN, BOX = ("005_tomato_soup_can", "009_gelatin_box")
 KAPPAS = {CAN: 0.1, BOX: 0.08}

@@ -4,7 +4,7 @@ import torch
 
 from osfcore.errors import UnknownName
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.paper.dynamics.graph import (
+from osfcore.paper.dynamics import (
     NODE_FEATURES,
     PUSHER,
     PUSHER_KAPPA_M,

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from osfcore.paper.dynamics.graph import NODE_FEATURES, UNKNOWN
-from osfcore.paper.dynamics.graph_network import GraphNetwork
+from osfcore.paper.dynamics import NODE_FEATURES, UNKNOWN, GraphNetwork
 from tests.core.paper.dynamics.scenes import BOX, CAN, NAMES, network
 
 

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from osfcore.paper.dynamics.graph_network import GraphNetwork
-from osfcore.paper.dynamics.prediction import squared_error, unroll
+from osfcore.paper.dynamics import GraphNetwork, squared_error, unroll
 from tests.core.paper.dynamics.scenes import NAMES, in_units, network, scenes
 
 NUMBER, KAPPA = torch.tensor([[2, 3, 0]] * 4), torch.tensor([[0.1, 0.2, 0.05]] * 4)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from osfcore.errors import InvalidInput
-from osfcore.paper.dynamics.recordings import record, windows
+from osfcore.paper.train_dynamics import record, windows
 from tests.core.paper.dynamics.scenes import BOX, CAN, KAPPAS, episode, network
 
 

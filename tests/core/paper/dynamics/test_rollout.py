@@ -1,14 +1,12 @@
 import numpy as np
 import pytest
 
-from osfcore.dynamics.pusher_path import SUBSTEPS, pusher_path
+from osfcore.dynamics.motion import SUBSTEPS, pusher_path
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from osfcore.paper.dynamics.graph_network import GraphNetwork
-from osfcore.paper.dynamics.rollout import PaperPushModel, load_paper_push_model
-from osfcore.paper.dynamics.weights import WEIGHTS_FILE, write_network
+from osfcore.paper.dynamics import WEIGHTS_FILE, GraphNetwork, PaperPushModel, load_paper_push_model, write_network
 from tests.core.paper.dynamics.scenes import BOX, CAN, KAPPAS, NAMES, network, state
 
 KNOWN = {**KAPPAS, "teapot": 0.2}

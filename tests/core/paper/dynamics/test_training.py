@@ -6,9 +6,9 @@ import torch
 from safetensors.torch import load
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.paper.dynamics import training
-from osfcore.paper.dynamics.training import TrainPaperDynamics, train_paper_dynamics
-from osfcore.paper.dynamics.weights import read_network
+from osfcore.paper import train_dynamics as training
+from osfcore.paper.dynamics import read_network
+from osfcore.paper.train_dynamics import TrainPaperDynamics, train_paper_dynamics
 from tests.core.paper.dynamics.scenes import BOX, CAN, KAPPAS, NAMES, episode, write
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from osfcore.geometry.poses import quaternion_exp
-from osfcore.paper.dynamics.graph_network import GraphNetwork
-from osfcore.paper.dynamics.recordings import record
-from osfcore.paper.dynamics.validation import validate
+from osfcore.paper.dynamics import GraphNetwork
+from osfcore.paper.train_dynamics import record, validate
 from tests.core.paper.dynamics.scenes import KAPPAS, NAMES, episode, network
 
 STILL = GraphNetwork(NAMES, 8)  # before anything is learned, nothing moves

@@ -6,7 +6,7 @@ from safetensors.torch import load, save
 
 from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.paper.dynamics.weights import FORMAT, network_bytes, read_network, shipped, weights_path, write_network
+from osfcore.paper.dynamics import FORMAT, network_bytes, read_network, shipped, weights_path, write_network
 from tests.core.paper.dynamics.scenes import NAMES, network
 
 BIAS = "answer.bias"

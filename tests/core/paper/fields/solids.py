@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from osfcore.paper.fields.tiny_field import TinyField, first_field, layer_shapes
+from osfcore.paper.fields import TinyField, first_field, layer_shapes
 
 WIDTH, VOXEL = 8, 0.005
 

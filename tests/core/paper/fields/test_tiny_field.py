@@ -3,9 +3,7 @@ import pytest
 import torch
 
 from osfcore.errors import CorruptFile
-from osfcore.paper.fields.tiny_field import first_field, network_size
-from osfcore.paper.fields.tiny_query import TinyQuery
-from osfcore.paper.fields.weights import field_bytes, field_from_bytes, read_field
+from osfcore.paper.fields import TinyQuery, field_bytes, field_from_bytes, first_field, network_size, read_field
 from tests.core.paper.fields.solids import VOXEL, empty_block, uniform_block
 
 

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.fields.training.optimization import Rates
-from osfcore.fields.training.osf_training import TeacherRecipe
-from osfcore.paper.fields.training import PaperFieldRecipe, TrainPaperField, train_paper_field
-from osfcore.paper.fields.weights import read_field
+from osfcore.fields.train_osf import Rates, TeacherRecipe
+from osfcore.paper.fields import read_field
+from osfcore.paper.train_fields import PaperFieldRecipe, TrainPaperField, train_paper_field
 from tests.core.fields.rendered_sets import painted_block, write_object_set
 
 pytestmark = pytest.mark.usefixtures("one_thread")

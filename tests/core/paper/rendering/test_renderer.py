@@ -3,12 +3,12 @@ import pytest
 import torch
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.fields.ray_sampling import camera_rays
+from osfcore.fields.rays import camera_rays
 from osfcore.geometry.poses import quaternion_exp, quaternion_to_matrix
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.paper.fields.tiny_query import TinyQuery
-from osfcore.paper.rendering.renderer import PaperRenderer
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.paper.fields import TinyQuery
+from osfcore.paper.rendering import PaperRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
 from tests.core.paper.fields.solids import VOXEL, empty_block, uniform_block
 from tests.core.render.scenes import block, plain_table, view

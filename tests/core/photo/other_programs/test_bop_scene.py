@@ -6,19 +6,15 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
-from osfcore.estimation.objective.resting_orientations import resting_orientations
+from osfcore.estimation import objective as resting_orientations
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.estimated_state import EstimatedState
 from osfcore.geometry.poses import Pose, quaternion_to_matrix, rotation_angle
-from osfcore.geometry.states import Observation
+from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.observation_file import read_observation, write_observation
-from osfcore.photo.other_programs.bop_images import BopChoice
-from osfcore.photo.other_programs.bop_results import bop_results
-from osfcore.photo.other_programs.bop_scene import read_bop_scene
-from osfcore.photo.other_programs.pose_file import PoseChoice, read_poses
-from osfcore.photo.poses.table_prior import TablePrior
-from osfcore.world.scene_request import SceneRequest
+from osfcore.photo.bop import BopChoice, PoseChoice, bop_results, read_bop_scene, read_poses
+from osfcore.photo.pose_loss import TablePrior
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.core.photo.other_programs.bop_scenes import annotation, write_bop_scene, write_models_info
 

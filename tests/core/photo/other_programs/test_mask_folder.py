@@ -7,7 +7,7 @@ import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.io.image_file import write_png
-from osfcore.photo.other_programs.mask_folder import read_masks
+from osfcore.photo.bop import read_masks
 
 KNOWN = ("025_mug", "003_cracker_box", "009_gelatin_box")
 SENT, KEPT = (80, 60), (40, 30)

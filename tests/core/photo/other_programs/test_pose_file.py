@@ -10,8 +10,7 @@ from scipy.io import savemat
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_to_matrix, rotation_angle
-from osfcore.photo.other_programs.pose_file import PoseChoice, read_poses, scene_gt_names
-from osfcore.photo.other_programs.ycb_video import NAMES, in_object_frame, name_of
+from osfcore.photo.bop import NAMES, PoseChoice, in_object_frame, name_of, read_poses, scene_gt_names
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 POSE = Pose(np.array([0.05, -0.1, 0.8]), quaternion_exp(np.array([0.4, -1.2, 0.3])))

@@ -7,8 +7,8 @@ import pytest
 
 from osfcore.errors import CannotWrite, InvalidInput, MissingAssets, UnknownName
 from osfcore.io.image_set import read_annotations
-from osfcore.world.collection.collect_images import CollectObject, CollectTable, collect_object, collect_table
-from osfcore.world.imaging.optics import TABLE_ALBEDO
+from osfcore.world.collect_images import CollectObject, CollectTable, collect_object, collect_table
+from osfcore.world.imaging import TABLE_ALBEDO
 
 
 @pytest.fixture(scope="module")

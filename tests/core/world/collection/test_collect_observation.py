@@ -4,7 +4,7 @@ import pytest
 from osfcore.errors import CannotWrite, InvalidInput, MissingAssets, UnknownName
 from osfcore.io.observation_file import read_observation
 from osfcore.io.scene_file import read_scene
-from osfcore.world.collection.collect_observation import TRUTH_FILE, CollectObservation, collect_observation
+from osfcore.world.collect_images import TRUTH_FILE, CollectObservation, collect_observation
 from osfcore.world.tabletop import Tabletop
 
 NAMES = ("003_cracker_box", "009_gelatin_box")

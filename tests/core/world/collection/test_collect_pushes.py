@@ -18,8 +18,8 @@ from osfcore.geometry.workspace import STEP_S
 from osfcore.io.image_file import to_uint8
 from osfcore.io.push_file import PushEpisode, read_pushes
 from osfcore.random_streams import Stream, stream_rng
-from osfcore.world.collection.collect_pushes import SUBSTATES, CollectPushes, collect_pushes
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.collect_pushes import SUBSTATES, CollectPushes, collect_pushes
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 

@@ -3,12 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.dynamics.recorded_states import SLEEP_M, substates
+from osfcore.dynamics.motion import SLEEP_M, substates
 from osfcore.geometry.poses import quaternion_conjugate, quaternion_multiply, rotation_angle
 from osfcore.io.push_file import read_pushes
-from osfcore.world.collection import disturbed_states as disturb
-from osfcore.world.collection.collect_pushes import CollectPushes, collect_pushes
-from osfcore.world.collection.disturbed_states import disturbed
+from osfcore.world import collect_pushes as disturb
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes, disturbed
 from osfcore.world.physics import body_model
 
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from osfcore.geometry.workspace import MAX_SPEED_M_S, check_action
-from osfcore.world.collection.policies import DirectedPolicy, PaperPolicy
-from osfcore.world.scene_request import SceneRequest
+from osfcore.world.collect_pushes import DirectedPolicy, PaperPolicy
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 

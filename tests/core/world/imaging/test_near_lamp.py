@@ -4,17 +4,13 @@ import numpy as np
 import pytest
 
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
-from osfcore.geometry.light import Light
+from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.geometry.spot_lamp import SpotLamp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.render.scene_renderer import SceneRenderer
+from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
-from osfcore.world.imaging.optics import TABLE_ALBEDO, Lamp, TableSurface
-from osfcore.world.imaging.ray_tracer import RayTracer, masks_of
-from osfcore.world.imaging.traced_mesh import TracedMesh
-from osfcore.world.imaging.wood import wooden_texture
+from osfcore.world.imaging import TABLE_ALBEDO, Lamp, RayTracer, TableSurface, TracedMesh, masks_of, wooden_texture
 from tests.core.render.scenes import block, table_of
 from tests.core.world.boxes import box_asset
 

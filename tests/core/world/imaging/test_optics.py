@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.world.imaging.optics import TABLE_ALBEDO, Lamp, TableSurface, lambert
+from osfcore.world.imaging import TABLE_ALBEDO, Lamp, TableSurface, lambert
 
 ALBEDO = np.array([[0.2, 0.5, 0.8]])
 shares = st.floats(0, 1)

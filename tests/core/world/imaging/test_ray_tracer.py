@@ -8,9 +8,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.world.imaging.optics import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp
-from osfcore.world.imaging.ray_tracer import RayTracer, masks_of
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp, RayTracer, TracedMesh, masks_of
 from tests.core.world.boxes import box_asset
 
 HEIGHT, HALF = 0.04, 0.02

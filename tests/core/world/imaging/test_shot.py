@@ -3,9 +3,7 @@ import pytest
 
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
-from osfcore.world.imaging.optics import Lamp
-from osfcore.world.imaging.shot import Body, Shot
-from osfcore.world.imaging.traced_mesh import TracedMesh
+from osfcore.world.imaging import Body, Lamp, Shot, TracedMesh
 from tests.core.world.boxes import box_asset
 
 CAMERA = Camera.look_at("above", (0, 0, 1.2), (0, 0, 0), size=400)

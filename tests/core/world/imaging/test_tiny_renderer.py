@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from osfcore.geometry.cameras import default_cameras, goal_camera
-from osfcore.world.imaging.ray_tracer import masks_of
+from osfcore.world.imaging import masks_of
 from osfcore.world.tabletop import Tabletop
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.world.imaging.traced_mesh import NO_HIT, TracedMesh, into_frame
+from osfcore.world.imaging import NO_HIT, TracedMesh, into_frame
 from tests.core.world.boxes import box_asset
 
 SIZE = np.array([0.1, 0.06, 0.04])

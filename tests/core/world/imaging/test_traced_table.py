@@ -6,10 +6,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, TABLE_SIDE_M
-from osfcore.world.imaging.optics import TABLE_ALBEDO, Lamp, TableSurface
-from osfcore.world.imaging.ray_tracer import Picture, RayTracer
-from osfcore.world.imaging.traced_mesh import TracedMesh
-from osfcore.world.imaging.wood import wooden_texture
+from osfcore.world.imaging import TABLE_ALBEDO, Lamp, Picture, RayTracer, TableSurface, TracedMesh, wooden_texture
 from tests.core.world.boxes import box_asset
 
 BOX = TracedMesh(box_asset("box", (0.08, 0.06, 0.1)).mesh)

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from osfcore.world.imaging.optics import TABLE_ALBEDO
-from osfcore.world.imaging.wood import wooden_texture
+from osfcore.world.imaging import TABLE_ALBEDO, wooden_texture
 
 
 @pytest.fixture(scope="module")

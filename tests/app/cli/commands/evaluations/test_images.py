@@ -4,13 +4,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-import osfcore.experiments.dynamics.video_episodes as videos
-import osfcore.experiments.dynamics.video_prediction as video
-import osfcore.experiments.estimation.tasks as tasks
-import osfcore.experiments.fields.relighting as relighting
+import osfcore.experiments.estimation_tasks as tasks
+import osfcore.experiments.relighting as relighting
+import osfcore.experiments.video_prediction as video
+import osfcore.experiments.video_prediction as videos
 from app.cli.main import main
-from osfcore.experiments.dynamics.video_prediction import CompareVideos
-from osfcore.experiments.fields.relighting import CompareRelighting
+from osfcore.experiments.relighting import CompareRelighting
+from osfcore.experiments.video_prediction import CompareVideos
 from tests.core.experiments.solids import SOLIDS
 
 COMMON = ["--names", *SOLIDS, "--tasks", "1", "--objects", "2", "--workers", "1"]

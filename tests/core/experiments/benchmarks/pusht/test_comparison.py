@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.benchmarks.pusht.comparison import BenchPlanner, bench_planner
+from osfcore.experiments.pusht import BenchPlanner, bench_planner
 
 
 @pytest.mark.parametrize(

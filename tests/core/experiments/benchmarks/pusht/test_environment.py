@@ -4,7 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from osfcore.experiments.benchmarks.pusht.environment import PX_M, MissingPushT, PushT, Simulation, drift
+from osfcore.experiments.pusht import PX_M, MissingPushT, PushT, Simulation, drift
 from osfcore.geometry.workspace import STEP_S
 
 # The pusher at rest 5 px left of the stem, at the height of the centre of mass; and one that meets nothing.

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.experiments.benchmarks.pusht.environment import MissingPushT, drift
-from osfcore.experiments.benchmarks.pusht.planners import PLANNERS, Problem, PytorchMPPI
-from osfcore.experiments.benchmarks.pusht.table import goal_of
+from osfcore.experiments.pusht import PLANNERS, MissingPushT, Problem, PytorchMPPI, drift, goal_of
 from osfcore.geometry.workspace import MAX_SPEED_M_S
 
 START = np.array([150.0, 256.0, 0.0, 0.0, 240.0, 196.0, 0.0])  # the pusher is left of the T

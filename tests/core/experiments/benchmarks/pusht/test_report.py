@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from osfcore.experiments.benchmarks.pusht.report import PlannerReport, PushTEpisode
+from osfcore.experiments.pusht import PlannerReport, PushTEpisode
 
 
 def episode(planner, seed, coverage, *, seconds=(0.5, 1.5)):

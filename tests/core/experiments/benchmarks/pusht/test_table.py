@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from osfcore.dynamics.contact_geometry import part_outlines
-from osfcore.dynamics.shapes.object_shapes import ShapeTable
-from osfcore.experiments.benchmarks.pusht.table import cost_of, goal_of, pose_of, rollouts_of, scene_of, tee_shape
+from osfcore.dynamics.shapes import ShapeTable, part_outlines
+from osfcore.experiments.pusht import cost_of, goal_of, pose_of, rollouts_of, scene_of, tee_shape
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 
 STATE = np.array([100.0, 356.0, 5.0, -5.0, 256.0, 196.0, 0.0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.experiments.rivals.fitvid.augmentation import augmented
+from osfcore.experiments.rivals.train_fitvid import augmented
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.rivals.fitvid.frame_windows import VideoFiles, windows
+from osfcore.experiments.rivals.train_fitvid import VideoFiles, windows
 from osfcore.io.push_file import read_pushes
 from tests.core.experiments.rivals.fitvid.videos import write_videos
 
@@ -35,7 +35,7 @@ def test_windows_are_stretches_of_the_episodes(path):
 
 
 def test_objects_that_never_meet_are_not_learned_from(path, monkeypatch):
-    from osfcore.experiments.rivals.fitvid import frame_windows
+    from osfcore.experiments.rivals import train_fitvid as frame_windows
 
     monkeypatch.setattr(frame_windows, "has_held_out_pair", lambda names: True)
     with pytest.raises(InvalidInput, match="learn from is 0"):

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from osfcore.experiments.rivals.fitvid.frame_windows import VideoFiles
-from osfcore.experiments.rivals.fitvid.measurement import VideoErrors, measure
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
+from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings
+from osfcore.experiments.rivals.train_fitvid import VideoErrors, VideoFiles, measure
 from osfcore.io.push_file import read_pushes
 from osfcore.metrics.image_errors import psnr
 from tests.core.experiments.rivals.fitvid.videos import write_videos

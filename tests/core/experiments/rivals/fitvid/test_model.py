@@ -3,9 +3,8 @@ import pytest
 import torch
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.rivals.fitvid.cells import DecoderCell, EncoderCell
-from osfcore.experiments.rivals.fitvid.measurement import as_frames
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
+from osfcore.experiments.rivals.fitvid import DecoderCell, EncoderCell, FitVidModel, FitVidSettings
+from osfcore.experiments.rivals.train_fitvid import as_frames
 from tests.core.experiments.rivals.fitvid.videos import square_video
 
 TINY = FitVidSettings(side=16, width=2, features=12, hidden=16, latent=3)

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.experiments.rivals.fitvid.recurrence import Gaussian, LatentLSTM, kl_divergence
+from osfcore.experiments.rivals.fitvid import Gaussian, LatentLSTM, kl_divergence
 
 numbers = st.floats(-3, 3)
 gaussians = st.tuples(numbers, numbers).map(lambda pair: Gaussian(torch.tensor([pair[0]]), torch.tensor([pair[1]])))

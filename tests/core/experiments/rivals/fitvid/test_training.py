@@ -6,8 +6,8 @@ import torch
 from safetensors.torch import load
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.rivals.fitvid.training import TrainFitVid, train_fitvid
-from osfcore.experiments.rivals.fitvid.weights import read_fitvid
+from osfcore.experiments.rivals.fitvid import read_fitvid
+from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
 from tests.core.experiments.rivals.fitvid.videos import write_videos
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -4,8 +4,7 @@ import torch
 from safetensors.torch import load, save
 
 from osfcore.errors import CorruptFile
-from osfcore.experiments.rivals.fitvid.model import FitVidModel, FitVidSettings
-from osfcore.experiments.rivals.fitvid.weights import FORMAT, read_fitvid, write_fitvid
+from osfcore.experiments.rivals.fitvid import FORMAT, FitVidModel, FitVidSettings, read_fitvid, write_fitvid
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TINY = FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)

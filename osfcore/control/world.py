@@ -1,0 +1,160 @@
+"""What a tabletop with a pusher must offer, so that a real robot can stand in for the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.states import Observation, SceneState
+
+
+class World(Protocol):
+    """A table with objects, cameras and one pusher that follows velocities.
+
+    The simulator (`osfcore.world.tabletop.Tabletop`) is one implementation. Nothing here tells poses or depth: whoever
+    plans has to see.
+    """
+
+    def reset(self, seed: int) -> Observation:
+        """Put a scene on the table: the same for the same seed where the world can (a robot may ask a person)."""
+        ...
+
+    def observe(self, *, masks: bool = False) -> Observation:
+        """Take an image with every camera, with object masks on demand (a robot may have none: then None)."""
+        ...
+
+    def act(self, action: Float[np.ndarray, "3"]) -> None:
+        """Hold the pusher velocity (vx, vy, 0) [m/s] for `STEP_S` [s].
+
+        Raises:
+            InvalidInput: if the action is outside its limits; the world is unchanged.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release what the world holds. Calling it again does nothing."""
+        ...
+
+
+class SimulatedWorld(World, Protocol):
+    """A world that knows the truth, which reports tell; nothing that estimates or plans asks for it."""
+
+    def truth(self) -> SceneState:
+        """Where everything truly is."""
+        ...
+
+    def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
+        """What any cameras would see now."""
+        ...
+
+
+# What reaches the estimators of a closed loop: cameras that see something, at the brightness of the first images.
+#
+# A covered camera shows one colour; its image would pull every estimate. A lamp that is dimmed makes all of an
+# image darker by one factor, lit and shadowed parts alike, while one that is moved does not: its shadows keep their
+# radiance and lie elsewhere. So a common factor is taken out of the images, and anything else is left to the search
+# for the lamp.
+
+
+_BLIND = 0.015  # standard deviation of an image that shows one colour [radiance]
+_FEWEST = 2  # cameras that an estimate needs
+_DARKEST = 0.02  # radiance below which a pixel tells nothing of factors
+_CHANGE, _AGREES = 0.1, 0.08  # logarithms: of a factor that counts, and of those that are the same
+_ALIKE = 0.6  # share of pixels that must agree
+_SHADOWED, _FEW = 0.55, 40  # of the median: pixels in shadow, if there are that many
+
+
+@dataclass(frozen=True, slots=True)
+class SightChange:
+    """Something about the pictures that a person should know.
+
+    Attributes:
+        matter: "camera" or "brightness".
+        text: a sentence.
+    """
+
+    matter: str
+    text: str
+
+
+class Sight:
+    """Prepares one observation after the other."""
+
+    def __init__(self) -> None:
+        self._brightness = 1.0
+        self._blind: frozenset[str] = frozenset()
+        self._before: Observation | None = None
+
+    def take(self, observation: Observation) -> tuple[Observation, tuple[SightChange, ...]]:
+        """What an estimator should see of an observation, and what has changed about it."""
+        blind = blind_cameras(observation)
+        changes = self._told_cameras(blind)
+        self._blind = blind
+        seen = without_cameras(observation, blind)
+        factor = None if self._before is None else brightness_change(self._before, seen)
+        self._before = seen
+        if factor is not None:
+            self._brightness *= factor
+            share = f"{100 * self._brightness:.0f} %"
+            changes.append(SightChange("brightness", f"The light is at {share} of what it was; allowed for."))
+        if abs(np.log(self._brightness)) < _CHANGE / 2:
+            self._brightness = 1.0
+        images = np.clip(seen.images / np.float32(self._brightness), 0, 1)
+        return replace(seen, images=images) if self._brightness != 1.0 else seen, tuple(changes)
+
+    def _told_cameras(self, blind: frozenset[str]) -> list[SightChange]:
+        lost, back = sorted(blind - self._blind), sorted(self._blind - blind)
+        told = [SightChange("camera", f"Camera {name} sees nothing; going on with the others.") for name in lost]
+        return told + [SightChange("camera", f"Camera {name} sees again.") for name in back]
+
+
+def blind_cameras(observation: Observation) -> frozenset[str]:
+    """Names of cameras whose images show one colour; none if fewer than two others are left."""
+    spread = observation.images.std(axis=(1, 2)).max(axis=1)
+    names = frozenset(c.name for c, one in zip(observation.cameras, spread, strict=True) if one < _BLIND)
+    return names if len(observation.cameras) - len(names) >= _FEWEST else frozenset()
+
+
+def without_cameras(observation: Observation, names: frozenset[str]) -> Observation:
+    """An observation with some of its views left out."""
+    kept = [v for v, camera in enumerate(observation.cameras) if camera.name not in names]
+    if len(kept) == len(observation.cameras):
+        return observation
+    masks = None if observation.masks is None else observation.masks[kept]
+    cameras = tuple(observation.cameras[v] for v in kept)
+    return replace(observation, cameras=cameras, images=observation.images[kept], masks=masks)
+
+
+def brightness_change(before: Observation, now: Observation) -> float | None:
+    """The factor by which everything became brighter; None if it did not, or not everything alike.
+
+    Args:
+        before: an observation.
+        now: a later one; cameras that are in both are compared.
+    """
+    pairs = [
+        (_grey(before.images[a]), _grey(now.images[b]))
+        for a, one in enumerate(before.cameras)
+        for b, other in enumerate(now.cameras)
+        if one.name == other.name
+    ]
+    if not pairs:
+        return None
+    old, new = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+    usable = (old > _DARKEST) & (new > _DARKEST / 4)
+    if usable.sum() < _FEW:
+        return None
+    ratio = np.log(new[usable] / old[usable])
+    change = float(np.median(ratio))
+    shadowed = ratio[old[usable] < _SHADOWED * np.median(old[usable])]
+    is_common = len(shadowed) < _FEW or abs(float(np.median(shadowed)) - change) < _AGREES
+    is_alike = np.mean(np.abs(ratio - change) < _AGREES) > _ALIKE
+    return float(np.exp(change)) if abs(change) > _CHANGE and is_common and is_alike else None
+
+
+def _grey(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "P"]:
+    return image.mean(axis=-1).ravel().astype(float)

@@ -1,1 +1,0 @@
-"""Shapes of objects as dynamics needs them, read off their fields."""

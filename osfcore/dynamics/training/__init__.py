@@ -1,1 +1,0 @@
-"""Training of the propagation network on recorded pushes."""

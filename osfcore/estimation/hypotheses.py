@@ -1,0 +1,599 @@
+"""Hypotheses for what descent does not reach: other orientations, objects found by templates, scenes of both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from osfcore.estimation.objective import (
+    QUALITY,
+    ObjectModels,
+    ObservedViews,
+    SceneParameters,
+    crop_camera,
+    crop_to_object,
+    loss_of,
+    photometric_loss,
+    residuals,
+    yaw_quaternions,
+)
+from osfcore.estimation.search import GaussNewtonState, gauss_newton, hemisphere, lit_table_level, search_light
+from osfcore.estimation.uncertainty import evaluate_fit, object_residuals
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import AMBIENT, DIFFUSE
+from osfcore.geometry.poses import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_multiply,
+    rotate,
+    rotation_angle,
+)
+from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
+from osfcore.render.types import SceneBatch
+
+# Orientation hypotheses of one object, refined by Gauss-Newton and compared by the photometric loss around it.
+
+
+_YAWS = 24
+_DOWN = np.array([0.0, 0.0, -1.0])
+_RANKED_COARSE = 64  # hypotheses that are ranked again in coarse images
+_REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
+_REFINED_COARSE = 3  # of these, so many are refined in coarse ones
+_ITERATIONS, _FINE_ITERATIONS = 2, 3
+_FAR, _EXPLAINED = (
+    1.5,
+    0.035,
+)  # nothing is refined where all losses are as high and the object differs by less [radiance]
+_CLOSE = 1.5  # ratio to the present loss up to which a hypothesis is refined on fine images
+_BETTER = 0.98  # times the loss: what is less is no reason to turn an object
+_SAME_RAD = np.deg2rad(12.0)
+
+
+def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
+    """An object turned in place about the vertical through its centre of mass, by equal steps; a batch of poses.
+
+    Args:
+        models: fields, for the centre of mass.
+        params: the guess; the object's own pose is not among the result.
+        number: of the object.
+    """
+    turns = yaw_quaternions(np.arange(1, _YAWS) * 2 * np.pi / _YAWS)
+    quaternions = quaternion_multiply(turns, params.quaternions[number][None])
+    centre = models.resting(params.names[number]).centre
+    middle = params.positions[number] + rotate(params.quaternions[number], centre)
+    return Pose(middle - rotate(quaternions, centre), quaternions)
+
+
+def side_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
+    """An object tipped over in place, by the least rotation, onto each side that it may lie on; a batch of poses.
+
+    A can on its side is rolled about its axis so: labels that repeat around it make it look alike in coarse images.
+    Each pose is among the result also turned by 180 deg about the vertical. The axis of a rotation by about 180 deg is
+    the object's longest one.
+
+    Args:
+        models: fields, for the sides, and the centre of mass.
+        params: the guess; the side that the object lies on is not among the result.
+        number: of the object.
+    """
+    resting, own = models.resting(params.names[number]), params.quaternions[number]
+    sides = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
+    sides, first = np.unique(np.round(sides, 6), axis=0, return_index=True)
+    now = rotate(own, sides)
+    axes, angles = np.cross(now, _DOWN), np.arccos((now @ _DOWN).clip(-1, 1))
+    longest = rotate(own, np.linalg.svd(resting.hull - resting.hull.mean(axis=0), full_matrices=False)[2][0])
+    axes[angles > np.pi - _SAME_RAD] = longest * [1, 1, 0]
+    other = angles > _SAME_RAD
+    turns = axes[other] / np.linalg.norm(axes[other], axis=1, keepdims=True).clip(1e-9) * angles[other, None]
+    tipped = quaternion_multiply(quaternion_exp(turns), own[None])
+    quaternions = np.concatenate([tipped, quaternion_multiply(yaw_quaternions(np.array([np.pi])), tipped)])
+    middle = np.tile(params.positions[number] + rotate(own, resting.centre), (len(quaternions), 1))
+    middle[:, 2] = np.tile(resting.heights[first][other], 2)
+    return Pose(middle - rotate(quaternions, resting.centre), quaternions)
+
+
+def compare_orientations(
+    models: ObjectModels,
+    rough: ObservedViews,
+    coarse: ObservedViews,
+    fine: ObservedViews,
+    at: GaussNewtonState,
+    number: int,
+    others: Pose,
+) -> tuple[GaussNewtonState, float]:
+    """Compare an object's orientation with the best of other hypotheses.
+
+    None is refined where the object explains its pixels already and every hypothesis is far worse: under right
+    orientations residuals are 0.038 at most, under wrong ones 0.038 and more (`docs/estimation.md`).
+
+    Args:
+        models: fields.
+        rough: images in which hypotheses are ranked and first refined: they have the widest basins of attraction.
+        coarse: images in which the first of them are ranked again, and the best refined further.
+        fine: images in which the best of them is compared.
+        at: the scene so far.
+        number: of the object.
+        others: poses that it might have instead, a batch.
+
+    Returns:
+        The better scene, and the ratio of the worse loss to the better one; infinite without a distinct hypothesis.
+    """
+    name, own_quaternion = at.params.names[number], at.params.quaternions[number]
+    far = others[models.turned(name, own_quaternion, others.quaternion) > _SAME_RAD]
+    if not len(far.position):
+        return at, np.inf
+    own = crop_to_object(rough, models, at.params, number)
+    far = far[np.argsort(pose_losses(models, own, at.params, number, far))[:_RANKED_COARSE]]
+    own = crop_to_object(coarse, models, at.params, number)
+    losses = pose_losses(models, own, at.params, number, far)
+    far, nearest = far[np.argsort(losses)], float(losses.min() / max(loss_of(models, own, at.params), 1e-12))
+    if nearest > _FAR and object_residuals(evaluate_fit(models, fine, at.params))[number] < _EXPLAINED:
+        return at, nearest
+    tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct_orientations(far)]
+    tried = sorted(tried, key=lambda one: loss_of(models, own, one.params))[:_REFINED_COARSE]
+    tried = [_refine(models, coarse, one, number, _pose(one.params, number), _ITERATIONS) for one in tried]
+    ends = [loss_of(models, own, refined.params) for refined in tried]
+    rival = tried[int(np.argmin(ends))]
+    if min(ends) < _CLOSE * loss_of(models, own, at.params):
+        rival = _refine(models, fine, rival, number, _pose(rival.params, number), _FINE_ITERATIONS)
+    own = crop_to_object(fine, models, at.params, number)
+    here, there = (loss_of(models, own, params) for params in (at.params, rival.params))
+    angle = models.turned(name, own_quaternion, rival.params.quaternions[number][None])[0]
+    ratio = np.inf if angle < _SAME_RAD else max(here, there) / max(min(here, there), 1e-12)
+    return (replace(rival, losses=at.losses) if there < _BETTER * here else at), float(ratio)
+
+
+def _refine(
+    models: ObjectModels, views: ObservedViews, at: GaussNewtonState, number: int, pose: Pose, iterations: int
+) -> GaussNewtonState:
+    """Gauss-Newton of one object from a pose; its normal matrix stays that of before until it moves."""
+    rival = replace(at, params=with_pose(at.params, number, pose), dampings=GaussNewtonState.at(at.params).dampings)
+    return list(gauss_newton(models, views, rival, iterations=iterations, objects=(number,)))[-1]
+
+
+def _distinct_orientations(poses: Pose) -> list[int]:
+    """Indices of the first few poses that differ from each other."""
+    kept: list[int] = []
+    for k in range(len(poses.position)):
+        if all(rotation_angle(poses.quaternion[k], poses.quaternion[o]) > _SAME_RAD * 1.5 for o in kept):
+            kept.append(k)
+        if len(kept) == _REFINED_ROUGH:
+            break
+    return kept
+
+
+def with_pose(params: SceneParameters, number: int, pose: Pose) -> SceneParameters:
+    """A guess with one object in another pose.
+
+    Args:
+        params: the guess, which stays as it is.
+        number: of the object.
+        pose: its new `T_world_object`.
+    """
+    positions, quaternions = params.positions.copy(), params.quaternions.copy()
+    positions[number], quaternions[number] = pose.position, pose.quaternion
+    return replace(params, positions=positions, quaternions=quaternions)
+
+
+def _pose(params: SceneParameters, number: int) -> Pose:
+    return Pose(params.positions[number], params.quaternions[number])
+
+
+def pose_losses(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
+) -> Float[np.ndarray, "K"]:
+    """Photometric loss of a scene with one object in each of K poses.
+
+    Args:
+        models: fields.
+        views: images to compare with, whole ones or windows around the object.
+        params: the guess; all other objects and the light stay.
+        number: of the object.
+        poses: the K poses, a batch of `T_world_object`.
+    """
+    batch = params.perturbed(np.zeros((len(poses.position), params.size)))
+    positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
+    positions[:, number], quaternions[:, number] = poses.position, poses.quaternion
+    return photometric_loss(residuals(models, views, replace(batch, positions=positions, quaternions=quaternions)))
+
+
+# Finding an object in one image without a mask: templates slid over the image, under every light at once.
+#
+# A matte object under any distant light looks nearly like a mixture of its images under four lights. A template is
+# those four; where it is put, the best mixture is a small least-squares problem. What counts is how much better it
+# explains its pixels than the bare table does, lit or in shadow.
+
+
+_BASIS = np.array([[0, 0, 1.0], [0.8, 0, 0.6], [-0.4, 0.48**0.5, 0.6], [-0.4, -(0.48**0.5), 0.6]])  # toward the lights
+_REACH_M = WORKSPACE_HALF_M + 0.06
+_ANCHORS = 5  # along each side of the workspace; templates are rendered there, and slid by half the way between two
+_BLOCK_M = 0.025  # side of a square from which each orientation is kept once
+_RIDGE = 0.05
+_MAX_TABLE_ERROR = 0.3
+_UNEVEN = 0.03  # share by which pixels of the lit table may differ
+_NEAR_M, _NEAR_RAD = 0.02, np.deg2rad(20.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TemplateMatches:
+    """Where an object may be in an image, the most likely first.
+
+    Attributes:
+        positions: of the object's origin [m].
+        quaternions: unit.
+        scores: by how much each explains its pixels better than the table does.
+    """
+
+    positions: Float[np.ndarray, "K 3"]
+    quaternions: Float[np.ndarray, "K 4"]
+    scores: Float[np.ndarray, "K"]
+
+    @property
+    def poses(self) -> Pose:
+        """All of them."""
+        return Pose(self.positions, self.quaternions)
+
+    def pose(self, number: int) -> Pose:
+        """One of them."""
+        return Pose(self.positions[number], self.quaternions[number])
+
+    def within(self, position: Float[np.ndarray, "3"], reach: float) -> TemplateMatches:
+        """Those within `reach` [m] of a position."""
+        return self.subset(np.flatnonzero(np.linalg.norm(self.positions - position, axis=1) < reach))
+
+    def subset(self, numbers: Int[np.ndarray, "C"]) -> TemplateMatches:
+        """Some of them."""
+        return TemplateMatches(self.positions[numbers], self.quaternions[numbers], self.scores[numbers])
+
+
+def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None = None) -> Float[np.ndarray, "h w"]:
+    """Squared error of the first view's pixels if they show the table.
+
+    Args:
+        models: fields.
+        views: what was observed.
+        lit: light on the lit table, see `lit_table_level`: then each pixel shows that, or shadow. Else it is lit or
+            shaded at will, and grey objects pass for table, too.
+    """
+    view = views.cameras[:1]
+    nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), _BASIS[:1], None)
+    table = models.together.render(nothing, view, quality=QUALITY).rgb[0, 0]
+    image = views.images[0]
+    share = (image * table).sum(axis=-1) / np.maximum((table * table).sum(axis=-1), 1e-6)
+    errors = np.full(share.shape, _MAX_TABLE_ERROR**2)
+    full = AMBIENT + DIFFUSE * (lit or 0)
+    for low, high in [(0.2, 1.05)] if lit is None else [(0.2, AMBIENT), ((1 - _UNEVEN) * full, (1 + _UNEVEN) * full)]:
+        left = image - table * np.clip(share, low, high)[..., None]
+        errors = np.minimum(errors, (left**2).sum(axis=-1))
+    return errors
+
+
+def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> Float[np.ndarray, "h w"]:
+    """Squared error of the first view's pixels, summed over the colours and truncated.
+
+    Args:
+        models: fields.
+        views: what was observed; only the first view counts.
+        params: the scene to render, such as the objects found so far.
+    """
+    rendered = models.together.render(params.perturbed(np.zeros((1, params.size))), views.cameras[:1], quality=QUALITY)
+    return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MAX_TABLE_ERROR**2)
+
+
+def match_templates(
+    models: ObjectModels,
+    views: ObservedViews,
+    name: str,
+    quaternions: Float[np.ndarray, "K 4"],
+    heights: Float[np.ndarray, "K"],
+    *,
+    most: int,
+    behind: Float[np.ndarray, "h w"] | None = None,
+    light: Float[np.ndarray, "3"] | None = None,
+) -> TemplateMatches:
+    """Look for an object in the first view, in given orientations and at given heights of its origin [m].
+
+    Args:
+        models: fields.
+        views: what was observed.
+        name: of the object.
+        quaternions: of the orientations.
+        heights: for each of them.
+        most: how many matches are kept.
+        behind: squared errors of the pixels without the object; those of the table under its own light by default.
+        light: unit vector toward the light, where it is known; any light else.
+    """
+    lights = _BASIS if light is None else light[None]
+    camera, image = views.cameras[0], views.images[0]
+    table = table_errors(models, views, lit_table_level(models, views)) if behind is None else behind
+    grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
+    found = [
+        _match_at_anchor(models, camera, image, table, name, quaternions, heights, lights, (x, y))
+        for x in grid
+        for y in grid
+    ]
+    positions, turns, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return _non_maximum_suppression(positions, turns, scores, most)
+
+
+def _match_at_anchor(
+    models: ObjectModels,
+    camera: Camera,
+    image: np.ndarray,
+    table: np.ndarray,
+    name: str,
+    quaternions: np.ndarray,
+    heights: np.ndarray,
+    lights: np.ndarray,
+    anchor: tuple[float, float],
+) -> tuple[np.ndarray, ...]:
+    """The best places of each orientation around an anchor: positions, orientations, scores."""
+    resting = models.resting(name)
+    positions = np.column_stack([np.tile(anchor, (len(heights), 1)), heights])
+    centre = positions[0] + rotate(quaternions[0], resting.centre)
+    nothing = np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
+    depth = float(camera.T_world_camera.inverse().apply(centre)[2])
+    if depth < resting.radius:
+        return nothing  # behind the camera, or around it
+    height, width = image.shape[:2]
+    per_metre = camera.intrinsics[0, 0] / depth
+    half = int(np.clip(np.ceil(1.15 * resting.radius * per_metre) + 1, 8, min(height, width) // 2))
+    shift = min(int(np.ceil(_REACH_M / _ANCHORS * per_metre)) + 1, max(height, width) // 2)
+    x, y = (int(v) for v in np.round(camera.project(centre)) - half)
+    if not (-2 * half < x < width and -2 * half < y < height):
+        return nothing  # the camera does not look there
+    patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
+    scores = _scores(
+        models, crop_camera(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, lights, patches
+    )
+    best = _best_per_block(scores, places, _BLOCK_M * per_metre)
+    scores, places = np.take_along_axis(scores, best, axis=0).ravel(), places[best.ravel()]
+    quaternions, heights = (np.tile(a, (len(best),) + (1,) * (a.ndim - 1)) for a in (quaternions, heights))
+    pixels = np.tile(camera.project(positions), (len(best), 1)) + places
+    directions = camera.ray_directions(pixels)
+    eye = camera.T_world_camera.position
+    far = (heights - eye[2]) / np.minimum(directions[:, 2], -1e-3)
+    found = eye + far[:, None] * directions
+    on_table = np.abs(found[:, :2]).max(axis=1) < TABLE_SIDE_M / 2  # toward the horizon a pixel is many metres
+    return found[on_table], quaternions[on_table], scores[on_table]
+
+
+def _best_per_block(scores: np.ndarray, places: np.ndarray, side: float) -> Int[np.ndarray, "B K"]:
+    """For each square block of shifted windows, and each template, the window where it scores best."""
+    blocks = np.floor(places / max(side, 1.0)).astype(int)
+    members = [np.flatnonzero((blocks == block).all(axis=1)) for block in np.unique(blocks, axis=0)]
+    return np.stack([own[scores[own].argmax(axis=0)] for own in members])
+
+
+def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[np.ndarray, np.ndarray]:
+    """Windows of an image around one, S x side x side x c, and by how much each is shifted (x, y).
+
+    Beyond the image's border everything is black, and the table explains it.
+    """
+    border = side + shift
+    wide = np.pad(image, ((border, border), (border, border), (0, 0)))
+    top, left = y + border - shift, x + border - shift
+    part = wide[top : top + side + 2 * shift, left : left + side + 2 * shift]
+    windows = np.moveaxis(np.lib.stride_tricks.sliding_window_view(part, (side, side), axis=(0, 1)), 2, -1)
+    rows, columns = np.mgrid[: windows.shape[0], : windows.shape[1]] - shift
+    offsets = np.column_stack([columns.ravel(), rows.ravel()])
+    return windows.reshape(-1, side, side, image.shape[-1]), offsets
+
+
+def _scores(
+    models: ObjectModels, camera: Camera, name: str, positions: np.ndarray, quaternions: np.ndarray,
+    directions: np.ndarray, patches: np.ndarray,
+) -> Float[np.ndarray, "S K"]:  # fmt: skip
+    """How much better each of K templates explains each of S windows than the table does."""
+    count, lights = len(positions), len(directions)
+    batch = SceneBatch(
+        (name,),
+        np.repeat(positions, lights, axis=0)[:, None],
+        np.repeat(quaternions, lights, axis=0)[:, None],
+        np.tile(directions, (count, 1)),
+        None,
+    )
+    rendered = models.alone.render(batch, (camera,), quality=QUALITY, outputs={"rgb", "opacity"})
+    assert rendered.opacity is not None
+    mask = (rendered.opacity[::lights, 0, 0] > 0.5).reshape(count, -1).astype(np.float32)
+    basis = rendered.rgb[:, 0].reshape(count, lights, -1) * np.repeat(mask, 3, axis=-1)[:, None]
+    pixels = patches[..., :3].reshape(len(patches), -1).astype(np.float32)
+    gram = basis @ np.swapaxes(basis, 1, 2)
+    gram += _RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None] / lights * np.eye(lights) + 1e-6 * np.eye(lights)
+    seen = (pixels @ basis.reshape(count * lights, -1).T).reshape(len(patches), count, lights)
+    explained = np.einsum("skl,klm,skm->sk", seen, np.linalg.inv(gram), seen, optimize=True)
+    squares = (pixels**2).reshape(len(patches), -1, 3).sum(axis=-1) @ mask.T
+    of_table = patches[..., 3].reshape(len(patches), -1) @ mask.T
+    return of_table - (squares - explained)
+
+
+def _non_maximum_suppression(
+    positions: np.ndarray, quaternions: np.ndarray, scores: np.ndarray, most: int
+) -> TemplateMatches:
+    """The best ones that differ in place or orientation."""
+    order = np.argsort(-scores)
+    positions, quaternions, scores = positions[order], quaternions[order], scores[order]
+    kept, left = [], np.ones(len(scores), bool)
+    while left.any() and len(kept) < most:
+        k = int(left.argmax())
+        kept.append(k)
+        near = np.linalg.norm(positions - positions[k], axis=1) <= _NEAR_M
+        left &= ~(near & (np.abs(quaternions @ quaternions[k]) >= np.cos(_NEAR_RAD / 2)))
+        left[k] = False
+    return TemplateMatches(positions[kept], quaternions[kept], scores[kept])
+
+
+# Scenes put together from matches: which of them explain an image together, its light being unknown.
+#
+# Objects and light depend on each other: under a wrong light a wrong scene may look right. So it is begun under
+# lights all over the hemisphere, on rough images, and the best of these scenes are sorted out on finer ones. Last,
+# objects are replaced two at a time: one that stands in another's place keeps it from there.
+
+
+OUT_OF_VIEW = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
+_LIGHTS = 40  # over the whole sphere, to begin with
+_FEW_LIGHTS = 10
+_KEPT_ROUGH, _KEPT = 8, 3  # of the scenes found under them, for another round, and for one on finer images
+_PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, matches for the second
+
+
+def assemble_scene(
+    models: ObjectModels,
+    rough: ObservedViews,
+    coarse: ObservedViews,
+    start: SceneParameters,
+    matches: list[TemplateMatches],
+) -> Iterator[tuple[SceneParameters, float]]:
+    """Put scenes together; yields the best so far and its loss, each time one more was tried.
+
+    Args:
+        models: fields.
+        rough: images for all lights.
+        coarse: images for the best of them.
+        start: one scene to begin with; the others begin with no object.
+        matches: of each object.
+    """
+    yield from _SceneAssembly(models, rough, coarse, matches).scenes(start)
+
+
+def quick_scene(
+    models: ObjectModels,
+    rough: ObservedViews,
+    coarse: ObservedViews,
+    names: tuple[str, ...],
+    matches: list[TemplateMatches],
+) -> SceneParameters:
+    """A scene put together under few lights, good enough to tell whether the objects are there at all.
+
+    Args:
+        models: fields.
+        rough: images for all lights.
+        coarse: images for the best of them.
+        names: of the objects.
+        matches: of each object.
+    """
+    nowhere, unturned = (np.tile(part, (len(names), 1)) for part in (OUT_OF_VIEW.position, OUT_OF_VIEW.quaternion))
+    empty = SceneParameters(names, nowhere, unturned, np.array([0.0, 0.0, 1.0]), None)
+    return _SceneAssembly(models, rough, coarse, matches).quick_scene(empty)
+
+
+def reassign_poses(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, matches: list[TemplateMatches]
+) -> SceneParameters:
+    """In turn each object at the match that explains whole images better than its pose does; the same if none.
+
+    Args:
+        models: fields.
+        views: images to compare with.
+        params: the guess.
+        matches: of each object, in the guess's order.
+    """
+    for n, found in enumerate(matches):
+        params, _ = best_placement(models, views, params, n, found)
+    return params
+
+
+def best_placement(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
+) -> tuple[SceneParameters, float]:
+    """The guess with an object where its photometric loss is least, where it is or at a match; and that loss.
+
+    Args:
+        models: fields.
+        views: images to compare with.
+        params: the guess.
+        n: number of the object.
+        found: its matches, perhaps none.
+    """
+    own, losses = loss_of(models, views, params), _losses(models, views, params, n, found)
+    if losses.min(initial=np.inf) >= own:
+        return params, own
+    return with_pose(params, n, found.pose(int(losses.argmin()))), float(losses.min())
+
+
+def _losses(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
+) -> Float[np.ndarray, "K"]:
+    """Loss of the guess with an object at each of its matches."""
+    return pose_losses(models, views, params, n, found.poses) if len(found.scores) else np.zeros(0)
+
+
+def count_of_scenes(objects: int) -> int:
+    """How many steps it takes."""
+    return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
+
+
+def without_objects(params: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
+    """The guess with some objects away."""
+    for n in numbers:
+        params = with_pose(params, n, OUT_OF_VIEW)
+    return params
+
+
+class _SceneAssembly:
+    def __init__(
+        self, models: ObjectModels, rough: ObservedViews, coarse: ObservedViews, matches: list[TemplateMatches]
+    ) -> None:
+        self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, matches
+
+    def scenes(self, start: SceneParameters) -> Iterator[tuple[SceneParameters, float]]:
+        empty = without_objects(start, range(len(self._sightings)))
+        scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
+        for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
+            found: list[tuple[SceneParameters, float]] = []
+            for params in scenes[:kept]:
+                found.append(self._alternated(params, views))
+                found.sort(key=lambda pair: pair[1])
+                yield found[0]
+            scenes = [params for params, _ in found]
+        params, loss = found[0]
+        for pair in combinations(range(len(self._sightings)), 2):
+            params, loss = self._replaced(params, loss, pair)
+            yield params, loss
+        yield self._alternated(params, self._coarse)
+
+    def quick_scene(self, empty: SceneParameters) -> SceneParameters:
+        begun = [self._alternated(replace(empty, light=light), self._rough) for light in hemisphere(_FEW_LIGHTS)]
+        params, _ = min(begun, key=lambda pair: pair[1])
+        for views in (self._rough, self._coarse):
+            params, _ = self._alternated(params, views)
+        return params
+
+    def _alternated(self, params: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
+        """In turn each object at its best match, and the light."""
+        for n, found in enumerate(self._sightings):
+            params, _ = best_placement(self._models, views, params, n, found)
+        params = replace(params, light=search_light(self._models, self._rough, views, params))
+        return params, loss_of(self._models, views, params)
+
+    def _replaced(self, params: SceneParameters, loss: float, pair: tuple[int, int]) -> tuple[SceneParameters, float]:
+        """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
+        best, least = params, loss
+        first, second = pair
+        rest = without_objects(params, pair)
+        others = self._sightings[second]
+        others = others.subset(self._ranking(rest, second)[:_SECOND])
+        for k in self._best_places(rest, first):
+            one = with_pose(rest, first, self._sightings[first].pose(k))
+            both, loss = best_placement(self._models, self._coarse, one, second, others)
+            if loss < least:
+                best, least = both, loss
+        return best, least
+
+    def _best_places(self, params: SceneParameters, n: int) -> list[int]:
+        """Numbers of the matches of an object that explain the image best, each in a place of its own."""
+        positions, kept = self._sightings[n].positions, []
+        for k in self._ranking(params, n).tolist():
+            if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:
+                kept.append(k)
+            if len(kept) == _PLACES:
+                break
+        return kept
+
+    def _ranking(self, params: SceneParameters, n: int) -> Int[np.ndarray, "K"]:
+        return np.argsort(_losses(self._models, self._coarse, params, n, self._sightings[n]))

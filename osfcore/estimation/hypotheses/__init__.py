@@ -1,1 +1,0 @@
-"""Pose hypotheses: other orientations, motions, template matches, and scenes assembled from them."""

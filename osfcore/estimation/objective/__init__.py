@@ -1,1 +1,0 @@
-"""What estimation minimises: parameters, observed views, photometric and masked losses."""

@@ -1,0 +1,264 @@
+"""The image model of pictures of unknown exposure, response, ambient light and table, fitted at known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from osfcore.estimation.camera_response import ImageModel
+from osfcore.estimation.objective import LIGHT, ObjectModels, ObservedViews, SceneParameters
+from osfcore.estimation.search import hemisphere
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.table import TableField
+from osfcore.render.types import SceneBatch
+
+# Fields and tables with factors on albedo and ambient light: what an image model makes of those of the library.
+
+
+_ALBEDO = slice(1, 4)  # among a field's features
+
+
+def adapted(models: ObjectModels, names: Iterable[str], model: ImageModel) -> ObjectModels:
+    """Models of some objects that show what `ImageModel.normalized` pictures do.
+
+    Args:
+        models: not adapted yet.
+        names: of the objects.
+        model: of the pictures.
+    """
+    return models.changed(
+        names, lambda field: scaled_field(field, model.scale, model.ambient), lambda table: _adapted_table(table, model)
+    )
+
+
+def _adapted_table(table: TableField, model: ImageModel) -> TableField:
+    scaled = scaled_table(table, model.scale * model.table, model.ambient)
+    if model.surroundings is None:
+        return scaled
+    return replace(scaled, background=(model.surroundings * model.scale / model.gain).astype(np.float32))
+
+
+def scaled_field(field: KiloOSF, albedo: float, ambient: float) -> KiloOSF:
+    """A field with factors on its albedo and on its ambient light."""
+    rows = field.rows.copy()
+    rows[:, _ALBEDO] *= np.float32(albedo)
+    return replace(field, rows=rows, ambient=field.ambient * np.float32(ambient))
+
+
+def scaled_table(table: TableField, albedo: Float[np.ndarray, "3"], ambient: float) -> TableField:
+    """A table with factors on its albedo, per colour, and on its ambient light."""
+    factors = np.asarray(albedo, np.float32)
+    return replace(table, albedo=table.albedo * factors, ambient=table.ambient * np.float32(ambient))
+
+
+# The image model of pictures from roughly known poses: exposure, ambient light, table and lamp at once.
+#
+# With E the rendered ambient part of a scene and S(l) the rendered direct part under a lamp from l, shadows
+# included,
+#
+#     I_c = G_c (r E_c + S_c(l))            on objects,
+#     I_c = G_c T_c (r E_c + S_c(l))        on the table,
+#
+# so that for each l and r the gains are two small least-squares problems, weighted by truncated errors. l and r are
+# searched: over the hemisphere and a range of r, then on shrinking grids around the best. Neither the exposure nor
+# the table's colour enter: shading of objects, and the contrast of shadows on the table tell l and r.
+
+
+_DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
+_AMBIENT = np.geomspace(0.2, 8.0, 11)  # r: shares of ambient light from 6 to 73 %
+_FIRST_STEP_RAD, _FIRST_FACTOR = np.deg2rad(8.0), 1.3
+_ROUNDS, _SHRINKING = 6, 0.6
+_SURVIVORS = 4
+_TRUNCATED = 0.25  # of the pictures' mean brightness: shadows that are elsewhere, and wrong sides of objects
+_OPAQUE, _CLEAR = 0.9, 0.05  # shares of pixels that count as an object's, and as the table's
+_SATURATED, _DARK = 0.985, 1e-6  # of full scale; where pictures are black, errors are relative to this
+_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Calibration:
+    """What pictures tell of their making.
+
+    Attributes:
+        model: exposure, ambient light and table.
+        light: unit vector toward the lamp.
+        unexplained: mean truncated error of objects and of the table, relative to their brightness.
+    """
+
+    model: ImageModel
+    light: Float[np.ndarray, "3"]
+    unexplained: float
+
+
+class Calibrator:
+    """Fits image models to pictures.
+
+    Args:
+        models: fields as they were made.
+        names: of the objects in the pictures.
+    """
+
+    def __init__(self, models: ObjectModels, names: tuple[str, ...]) -> None:
+        white = np.ones(3)
+        self._whole = models
+        self._direct = models.changed(
+            names,
+            lambda field: scaled_field(field, 1.0, 0.0),
+            lambda table: replace(scaled_table(table, white, 0.0), background=np.zeros(3, np.float32)),
+        )
+
+    def search(self, rough: ObservedViews, fine: ObservedViews, params: SceneParameters) -> Calibration:
+        """Find lamp and image model, whatever they are.
+
+        Args:
+            rough: pictures on which the hemisphere is tried.
+            fine: pictures for what follows.
+            params: the objects; its light plays no part.
+        """
+        pixels = self._pixels(rough, params)
+        directions = hemisphere(_DIRECTIONS)
+        costs = pixels.costs(self._direct_parts(rough, params, directions, pixels), _AMBIENT)
+        found = np.argsort(costs, axis=None)[: 2 * _SURVIVORS]
+        best = [(directions[k // len(_AMBIENT)], float(_AMBIENT[k % len(_AMBIENT)])) for k in found]
+        return self._refined(fine, params, best, _FIRST_STEP_RAD, _FIRST_FACTOR, _ROUNDS)
+
+    def refine(self, views: ObservedViews, params: SceneParameters, ambient: float, *, hold_light: bool) -> Calibration:
+        """Improve a calibration, now that the poses are known.
+
+        Args:
+            views: pictures.
+            params: objects and lamp, near the truth.
+            ambient: r likewise.
+            hold_light: the lamp is where it is.
+        """
+        step = 0.0 if hold_light else _FIRST_STEP_RAD / 4
+        return self._refined(views, params, [(params.light, ambient)], step, _FIRST_FACTOR**0.5, 3, kept=1)
+
+    def _refined(
+        self,
+        views: ObservedViews,
+        params: SceneParameters,
+        best: list[tuple[np.ndarray, float]],
+        step: float,
+        factor: float,
+        rounds: int,
+        kept: int = _SURVIVORS // 2,
+    ) -> Calibration:
+        pixels = self._pixels(views, params)
+        cost = np.inf
+        for _ in range(rounds):
+            tried: list[tuple[float, np.ndarray, float]] = []
+            for light, ambient in best:
+                lights = _neighbours(params, light, step) if step else light[None]
+                around = ambient * factor ** np.array([-1.0, 0.0, 1.0])
+                costs = pixels.costs(self._direct_parts(views, params, lights, pixels), around)
+                tried += [
+                    (costs[a, b], lights[a], float(around[b])) for a in range(len(lights)) for b in range(len(around))
+                ]
+            tried.sort(key=lambda one: one[0])
+            cost, best = tried[0][0], [(light, ambient) for _, light, ambient in tried[:kept]]
+            step, factor = step * _SHRINKING, factor**_SHRINKING
+        light, ambient = best[0]
+        direct = self._direct_parts(views, params, light[None], pixels)[0]
+        objects, table = pixels.gains(direct, ambient)
+        model = ImageModel(objects, ambient, table / objects, surroundings=pixels.surroundings)
+        return Calibration(model, light, float(cost))
+
+    def _pixels(self, views: ObservedViews, params: SceneParameters) -> _Pixels:
+        """The pixels that count, with what is seen there and its ambient part."""
+        batch = params.perturbed(np.zeros((1, params.size)))
+        nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), params.light[None], None)
+        whole = self._whole.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
+        direct = self._direct.together.render(batch, views.cameras, quality=views.quality).rgb[0]
+        empty, lit = (m.together.render(nothing, views.cameras, quality=views.quality).rgb[0]
+                      for m in (self._whole, self._direct))  # fmt: skip
+        assert whole.opacity is not None
+        ambient, bare = whole.rgb[0] - direct, empty - lit
+        opacity = whole.opacity[0].sum(axis=1)
+        masks = np.zeros_like(opacity) if views.masks is None else views.masks.sum(axis=1)
+        exposed = views.images.max(axis=-1) < _SATURATED
+        objects = (opacity > _OPAQUE) & exposed
+        if views.masks is not None:
+            objects &= masks > _OPAQUE
+        has_no_pusher = np.abs(ambient - bare).max(axis=-1) < 1e-3
+        others = (opacity < _CLEAR) & (masks < _CLEAR) & has_no_pusher
+        is_table = lit.max(axis=-1) > 0
+        counted, beyond = objects | (others & is_table & exposed), others & ~is_table
+        surroundings = np.median(views.images[beyond], axis=0).astype(float) if beyond.any() else None
+        return _Pixels(counted, objects[counted], views.images[counted], ambient[counted], surroundings)
+
+    def _direct_parts(
+        self, views: ObservedViews, params: SceneParameters, lights: np.ndarray, pixels: _Pixels
+    ) -> Float32[np.ndarray, "L P 3"]:
+        batch = replace(params.perturbed(np.zeros((len(lights), params.size))), lights=lights)
+        rendered = self._direct.together.render(batch, views.cameras, quality=views.quality, only=pixels.counted)
+        return rendered.rgb[:, pixels.counted]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Pixels:
+    """P pixels of which the model tells something.
+
+    Attributes:
+        counted: where they are.
+        of_objects: those that show objects; the others show the table.
+        seen: their radiance.
+        ambient: E.
+        surroundings: median radiance beyond the table; None where nothing else is seen.
+    """
+
+    counted: Bool[np.ndarray, "V h w"]
+    of_objects: Bool[np.ndarray, "P"]
+    seen: Float32[np.ndarray, "P 3"]
+    ambient: Float32[np.ndarray, "P 3"]
+    surroundings: Float[np.ndarray, "3"] | None
+
+    def costs(self, direct: Float32[np.ndarray, "L P 3"], ambients: Float[np.ndarray, "R"]) -> np.ndarray:
+        """Mean truncated errors, L x R."""
+        costs = np.zeros((len(direct), len(ambients)))
+        for kind in (self.of_objects, ~self.of_objects):
+            if not kind.any():
+                continue
+            seen, ambient, own = self.seen[kind], self.ambient[kind], direct[:, kind]
+            brightness = max(float(seen.mean()), _DARK)
+            most = _TRUNCATED * brightness
+            for number, r in enumerate(ambients):
+                error = np.abs(_fit(np.float32(r) * ambient + own, seen, most)[1])
+                costs[:, number] += np.minimum(error, most).mean(axis=(1, 2)) / brightness
+        return costs
+
+    def gains(self, direct: Float32[np.ndarray, "P 3"], ambient: float) -> tuple[np.ndarray, np.ndarray]:
+        """Of objects and table, per colour; where one of them does not show, that of the other."""
+        found = []
+        for kind in (self.of_objects, ~self.of_objects):
+            if kind.any():
+                shown, seen = np.float32(ambient) * self.ambient[kind] + direct[kind], self.seen[kind]
+                found.append(_fit(shown[None], seen, _TRUNCATED * float(seen.mean()), 4)[0][0])
+        if not found:
+            return np.ones(3), np.ones(3)
+        return found[0].astype(float), found[-1].astype(float)
+
+
+def _fit(
+    shown: Float32[np.ndarray, "L P 3"], seen: Float32[np.ndarray, "P 3"], most: float, rounds: int = 1
+) -> tuple[Float32[np.ndarray, "L 3"], Float32[np.ndarray, "L P 3"]]:
+    """Gains of least squares without the pixels whose error is above `most`, and errors."""
+    gains = _ratio((shown * seen).sum(axis=1), (shown * shown).sum(axis=1))
+    for _ in range(rounds):
+        weights = (np.abs(gains[:, None] * shown - seen) < most).astype(np.float32)
+        weighted = weights * shown
+        gains = _ratio((weighted * seen).sum(axis=1), (weighted * shown).sum(axis=1))
+    return gains, gains[:, None] * shown - seen
+
+
+def _ratio(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    return np.maximum(upper, 1e-3) / np.maximum(lower, 1e-3)
+
+
+def _neighbours(params: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
+    changes = np.zeros((len(_OFFSETS), params.size))
+    changes[:, -LIGHT:] = step * _OFFSETS
+    return replace(params, light=light).perturbed(changes).lights

@@ -1,0 +1,727 @@
+"""Searches for poses and light: CMA-ES from several starts, a grid of lights, Gauss-Newton on the photometric loss."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from osfcore.estimation.objective import (
+    HUBER,
+    LIGHT,
+    POSE,
+    QUALITY,
+    ObjectModels,
+    ObjectView,
+    ObservedViews,
+    RenderedObject,
+    RestingOrientations,
+    SceneParameters,
+    crop_to_silhouette,
+    fibonacci_sphere,
+    masked_loss,
+    photometric_loss,
+    render_poses,
+    residuals,
+)
+from osfcore.estimation.steps import EstimateStep, Stage
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.poses import Pose, rotate, rotation_angle
+from osfcore.geometry.states import EstimatedState
+from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
+from osfcore.progress import Progress
+from osfcore.render.types import SceneBatch
+
+# CMA-ES (Hansen, 2016, arXiv 1604.00772) by the `cma` library, in its ask-and-tell form.
+#
+# Candidates x_k ~ m + sigma N(0, C); the mean m moves to the weighted mean of the better half, and C and sigma
+# adapt to the steps that succeeded.
+
+
+class CMAES:
+    """One search that starts at zero.
+
+    Args:
+        scales: what one standard deviation is in each number of the vector; 0 holds a number still.
+        population: candidates per generation.
+        rng: all randomness.
+    """
+
+    def __init__(self, scales: Float[np.ndarray, "P"], population: int, rng: np.random.Generator) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it misses matplotlib, which is for its own plots
+            import cma
+
+        self._free = np.flatnonzero(scales)
+        self._scales = np.asarray(scales, float)
+        # Its own seed would seed numpy's global generator; nan leaves that alone.
+        options = {"popsize": population, "randn": lambda *shape: rng.standard_normal(shape), "seed": math.nan,
+                   "verbose": -9, "verb_log": 0}  # fmt: skip
+        self._strategy = cma.CMAEvolutionStrategy(np.zeros(len(self._free)), 1.0, options)
+        self._asked: list[np.ndarray] = []
+
+    def ask(self) -> Float[np.ndarray, "B P"]:
+        """The next generation."""
+        self._asked = self._strategy.ask()
+        return self._full(np.array(self._asked))
+
+    def tell(self, losses: Float[np.ndarray, "B"]) -> None:
+        """Losses of the generation that was asked for last; infinite ones count as very bad."""
+        self._strategy.tell(self._asked, np.nan_to_num(losses, nan=1e9, posinf=1e9).tolist())
+
+    @property
+    def mean(self) -> Float[np.ndarray, "P"]:
+        """The centre of the distribution."""
+        return self._full(np.asarray(self._strategy.mean)[None])[0]
+
+    @property
+    def sigma(self) -> float:
+        """The overall step, 1 at the beginning."""
+        return float(self._strategy.sigma)
+
+    def _full(self, short: np.ndarray) -> np.ndarray:
+        full = np.zeros((len(short), len(self._scales)))
+        full[:, self._free] = short * self._scales[self._free]
+        return full
+
+
+# Damped Gauss-Newton (Levenberg-Marquardt) on the photometric loss: block coordinate descent over objects and
+# light.
+#
+# For the parameters delta of one block, with residuals r, their Jacobian J by central differences, Huber weights w
+# = min(1, h / |r|) (iteratively reweighted least squares) and D = diag(J^T W J), each iteration solves
+#
+#     (J^T W J + lambda D) delta = -J^T W r
+#
+# for several lambda at once, clips delta to a trust region, renders all candidates as one batch and keeps the best
+# if it lowers the loss. Deviation from the textbook: the least damped steps are also tried scaled by 4 and 2,
+# because texture makes Gauss-Newton underestimate the step far from the minimum. A block's images are cropped to
+# the object; what blocks share, shadows on each other, is small, and further sweeps take care of it.
+#
+# Deviation from the paper, which uses CMA-ES throughout: near the solution the loss is smooth over differences
+# wider than a pixel, so a few iterations suffice, and J^T W J gives the uncertainty, which CMA-ES's final spread
+# does not.
+
+
+PLANAR_PARAMETERS = (0, 1, 5)  # among an object's numbers: x, y and the turn about the vertical
+POSE_PARAMETERS = tuple(range(POSE))
+_SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of central differences
+_MOST_SHIFT_M, _MOST_TURN_RAD, _MOST_LIGHT_RAD = 0.03, 0.4, 0.3
+_DAMPINGS = np.array(
+    [0.1, 0.1, 0.1, 1.0, 10.0, 100.0]
+)  # lambda: these multiples of the last good one are tried at once
+_STEP_SCALES = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)  # of delta, for each of these lambdas
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e6
+_CONVERGED_RATIO = 0.97  # of the losses after and before a sweep, from which on it counts as converged
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GaussNewtonState:
+    """The current iterate.
+
+    Attributes:
+        params: the best scene so far.
+        losses: `photometric_loss` of each object's windows, and last that of the whole images if the light is searched.
+        normals: Gauss-Newton's matrices of the summed losses, one for each object and one for the light; zero where
+            nothing was searched [1 / unit^2].
+        dampings: to go on with, one for each block.
+    """
+
+    params: SceneParameters
+    losses: Float[np.ndarray, "N+1"]
+    normals: tuple[Float[np.ndarray, "P P"], ...]
+    dampings: tuple[float, ...]
+
+    @staticmethod
+    def at(params: SceneParameters) -> GaussNewtonState:
+        """Before the first iteration."""
+        count = len(params.names)
+        normals = (*(np.zeros((POSE, POSE)) for _ in range(count)), np.zeros((LIGHT, LIGHT)))
+        return GaussNewtonState(params, np.full(count + 1, np.inf), normals, (_FIRST_DAMPING,) * (count + 1))
+
+
+def gauss_newton(
+    models: ObjectModels,
+    views: ObservedViews,
+    start: GaussNewtonState,
+    *,
+    iterations: int,
+    objects: Sequence[int] | None = None,
+    light: ObservedViews | None = None,
+    numbers: Sequence[int] = POSE_PARAMETERS,
+    until_settled: bool = False,
+) -> Iterator[GaussNewtonState]:
+    """Minimise the photometric loss; yields after each sweep over the objects and the light.
+
+    Args:
+        models: fields.
+        views: what was observed.
+        start: where to begin.
+        iterations: sweeps.
+        objects: which objects may move; all by default.
+        light: images in which to search the light, coarse ones will do; None holds it.
+        numbers: which of an object's six numbers may change, `POSE_PARAMETERS` or `PLANAR_PARAMETERS`.
+        until_settled: stop when a sweep hardly lowers the objects' losses.
+
+    Yields:
+        The iterate after each sweep.
+    """
+    at = start
+    moving = list(range(len(at.params.names)) if objects is None else objects)
+    before = np.inf
+    for _ in range(iterations):
+        for n in moving:
+            own = crop_to_silhouette(views, models, at.params, n)
+            at = _damped_step(models, own, at, n, np.array([POSE * n + k for k in numbers]))
+        if light is not None:
+            first = POSE * len(at.params.names)
+            at = _damped_step(models, light, at, len(at.params.names), np.arange(first, first + LIGHT))
+        yield at
+        loss = float(at.losses[moving].sum())
+        if until_settled and loss > _CONVERGED_RATIO * before:
+            return
+        before = loss
+
+
+def _damped_step(
+    models: ObjectModels, views: ObservedViews, at: GaussNewtonState, block: int, numbers: Int[np.ndarray, "n"]
+) -> GaussNewtonState:
+    """One damped step on some entries of the parameter vector (equation in the module's docstring)."""
+    params, half = at.params, difference_steps(len(at.params.names))
+    probes = np.zeros((1 + 2 * len(numbers), params.size))
+    for row, number in enumerate(numbers):
+        probes[1 + 2 * row, number], probes[2 + 2 * row, number] = half[number], -half[number]
+    errors = residuals(models, views, params.perturbed(probes)).reshape(len(probes), -1)
+    jacobian = (errors[1::2] - errors[2::2]) / (2 * half[numbers, None].astype(np.float32))
+    weights = np.minimum(1, HUBER / np.maximum(np.abs(errors[0]), _TINY))
+    normal = ((jacobian * weights) @ jacobian.T).astype(float)
+    gradient = jacobian @ (weights * errors[0])
+    dampings = at.dampings[block] * _DAMPINGS
+    steps = np.zeros((len(dampings), params.size))
+    for row, (damping, scale) in enumerate(zip(dampings, _STEP_SCALES, strict=True)):
+        damped = normal + np.diag(damping * np.diag(normal) + _TINY)
+        steps[row, numbers] = -scale * np.linalg.solve(damped, gradient)
+    steps /= np.maximum(1, (np.abs(steps) / _max_step(len(params.names))).max(axis=1, keepdims=True))
+    here = float(photometric_loss(errors[:1])[0])
+    losses = photometric_loss(residuals(models, views, params.perturbed(steps)))
+    best = int(np.argmin(losses))
+    if losses[best] < here:
+        params, here = params.updated(steps[best]), float(losses[best])
+        damping = max(float(dampings[best]), _LEAST_DAMPING)
+    else:
+        damping = min(float(dampings[-1]), _MOST_DAMPING)
+    whole = np.zeros_like(at.normals[block])
+    own = numbers - POSE * block
+    whole[np.ix_(own, own)] = normal
+    return _accept_step(at, params, block, here, whole, damping)
+
+
+def _accept_step(
+    at: GaussNewtonState, params: SceneParameters, block: int, loss: float, normal: np.ndarray, damping: float
+) -> GaussNewtonState:
+    losses = at.losses.copy()
+    losses[block] = loss
+    normals = (*at.normals[:block], normal, *at.normals[block + 1 :])
+    dampings = (*at.dampings[:block], damping, *at.dampings[block + 1 :])
+    return GaussNewtonState(params, losses, normals, dampings)
+
+
+def difference_steps(count: int) -> Float[np.ndarray, "P"]:
+    """Half the width of the central differences of each parameter, for a scene of `count` objects."""
+    return np.array([*([_SHIFT_M] * 3 + [_TURN_RAD] * (POSE - 3)) * count, *[_LIGHT_RAD] * LIGHT])
+
+
+def _max_step(count: int) -> Float[np.ndarray, "P"]:
+    return np.array([*([_MOST_SHIFT_M] * 3 + [_MOST_TURN_RAD] * (POSE - 3)) * count, *[_MOST_LIGHT_RAD] * LIGHT])
+
+
+# Where to begin: positions from the masks, and every way an object can lie, ranked by the masked loss.
+
+
+OVERHEAD = np.array([0.0, 0.0, 1.0])
+_CENTRING_ROUNDS = 2
+_MAX_STEP_M = 0.05
+_HEIGHT_WEIGHT = 4.0  # how firmly an object lies on the table, against one view's line of sight
+_MIN_PIXELS = 3.0
+_DISTINCT_RAD = np.deg2rad(25.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RankedPoses:
+    """Poses of one object from which a search may start, the best first.
+
+    Attributes:
+        positions: of the object's origin [m].
+        quaternions: unit.
+        losses: `masked_loss` of each.
+    """
+
+    positions: Float[np.ndarray, "K 3"]
+    quaternions: Float[np.ndarray, "K 4"]
+    losses: Float[np.ndarray, "K"]
+
+    def best(self, count: int) -> RankedPoses:
+        """The best `count`."""
+        return RankedPoses(self.positions[:count], self.quaternions[:count], self.losses[:count])
+
+    def distinct(self, count: int) -> RankedPoses:
+        """The best `count` whose orientations differ by more than 25 degrees from better ones."""
+        kept: list[int] = []
+        for k in range(len(self.losses)):
+            if all(rotation_angle(self.quaternions[k], self.quaternions[other]) > _DISTINCT_RAD for other in kept):
+                kept.append(k)
+            if len(kept) == count:
+                break
+        return RankedPoses(self.positions[kept], self.quaternions[kept], self.losses[kept])
+
+
+def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPoses:
+    """Every way the object can lie, put where the masks are, ranked by the masked loss.
+
+    Rendered under a light from overhead of unknown brightness, since the true one is not known yet.
+
+    Args:
+        models: fields.
+        name: of the object.
+        part: windows around its masks.
+    """
+    resting = models.resting(name)
+    positions = _positions_along_rays(part, resting)
+    for _ in range(_CENTRING_ROUNDS):
+        look = render_poses(models, name, part, positions, resting.quaternions, OVERHEAD)
+        positions = _centre_on_mask(look, part, positions)
+    return rank_poses(models, name, part, positions, resting.quaternions, OVERHEAD, any_brightness=True)
+
+
+def rank_poses(
+    models: ObjectModels,
+    name: str,
+    part: ObjectView,
+    positions: Float[np.ndarray, "K 3"],
+    quaternions: Float[np.ndarray, "K 4"],
+    light: Float[np.ndarray, "3"],
+    *,
+    any_brightness: bool = False,
+) -> RankedPoses:
+    """Poses in the order of their masked loss, the best first.
+
+    Args:
+        models: fields.
+        name: of the object.
+        part: windows around its masks.
+        positions: of the object's origin [m].
+        quaternions: rotations from the object's frame to the world, unit.
+        light: unit vector toward the light.
+        any_brightness: compare colours up to a factor, see `masked_loss`.
+    """
+    look = render_poses(models, name, part, positions, quaternions, light)
+    losses = masked_loss(look, part, any_brightness=any_brightness)
+    order = np.argsort(losses)
+    return RankedPoses(positions[order], quaternions[order], losses[order])
+
+
+def _positions_along_rays(part: ObjectView, resting: RestingOrientations) -> Float[np.ndarray, "K 3"]:
+    """Positions at which the centre of mass is closest to the lines of sight through the masks' centroids.
+
+    Its height over the table is nearly given by how the object lies, so one view is enough.
+    """
+    normal, target = np.zeros((3, 3)), np.zeros(3)
+    for camera, mask, weight in zip(part.cameras, part.mask, np.sqrt(part.area / part.area.max()), strict=True):
+        rows, columns = np.nonzero(mask > 0.5)
+        pixel = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+        direction = camera.ray_directions(pixel)
+        across = weight * (np.eye(3) - np.outer(direction, direction))
+        normal += across
+        target += across @ camera.T_world_camera.position
+    up = np.diag([0.0, 0.0, _HEIGHT_WEIGHT])
+    heights = np.outer(resting.heights, (0.0, 0.0, _HEIGHT_WEIGHT))
+    centres = np.linalg.solve(normal + up, (target + heights).T).T
+    centres[:, :2] = np.clip(centres[:, :2], -TABLE_SIDE_M / 2, TABLE_SIDE_M / 2)
+    return centres - rotate(resting.quaternions, resting.centre)
+
+
+def _centre_on_mask(
+    look: RenderedObject, part: ObjectView, positions: Float[np.ndarray, "B 3"]
+) -> Float[np.ndarray, "B 3"]:
+    """Positions moved, by least squares over the views, so that silhouettes have the centroids of the masks."""
+    wanted, _ = _centroids(part.mask * part.valid)
+    found, sizes = _centroids(look.opacity * part.valid)
+    normal = np.tile(np.diag([1e-3, 1e-3, 1e-3]), (len(positions), 1, 1))
+    target = np.zeros((len(positions), 3))
+    for view, camera in enumerate(part.cameras):
+        slope = _projection_slope(camera, positions)
+        slope = slope * (sizes[:, view] > _MIN_PIXELS)[:, None, None]
+        normal += np.swapaxes(slope, 1, 2) @ slope
+        target += np.einsum("bij,bi->bj", slope, wanted[view] - found[:, view])
+    if len(part.cameras) == 1:  # one view cannot tell distance from size; the object lies on the table
+        normal[:, 2, 2] += 1e9
+    step = np.linalg.solve(normal, target[..., None])[..., 0]
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return positions + step * np.minimum(1, _MAX_STEP_M / np.maximum(length, 1e-9))
+
+
+def _centroids(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids (x, y) of images [px], and the sums of their pixels."""
+    rows, columns = np.mgrid[: weights.shape[-2], : weights.shape[-1]] + 0.5
+    total = weights.sum(axis=(-2, -1))
+    moments = np.stack([(weights * columns).sum(axis=(-2, -1)), (weights * rows).sum(axis=(-2, -1))], axis=-1)
+    return moments / np.maximum(total, 1e-6)[..., None], total
+
+
+def _projection_slope(camera: Camera, points: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B 2 3"]:
+    """How pixel coordinates change with a point in the world [px / m]."""
+    inverse = camera.T_world_camera.inverse().matrix()
+    x, y, z = (points @ inverse[:3, :3].T + inverse[:3, 3]).T
+    z = np.maximum(z, 1e-3)
+    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
+    zero = np.zeros_like(x)
+    slope = np.stack([np.stack([fx / z, zero, -fx * x / z**2], -1), np.stack([zero, fy / z, -fy * y / z**2], -1)], 1)
+    return slope @ inverse[:3, :3]
+
+
+# CMA-ES over one object's pose from several starts at once, by the masked loss (paper eq. 5).
+
+
+SHIFT_M, TURN_RAD = 4e-3, 0.12  # the first spread
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CMAGeneration:
+    """One generation of all searches.
+
+    Attributes:
+        candidates: poses, of all starts together.
+        loss: of the best.
+        sigma: step of the first start's search, 1 at the beginning.
+    """
+
+    candidates: Pose
+    loss: float
+    sigma: float
+
+
+class MultistartCMA:
+    """One CMA-ES for each start of an object; a generation of all is rendered as one batch.
+
+    Args:
+        models: fields.
+        name: of the object.
+        part: where it was observed.
+        starts: where to begin.
+        light: unit vector toward the light.
+        population: candidates per generation and start.
+        rng: of the searches.
+        any_brightness: the light is not known yet, see `masked_loss`.
+    """
+
+    def __init__(
+        self,
+        models: ObjectModels,
+        name: str,
+        part: ObjectView,
+        starts: RankedPoses,
+        light: Float[np.ndarray, "3"],
+        *,
+        population: int,
+        rng: np.random.Generator,
+        any_brightness: bool,
+    ) -> None:
+        self._models, self._name, self._part, self._starts, self._light = models, name, part, starts, light
+        self._any_brightness = any_brightness
+        scales = np.array([SHIFT_M] * 3 + [TURN_RAD] * 3 + [0.0] * LIGHT)
+        begun = zip(starts.positions, starts.quaternions, strict=True)
+        self._guesses = [SceneParameters((name,), p[None], q[None], light, None) for p, q in begun]
+        self._searches = [CMAES(scales, population, rng) for _ in self._guesses]
+
+    def advance(self) -> CMAGeneration:
+        """One more generation of every search."""
+        batches = [g.perturbed(s.ask()) for g, s in zip(self._guesses, self._searches, strict=True)]
+        positions = np.concatenate([b.positions[:, 0] for b in batches])
+        quaternions = np.concatenate([b.quaternions[:, 0] for b in batches])
+        look = render_poses(self._models, self._name, self._part, positions, quaternions, self._light)
+        losses = masked_loss(look, self._part, any_brightness=self._any_brightness)
+        for search, own in zip(self._searches, losses.reshape(len(batches), -1), strict=True):
+            search.tell(own)
+        return CMAGeneration(Pose(positions, quaternions), float(losses.min()), self._searches[0].sigma)
+
+    def best_poses(self) -> Pose:
+        """The starts, and the mean of each search."""
+        now = [g.updated(s.mean) for g, s in zip(self._guesses, self._searches, strict=True)]
+        return Pose(
+            np.concatenate([self._starts.positions, *(g.positions for g in now)]),
+            np.concatenate([self._starts.quaternions, *(g.quaternions for g in now)]),
+        )
+
+
+# Whether pictures show the table as it is known, from its pixels alone: a check before any estimate.
+#
+# Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x
+# where the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another
+# table changes the colours. Where no shadow is seen, as under a lamp overhead, only colours tell.
+
+
+TableVerdict = Literal["usual", "unclear", "other"]
+_MASK_ERROR_PX, _BESIDE = 2, 0.02  # of masks, and of the image's side: where nothing is table for sure
+_FEWEST = 200  # pixels of table, without which nothing is told
+_DARKEST = 0.001, 0.003  # shares of the pixels; where both lie well in shadow, it is as dark everywhere
+_SAME = 0.025  # difference of x within a shadow
+_SHADOW, _BRIGHTEST = 0.05, 1.06  # |x| in shadow, and x in full light
+_LEAST_CONTRAST = 0.05  # of x: less is noise, not a shadow
+_COLOUR = 0.012  # median error of colours [radiance]
+_LIT, _FEWEST_LIT = 0.03, 20  # least x of a lit pixel, and how many each picture needs
+
+
+@dataclass(frozen=True, slots=True)
+class TableCheck:
+    """What pixels of the table tell.
+
+    Attributes:
+        shadow: x of the darkest; 0 on the known table under the known ambient light.
+        brightest: x of the brightest.
+        colour: median error of the colours [radiance].
+        verdict: "usual", or "other" where something speaks against the usual image model; "unclear" where no full
+            shadow is seen: then another lamp may explain what another exposure does.
+    """
+
+    shadow: float
+    brightest: float
+    colour: float
+    verdict: TableVerdict
+
+
+def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
+    """Compare the table's pixels with the known table.
+
+    Args:
+        models: of which the table is used.
+        views: pictures with masks.
+    """
+    x, error, on_table = table_light(models, views)
+    table = _table_pixels(views, on_table)
+    if table.sum() < _FEWEST:
+        return TableCheck(0.0, 0.0, 0.0, "unclear")
+    darkest, shadow, brightest = np.quantile(x[table], [*_DARKEST, 0.99])
+    colour = float(np.median(error[table]))
+    has_shadow = brightest - shadow > _LEAST_CONTRAST and shadow - darkest < _SAME
+    is_dark = abs(shadow) < _SHADOW if has_shadow else darkest > -_SHADOW
+    is_usual = is_dark and brightest < _BRIGHTEST and colour < _COLOUR
+    verdict: TableVerdict = "other" if not is_usual else "usual" if has_shadow else "unclear"
+    return TableCheck(float(shadow), float(brightest), colour, verdict)
+
+
+def table_light(
+    models: ObjectModels, views: ObservedViews
+) -> tuple[Float[np.ndarray, "V h w"], Float[np.ndarray, "V h w"], Bool[np.ndarray, "V h w"]]:
+    """What would be the light on the table, if every pixel showed it.
+
+    Args:
+        models: of which the table is used.
+        views: pictures.
+
+    Returns:
+        x by which the pixel's radiance is best explained, the error of its colours that this leaves [radiance], and
+        whether the table would be seen if it were empty.
+    """
+    nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), OVERHEAD[None], None)
+    empty = models.together.render(nothing, views.cameras, quality=QUALITY, outputs={"rgb", "depth"})
+    assert empty.depth is not None
+    full = empty.rgb[0]
+    seen = np.stack([cv2.blur(image, (3, 3)) for image in views.images])
+    # The known table facing the lamp sends out `full`, that is ambient and all direct light.
+    lit = (seen * full).sum(axis=-1) / np.maximum((full * full).sum(axis=-1), 1e-6)
+    error = np.abs(seen - lit[..., None] * full).mean(axis=-1)
+    return (lit - AMBIENT) / DIFFUSE, error, empty.depth[0] > 0
+
+
+def lit_table_level(models: ObjectModels, views: ObservedViews) -> float | None:
+    """Light x = sin(elevation) on the table where the lamp reaches it: the median over pixels of its colours.
+
+    Args:
+        models: of which the table is used.
+        views: pictures; masks play no part.
+
+    Returns:
+        x, or None where too little of a lit table is seen.
+    """
+    x, error, on_table = table_light(models, views)
+    lit = x[on_table & (error < _COLOUR) & (x > _LIT)]
+    return float(np.median(lit)) if len(lit) >= _FEWEST_LIT * len(views.images) else None
+
+
+def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
+    """Pixels that show nothing but table, well within its edge."""
+    reach = _MASK_ERROR_PX + round(_BESIDE * max(on_table.shape[1:]))
+    kernel = np.ones((2 * reach + 1,) * 2, np.uint8)
+    other = ~on_table
+    if views.masks is not None and views.masks.shape[1]:
+        other |= views.masks.max(axis=1) > 0
+    if views.pusher is not None:
+        other |= _pusher_pixels(views)
+    return np.stack([cv2.dilate(part.astype(np.uint8), kernel) == 0 for part in other])
+
+
+def _pusher_pixels(views: ObservedViews) -> np.ndarray:
+    """The pusher's outline in each view, about, from points of its axis."""
+    assert views.pusher is not None
+    shown = np.zeros(views.images.shape[:3], np.uint8)
+    axis = views.pusher + np.linspace(-0.5, 0.5, 9)[:, None] * [0.0, 0.0, PUSHER_HEIGHT_M]
+    for picture, camera in zip(shown, views.cameras, strict=True):
+        depth = camera.T_world_camera.inverse().apply(axis)[:, 2]
+        if depth.min() <= PUSHER_RADIUS_M:
+            continue
+        radius = int(np.ceil(camera.intrinsics[0, 0] * PUSHER_RADIUS_M / depth.min()))
+        for x, y in camera.project(axis):
+            cv2.circle(picture, (int(x), int(y)), radius, 1, -1)
+    return shown > 0
+
+
+# Builds the steps that an estimator yields.
+
+
+class StepReporter:
+    """Builds the steps of one estimation and counts them.
+
+    Args:
+        total: steps that are expected; may grow.
+    """
+
+    def __init__(self, total: int) -> None:
+        self.done, self.total = 0, total
+
+    def step(
+        self,
+        stage: Stage,
+        note: str,
+        params: SceneParameters,
+        tried: Sequence[Pose] = (),
+        losses: Sequence[float] = (),
+        sigma: float = 1.0,
+        lights: Float[np.ndarray, "C 3"] | None = None,
+        loss: float = float("nan"),
+    ) -> EstimateStep:
+        """The next step.
+
+        Args:
+            stage: which part of the method is at work.
+            note: what it does, for a person.
+            params: the best scene so far.
+            tried: poses of each object; shown if there are some of every object, as many as of the fewest.
+            losses: of each object.
+            sigma: the search's overall step.
+            lights: directions that were tried.
+            loss: of the whole.
+        """
+        self.done = min(self.done + 1, self.total)
+        candidates = None
+        count = min((len(poses.position) for poses in tried), default=0) if len(tried) == len(params.names) else 0
+        if count:
+            candidates = Pose(
+                np.stack([poses.position[:count] for poses in tried], 1),
+                np.stack([poses.quaternion[:count] for poses in tried], 1),
+            )
+        progress = Progress(self.done, self.total, note)
+        return EstimateStep(progress, stage, params.state(), candidates, lights, sigma, tuple(losses), loss)
+
+    def refinement(self, note: str, at: GaussNewtonState) -> EstimateStep:
+        """The next step, of Gauss-Newton."""
+        return self.step("polish", note, at.params, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
+
+    def finish(self, at: GaussNewtonState, estimate: EstimatedState) -> EstimateStep:
+        """The last step, with the result."""
+        self.done = self.total - 1
+        step = self.refinement("Done" if estimate.trusted else estimate.reason, at)
+        return replace(step, stage="done", estimate=estimate)
+
+
+# Light search: the direction toward the light by coarse-to-fine grid search, given roughly known poses.
+#
+# A grid over the hemisphere and a ring at the elevation that the table's shading tells, then shrinking 3 x 3 grids
+# around the best directions, ranked by the truncated absolute error mean(min(|r|, e_max)) of renderings with
+# shadows. Lit parts of the table reflect ambient + direct * sin(elevation); cast shadows tell the azimuth; neither
+# needs accurate poses. Without the ring lights near the horizon are missed: there shading changes by half from one
+# direction to the next.
+
+
+_DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
+_AZIMUTHS = 48  # of a ring at the horizon; higher ones are shorter
+_FIRST_STEP_RAD = np.deg2rad(8.0)
+_ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
+_MAX_ERROR = 0.25  # e_max [radiance]: orientations may still be wrong
+_FIRST_SURVIVORS, _SURVIVORS = 6, 3  # local minima arise where shadows fall on other objects
+_NEIGHBOUR_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
+
+
+def search_light(
+    models: ObjectModels, coarse: ObservedViews, fine: ObservedViews, params: SceneParameters
+) -> Float[np.ndarray, "3"]:
+    """Unit vector toward the light under which a rendering of the guessed poses fits the images best.
+
+    Args:
+        models: fields.
+        coarse: images to try the whole hemisphere on.
+        fine: images to refine on.
+        params: objects and pusher; its light plays no part.
+
+    Returns:
+        The direction.
+    """
+    directions = np.concatenate([hemisphere(), _ring(models, fine)])
+    best = directions[np.argsort(_losses(models, coarse, params, directions))[:_FIRST_SURVIVORS]]
+    step = _FIRST_STEP_RAD
+    for _ in range(_ROUNDS):
+        tried = np.concatenate([_neighbours(params, light, step) for light in best])
+        best = tried[np.argsort(_losses(models, fine, params, tried))[:_SURVIVORS]]
+        step *= _SHRINKING
+    return best[0]
+
+
+def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
+    """Least truncated error on the grid over the hemisphere, divided by the error under the guess's own light.
+
+    Args:
+        models: fields.
+        views: images to compare with; coarse ones will do.
+        params: the guess.
+    """
+    directions = np.concatenate([params.light[None], hemisphere()])
+    losses = _losses(models, views, params, directions)
+    return float(losses[1:].min() / max(losses[0], 1e-12))
+
+
+def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
+    """Where a light may be: those of `count` directions, spread over the whole sphere, that are high enough."""
+    directions = fibonacci_sphere(count)
+    return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
+
+
+def _ring(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "K 3"]:
+    """Directions from all around at the elevation that the table's lit pixels tell; none where none is seen."""
+    level = lit_table_level(models, views)
+    if level is None:
+        return np.zeros((0, 3))
+    elevation = np.arcsin(np.clip(level, np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG)), 1))
+    count = int(np.ceil(_AZIMUTHS * np.cos(elevation))) + 1
+    azimuths = 2 * np.pi * np.arange(count) / count
+    return np.stack([Light.from_angles(azimuth, elevation).direction for azimuth in azimuths])
+
+
+def _neighbours(params: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
+    changes = np.zeros((len(_NEIGHBOUR_OFFSETS), params.size))
+    changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
+    return replace(params, light=light).perturbed(changes).lights
+
+
+def _losses(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, lights: np.ndarray
+) -> Float[np.ndarray, "B"]:
+    batch = replace(params.perturbed(np.zeros((len(lights), params.size))), lights=lights)
+    rendered = models.together.render(batch, views.cameras, quality=QUALITY)
+    return np.minimum(np.abs(rendered.rgb - views.images), _MAX_ERROR).mean(axis=(1, 2, 3, 4))

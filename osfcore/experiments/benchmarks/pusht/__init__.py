@@ -1,1 +1,0 @@
-"""Planners alone, with true dynamics, on the public benchmark Push-T."""

@@ -1,0 +1,604 @@
+"""How good predictions of pushes are: open loop over episodes that nothing was trained on.
+
+Episodes of both policies with two, three, four and six objects are collected once into the output folder, from random
+streams that no other collection uses. Windows of up to 30 actions are rolled out by the network, by a quasi-static
+model and by nobody (everything stays), and scored for objects that truly moved. Pairs of objects that never meet in
+training are scored apart, and so are objects that a second network has never seen; with the paper's network neither is,
+for it has met them all. Episodes are the same for every method.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from osfcore.dynamics.dynamics_model import DynamicsModel
+from osfcore.dynamics.graph import read_metrics, read_network, shipped
+from osfcore.dynamics.motion import SUBSTEPS, pusher_path
+from osfcore.dynamics.rollout import PushModel, load_shapes, network_path
+from osfcore.dynamics.shapes import ObjectShape, ShapeTable, part_outlines
+from osfcore.dynamics.train import has_held_out_pair
+from osfcore.errors import InvalidInput, MissingAssets, check_seed
+from osfcore.experiments.bench_rollouts import BENCH_NAMES, rollout_rate
+from osfcore.experiments.charts import Axis, Chart, Curve, write_charts
+from osfcore.experiments.dynamics_scores import (
+    HORIZONS,
+    LONGEST,
+    Errors,
+    Predicted,
+    Windows,
+    analytic,
+    constant,
+    errors,
+    learned,
+    windows_of,
+)
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.workspace import PUSHER_RADIUS_M
+from osfcore.inspection.contact_sheet import put_text
+from osfcore.io.files import write_json
+from osfcore.io.image_file import write_png
+from osfcore.io.push_file import read_pushes
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.dynamics import GraphNetwork, PaperPushModel, Scenes, longest_axes, unroll, weights_path
+from osfcore.paper.dynamics import read_network as read_paper_network
+from osfcore.random_streams import Stream, stream_seed
+from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+
+# Whose predictions are evaluated: those of our model, or of the paper's as it is published.
+
+
+DynamicsMethod = Literal["ours", "paper"]
+METHODS: tuple[DynamicsMethod, ...] = get_args(DynamicsMethod)
+_CHUNK = 512  # windows
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Predictor:
+    """One way to predict.
+
+    Attributes:
+        predict: poses in windows of episodes, told the poses of one action before the start.
+        model: the same as planning asks for it.
+    """
+
+    predict: Callable[[Windows], Predicted]
+    model: DynamicsModel
+
+
+def check_method(method: str) -> None:
+    """Refuse what is no method.
+
+    Raises:
+        InvalidInput: if it is none.
+    """
+    if method not in METHODS:
+        raise InvalidInput("method", repr(method), f"one of {', '.join(METHODS)}")
+
+
+def load_predictor(
+    method: DynamicsMethod, data_dir: Path | None, fields: FieldLibrary, shapes: Mapping[str, ObjectShape]
+) -> Predictor:
+    """A trained network, on the CPU.
+
+    Args:
+        method: whose.
+        data_dir: a network in it comes before the package's.
+        fields: of the objects.
+        shapes: of all objects that occur, by name.
+
+    Raises:
+        CorruptFile: if a file is broken.
+    """
+    if method == "ours":
+        network = read_network(network_path(data_dir))
+        return Predictor(lambda windows: learned(network, shapes, windows), PushModel(network, shapes))
+    published, kappas = read_paper_network(weights_path(data_dir)), longest_axes(fields, shapes)
+    return Predictor(lambda windows: as_published(published, kappas, windows), PaperPushModel(published, kappas))
+
+
+def as_published(network: GraphNetwork, kappas: Mapping[str, float], windows: Windows) -> Predicted:
+    """Predictions of the paper's network, which looks at the poses at the start alone.
+
+    Args:
+        network: on the CPU.
+        kappas: longest axes of all objects in the windows, by name [m].
+        windows: what to predict.
+    """
+    number = torch.tensor([[network.number(name) for name in row] for row in windows.names])
+    kappa = torch.tensor([[kappas[name] for name in row] for row in windows.names])
+    path = pusher_path(windows.pusher[:, 1, :2], windows.actions[..., :2])[:, ::SUBSTEPS]
+    height = np.broadcast_to(windows.pusher[:, 1:2, 2:], (*path.shape[:2], 1))
+    pusher = _tensor(np.concatenate([path, height], axis=-1))
+    start = Scenes(_tensor(windows.positions[:, 1]), _tensor(windows.quaternions[:, 1]), pusher[:, 0])
+    placed: list[np.ndarray] = []
+    turned: list[np.ndarray] = []
+    with torch.inference_mode():
+        for first in range(0, len(number), _CHUNK):
+            rows = slice(first, first + _CHUNK)
+            begin = Scenes(start.position[rows], start.quaternion[rows], start.pusher[rows])
+            actions = _tensor(windows.actions[rows])
+            scenes = list(unroll(network, number[rows], kappa[rows], begin, actions, pusher[rows]))
+            placed.append(torch.stack([s.position for s in scenes], dim=1).numpy())
+            turned.append(torch.stack([s.quaternion for s in scenes], dim=1).numpy())
+    return Predicted(np.concatenate(placed).astype(float), np.concatenate(turned).astype(float))
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
+
+
+# What the evaluation of predicted pushes amounts to.
+
+
+_TOLD = (1, 4, 10, 30)
+_DIGITS = 3
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scored:
+    """One set of episodes, predicted and scored.
+
+    Attributes:
+        windows: what was rolled out.
+        network: what the network predicted.
+        errors: by predictor: network, constant, analytic, and without where a second network was asked.
+    """
+
+    windows: Windows
+    network: Predicted
+    errors: Mapping[str, Errors]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DynamicsReport:
+    """All sets.
+
+    Attributes:
+        by_set: by policy and number of objects, such as "paper 3".
+        unseen: scenes with objects that the second network has not seen.
+        unseen_names: these objects.
+        rollout_steps_per_s: steps of three-object scenes that are predicted in a second.
+        holds_out_pairs: whether there are pairs of objects that never met in the network's training.
+    """
+
+    by_set: Mapping[str, Scored]
+    unseen: Scored | None
+    unseen_names: tuple[str, ...]
+    rollout_steps_per_s: float
+    holds_out_pairs: bool = True
+
+    def of_count(self, objects: int) -> list[Scored]:
+        """Both policies with that many objects."""
+        return [scored for key, scored in self.by_set.items() if key.endswith(f" {objects}")]
+
+
+def report_json(report: DynamicsReport) -> dict[str, Any]:
+    """The report as plain numbers: millimetres and degrees; null for what was not measured."""
+    main = report.of_count(3)
+    result: dict[str, Any] = {"windows": _windows(main, 4)}
+    for horizon in _TOLD:
+        result |= _figures(main, horizon)
+    still = np.concatenate([scored.errors["network"].of_still(LONGEST) for scored in main])
+    result["still_drift_mm_30"] = _rounded(np.mean(still)) if len(still) else None
+    result["still_drift_median_mm_30"] = _median([still])
+    result["still_windows_30"] = len(still)
+    for horizon in _TOLD:
+        result[f"constant_mm_{horizon}"] = _median(_moved(main, "constant", horizon))
+        result[f"analytic_mm_{horizon}"] = _median(_moved(main, "analytic", horizon))
+        result[f"analytic_deg_{horizon}"] = _median(_moved(main, "analytic", horizon, deg=True))
+    result["rollout_steps_per_s"] = round(report.rollout_steps_per_s)
+    result["by_objects"] = {str(count): _row(report.of_count(count)) for count in _counts(report)}
+    result["by_policy"] = {key.split()[0]: _row([s]) for key, s in report.by_set.items() if key.endswith(" 3")}
+    result["by_name"] = _by_name(main)
+    result["unseen_pairs"] = _pairs(list(report.by_set.values()) if report.holds_out_pairs else [])
+    return result | _unseen_figures(report)
+
+
+def _counts(report: DynamicsReport) -> list[int]:
+    return sorted({int(key.split()[1]) for key in report.by_set})
+
+
+def _figures(scored: Sequence[Scored], horizon: int) -> dict[str, Any]:
+    mm, deg = _moved(scored, "network", horizon), _moved(scored, "network", horizon, deg=True)
+    return {
+        f"median_mm_{horizon}": _median(mm),
+        f"median_deg_{horizon}": _median(deg),
+        f"mean_mm_{horizon}": _mean(mm),
+        f"mean_deg_{horizon}": _mean(deg),
+        f"windows_{horizon}": _windows(scored, horizon),
+    }
+
+
+def _row(scored: Sequence[Scored]) -> dict[str, Any]:
+    """The main figures of some sets."""
+    return {
+        "windows": _windows(scored, 4),
+        "median_mm_4": _median(_moved(scored, "network", 4)),
+        "median_deg_4": _median(_moved(scored, "network", 4, deg=True)),
+        "median_mm_10": _median(_moved(scored, "network", 10)),
+        "constant_mm_4": _median(_moved(scored, "constant", 4)),
+        "analytic_mm_4": _median(_moved(scored, "analytic", 4)),
+    }
+
+
+def _moved(scored: Sequence[Scored], who: str, horizon: int, *, deg: bool = False) -> list[Float[np.ndarray, "_"]]:
+    return [s.errors[who].of_moved(horizon, deg=deg) for s in scored]
+
+
+def _windows(scored: Sequence[Scored], horizon: int) -> int:
+    return sum(len(values) for values in _moved(scored, "network", horizon))
+
+
+def _by_name(scored: Sequence[Scored]) -> dict[str, Any]:
+    """Errors after four actions of each object."""
+    names = sorted({name for s in scored for row in s.windows.names for name in row})
+    rows = {}
+    for name in names:
+        mm, deg = (np.concatenate([_at(s, "network", _is(s, (name,)), deg=d) for s in scored]) for d in (False, True))
+        rows[name] = {"windows": len(mm), "median_mm_4": _median([mm]), "median_deg_4": _median([deg])}
+    return rows
+
+
+def _pairs(scored: Sequence[Scored]) -> dict[str, Any]:
+    """Scenes in which two objects meet that never do in training."""
+    masks = [_held_out(s) for s in scored]
+    mm = [_at(s, "network", mask) for s, mask in zip(scored, masks, strict=True)]
+    way = [_at(s, "constant", mask) for s, mask in zip(scored, masks, strict=True)]
+    return {"windows": sum(map(len, mm)), "median_mm_4": _median(mm), "constant_mm_4": _median(way)}
+
+
+def _held_out(scored: Scored) -> Bool[np.ndarray, "W N"]:
+    rows = np.array([has_held_out_pair(names) for names in scored.windows.names])
+    return np.repeat(rows[:, None], len(scored.windows.names[0]), axis=1)
+
+
+def _unseen_figures(report: DynamicsReport) -> dict[str, Any]:
+    """What it costs never to have seen an object: the same windows by both networks."""
+    if report.unseen is None:
+        return {"unseen_objects": [], "unseen_objects_mm_4": None, "unseen_objects_windows": 0,
+                "unseen_objects_deg_4": None, "seen_objects_mm_4": None, "seen_objects_deg_4": None}  # fmt: skip
+    chosen = _is(report.unseen, report.unseen_names)
+    mm = {who: _at(report.unseen, who, chosen) for who in ("without", "network")}
+    deg = {who: _at(report.unseen, who, chosen, deg=True) for who in ("without", "network")}
+    return {
+        "unseen_objects": list(report.unseen_names),
+        "unseen_objects_windows": len(mm["without"]),
+        "unseen_objects_mm_4": _median([mm["without"]]),
+        "unseen_objects_deg_4": _median([deg["without"]]),
+        "seen_objects_mm_4": _median([mm["network"]]),
+        "seen_objects_deg_4": _median([deg["network"]]),
+    }
+
+
+def _is(scored: Scored, names: Sequence[str]) -> Bool[np.ndarray, "W N"]:
+    return np.array([[name in names for name in row] for row in scored.windows.names])
+
+
+def _at(scored: Scored, who: str, chosen: Bool[np.ndarray, "W N"], *, deg: bool = False) -> Float[np.ndarray, "M"]:
+    """Errors after four actions of chosen objects that truly moved."""
+    errors, at = scored.errors[who], HORIZONS.index(4)
+    return (errors.deg if deg else errors.mm)[at][errors.moved[at] & errors.valid[at] & chosen]
+
+
+def _median(parts: Sequence[Float[np.ndarray, "_"]]) -> float | None:
+    values = np.concatenate(parts) if parts else np.zeros(0)
+    return _rounded(np.median(values)) if len(values) else None
+
+
+def _mean(parts: Sequence[Float[np.ndarray, "_"]]) -> float | None:
+    values = np.concatenate(parts) if parts else np.zeros(0)
+    return _rounded(np.mean(values)) if len(values) else None
+
+
+def _rounded(value: float | np.floating) -> float:
+    return round(float(value), _DIGITS)
+
+
+# Pictures of an evaluation of predicted pushes: errors by horizon, and trajectories seen from above.
+
+
+GALLERY_HORIZON = 10  # actions
+_EACH = 6  # windows of a kind
+_CELL_PX, _SHOWN_M = 260, 0.5
+_PAPER, _START, _TRUE, _PREDICTED, _PUSHER = 255, (190, 190, 190), (44, 160, 44), (214, 39, 40), (31, 119, 180)
+
+
+def write_plots(folder: Path, report: DynamicsReport) -> None:
+    """Draw dynamics.png: median errors by horizon, against doing without, and by number of objects.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    main = report.of_count(3)
+    names = {"network": "graph network", "analytic": "quasi-static", "constant": "constant pose"}
+    panels = []
+    for deg, label in ((False, "median position error [mm]"), (True, "median rotation error [deg]")):
+        curves = [_curve(title, main, who, deg=deg) for who, title in names.items()]
+        panels.append(_panel("Objects that moved, 3 in a scene", label, curves))
+    counts = sorted({int(key.split()[1]) for key in report.by_set})
+    curves = [_curve(f"{count} objects", report.of_count(count), "network", deg=False) for count in counts]
+    panels.append(_panel("Graph network", "median position error [mm]", curves))
+    write_charts(folder / "dynamics.png", panels)
+
+
+def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool) -> Curve:
+    values = []
+    for horizon in HORIZONS:
+        errors = np.concatenate([s.errors[who].of_moved(horizon, deg=deg) for s in scored])
+        values.append(np.median(errors) if len(errors) else np.nan)
+    return Curve(name, np.array(HORIZONS, float), np.array(values), dots=True)
+
+
+def _panel(title: str, label: str, curves: Sequence[Curve]) -> Chart:
+    return Chart(title, Axis("actions of 0.2 s", 0, HORIZONS[-1]), Axis(label, 0), curves)
+
+
+def write_gallery(folder: Path, report: DynamicsReport, shapes: Mapping[str, ObjectShape]) -> None:
+    """Draw trajectories.png: the best, the middle and the worst windows of three objects after ten actions.
+
+    Args:
+        folder: of the picture.
+        report: with the network's predictions.
+        shapes: of all objects in it, by name.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    at = HORIZONS.index(GALLERY_HORIZON)
+    ranked = []
+    for scored in report.of_count(3):
+        e = scored.errors["network"]
+        counted = e.moved[at] & e.valid[at]
+        worst = np.where(counted, e.mm[at], -1).max(axis=1)
+        ranked += [(float(worst[w]), scored, int(w)) for w in np.flatnonzero(worst >= 0)]
+    ranked.sort(key=lambda entry: entry[0])
+    middle = max((len(ranked) - _EACH) // 2, 0)
+    rows = [
+        _row_of_pictures(title, chosen, shapes)
+        for title, chosen in (
+            ("Best", ranked[:_EACH]),
+            ("Middle", ranked[middle : middle + _EACH]),
+            ("Worst", ranked[-_EACH:]),
+        )
+    ]
+    write_png(folder / "trajectories.png", np.vstack(rows))
+
+
+def _row_of_pictures(
+    title: str, chosen: Sequence[tuple[float, Scored, int]], shapes: Mapping[str, ObjectShape]
+) -> np.ndarray:
+    cells = [_cell(f"{title}: {mm:.1f} mm", scored, window, shapes) for mm, scored, window in chosen]
+    blank = np.full((_CELL_PX, _CELL_PX, 3), _PAPER, np.uint8)
+    return np.hstack([*cells, *[blank] * (_EACH - len(cells))])
+
+
+def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectShape]) -> UInt8[np.ndarray, "h w 3"]:
+    """One window from above: where things were (grey), came to (green), were predicted to come to (red)."""
+    cell = np.full((_CELL_PX, _CELL_PX, 3), _PAPER, np.uint8)
+    windows, end = scored.windows, GALLERY_HORIZON
+    pusher = windows.pusher[window, 1 : end + 2, :2]
+    ends = windows.positions[window, [1, end + 1], :, :2]
+    farthest = np.linalg.norm(ends[1] - ends[0], axis=-1).argmax()
+    middle = ends[:, farthest].mean(axis=0)
+
+    def pixels(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        flat = (points - middle) / _SHOWN_M * [1, -1] + 0.5
+        return np.round(flat * _CELL_PX).astype(np.int32).reshape(-1, 1, 2)
+
+    for slot, name in enumerate(windows.names[window]):
+        true_p, true_q = windows.positions[window, 1:, slot], windows.quaternions[window, 1:, slot]
+        ours_p, ours_q = scored.network.positions[window, :, slot], scored.network.quaternions[window, :, slot]
+        for p, q, colour in (
+            (true_p[0], true_q[0], _START),
+            (true_p[end], true_q[end], _TRUE),
+            (ours_p[end - 1], ours_q[end - 1], _PREDICTED),
+        ):
+            mask = np.zeros(cell.shape[:2], np.uint8)
+            for part in part_outlines(ShapeTable((shapes[name],)), 0, Pose(p, q)):
+                cv2.fillConvexPoly(mask, pixels(part), 1)
+            edges = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+            cv2.polylines(cell, edges, True, colour, 1, cv2.LINE_AA)
+        cv2.polylines(cell, [pixels(true_p[: end + 1, :2])], False, _TRUE, 1, cv2.LINE_AA)
+        path = np.concatenate([true_p[:1, :2], ours_p[:end, :2]])
+        cv2.polylines(cell, [pixels(path)], False, _PREDICTED, 1, cv2.LINE_AA)
+    cv2.polylines(cell, [pixels(pusher)], False, _PUSHER, 1, cv2.LINE_AA)
+    for place, thickness in ((pusher[0], 1), (pusher[-1], -1)):
+        centre = pixels(place[None])[0, 0]
+        radius = round(PUSHER_RADIUS_M / _SHOWN_M * _CELL_PX)
+        cv2.circle(cell, (int(centre[0]), int(centre[1])), radius, _PUSHER, thickness, cv2.LINE_AA)
+    put_text(cell, title, (6, 16), _CELL_PX - 12)
+    cv2.rectangle(cell, (0, 0), (_CELL_PX - 1, _CELL_PX - 1), _START, 1)
+    return cell
+
+
+REPORT_FILE = "dynamics.json"
+MAX_TASKS = 10_000
+COUNTS = (2, 3, 4, 6)  # objects in a scene
+_STEPS = 50
+_OTHERS = 2  # objects beside unseen ones
+_UNSEEN = "unseen"
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateDynamics:
+    """What to measure.
+
+    Attributes:
+        folder: for episodes, pictures and dynamics.json; those of the paper's method go into its folder "paper".
+        tasks: episodes of each policy with three objects, and of both together with other numbers.
+        seed: of the episodes.
+        names: objects; all that have a field and a mesh if None.
+        data_dir: where a network trained on this machine may be.
+        method: whose predictions.
+    """
+
+    folder: Path
+    tasks: int = 20
+    seed: int = 0
+    names: tuple[str, ...] | None = None
+    data_dir: Path | None = None
+    method: DynamicsMethod = "ours"
+
+    @property
+    def results(self) -> Path:
+        """Folder for pictures and dynamics.json."""
+        return self.folder if self.method == "ours" else self.folder / self.method
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DynamicsEvaluationStep:
+    """How far an evaluation is.
+
+    Attributes:
+        done: parts finished.
+        total: parts in all.
+        note: what is being done.
+        report: with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    report: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Set:
+    """Episodes of one kind."""
+
+    key: str
+    policy: str
+    objects: int
+    episodes: int
+    names: tuple[str, ...]
+
+
+def evaluate_dynamics(
+    config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
+) -> Iterator[DynamicsEvaluationStep]:
+    """Collect, predict and score; pictures and dynamics.json go to `config.results`.
+
+    Args:
+        config: what to measure.
+        fields: shapes come from them.
+        assets: meshes for the simulator.
+        executor: simulates episodes side by side, if given.
+
+    Raises:
+        UnknownName, MissingAssets: if an object lacks a field or a mesh.
+        InvalidInput: if a number is out of range.
+        CorruptFile, CannotWrite: as files are.
+    """
+    names = _checked(config, fields, assets)
+    unseen = _unseen(config, names)
+    sets = _sets(config, names, unseen)
+    total = 2 * len(sets) + 1
+    done = 0
+    for entry in sets:
+        for step in _collect(config, entry, assets, executor):
+            yield DynamicsEvaluationStep(done, total, f"Pushes, {entry.objects} objects: {step}")
+        done += 1
+    shapes = load_shapes(config.data_dir, fields, names)
+    predictor = load_predictor(config.method, config.data_dir, fields, shapes)
+    scored: dict[str, Scored] = {}
+    for entry in sets:
+        yield DynamicsEvaluationStep(done, total, f"Predicting {entry.policy} pushes of {entry.objects} objects")
+        scored[entry.key] = _score(config, entry, shapes, assets, predictor)
+        done += 1
+    yield DynamicsEvaluationStep(done, total, "Timing rollouts")
+    bench_shapes = load_shapes(config.data_dir, fields, BENCH_NAMES)
+    timed = load_predictor(config.method, config.data_dir, fields, bench_shapes).model
+    report = DynamicsReport(
+        by_set={key: value for key, value in scored.items() if key != _UNSEEN},
+        unseen=scored.get(_UNSEEN),
+        unseen_names=unseen,
+        rollout_steps_per_s=rollout_rate(timed, bench_shapes),
+        holds_out_pairs=config.method == "ours",
+    )
+    write_plots(config.results, report)
+    write_gallery(config.results, report, shapes)
+    figures = report_json(report)
+    write_json(config.results / REPORT_FILE, figures)
+    yield DynamicsEvaluationStep(total, total, "Everything is measured", figures)
+
+
+def _checked(config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """The objects; at least as many as the largest scene of three policies needs."""
+    if not 1 <= config.tasks <= MAX_TASKS:
+        raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
+    check_seed(config.seed)
+    check_method(config.method)
+    if config.names is None:
+        names = tuple(name for name in fields.names() if assets.has(name))
+    else:
+        for name in config.names:
+            fields.info(name)
+            if not assets.has(name):
+                raise MissingAssets([name])
+        names = tuple(sorted(set(config.names)))
+    if len(names) < min(COUNTS) + 1:
+        raise InvalidInput("number of objects with a field and a mesh", len(names), f"at least {min(COUNTS) + 1}")
+    return names
+
+
+def _unseen(config: EvaluateDynamics, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Objects that the second shipped network has not seen, as far as they are there; the paper's has no second one."""
+    if config.method != "ours":
+        return ()
+    return tuple(name for name in read_metrics(shipped("pushes_without_two")).get("without", ()) if name in names)
+
+
+def _sets(config: EvaluateDynamics, names: tuple[str, ...], unseen: tuple[str, ...]) -> list[_Set]:
+    sets = []
+    for objects in (count for count in COUNTS if count <= len(names)):
+        share = config.tasks if objects == 3 else -(-config.tasks // 2)
+        sets += [_Set(f"{policy} {objects}", policy, objects, share, names) for policy in ("directed", "paper")]
+    if unseen:
+        others = tuple(name for name in names if name not in unseen)[:: max(len(names) // _OTHERS, 1)][:_OTHERS]
+        sets.append(_Set(_UNSEEN, "directed", 3, config.tasks, tuple(sorted((*unseen, *others)))))
+    return sets
+
+
+def _collect(config: EvaluateDynamics, entry: _Set, assets: AssetLibrary, executor: Executor | None) -> Iterator[str]:
+    path = _path(config, entry)
+    if path.exists():
+        return
+    seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
+    collection = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)  # pyright: ignore[reportArgumentType]
+    for step in collect_pushes(collection, assets, executor):
+        yield step.note
+
+
+def _path(config: EvaluateDynamics, entry: _Set) -> Path:
+    """Where the episodes of a set are kept; the name tells all that they depend on, but for the simulator."""
+    which = hashlib.sha256(" ".join(entry.names).encode()).hexdigest()[:8]
+    return config.folder / f"pushes-{entry.key.replace(' ', '-')}-{entry.episodes}-{config.seed}-{which}.h5"
+
+
+def _score(
+    config: EvaluateDynamics, entry: _Set, shapes: Mapping[str, ObjectShape], assets: AssetLibrary, predictor: Predictor
+) -> Scored:
+    windows = windows_of(read_pushes(_path(config, entry)))
+    symmetries = {name: assets.info(name).symmetry for name in entry.names}
+    predictions = {
+        "network": predictor.predict(windows),
+        "constant": constant(windows),
+        "analytic": analytic(shapes, windows),
+    }
+    if entry.key == _UNSEEN:
+        predictions["without"] = learned(read_network(shipped("pushes_without_two")), shapes, windows)
+    return Scored(
+        windows, predictions["network"], {key: errors(windows, p, symmetries) for key, p in predictions.items()}
+    )

@@ -1,0 +1,294 @@
+"""How far lamps that photographs tell are from true ones, in simulated scenes; poses are estimated from masks alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from osfcore.errors import check_ranges, check_seed
+from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.light import Light, SpotLamp
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import Observation
+from osfcore.io.files import write_json
+from osfcore.io.image_file import to_uint8
+from osfcore.metrics.pose_errors import rotation_error
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.objects.catalogue import CATALOGUE
+from osfcore.photo.lamp import photo_lamp
+from osfcore.photo.photograph import Photograph
+from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, estimate_photo
+from osfcore.random_streams import Stream, stream_rng, stream_seed
+from osfcore.world.imaging import Lamp, TableSurface, wooden_texture
+from osfcore.world.scenes import Conditions, SceneRequest
+from osfcore.world.tabletop import Tabletop
+
+# Simulated photographs of a table under a lamp: near ones with a cone, and distant ones for comparison.
+#
+# Three objects lie on the table; up to four views are taken, exposed such that little is saturated, with a white
+# balance of their own, noise, and eight bits of sRGB. Masks are exact.
+
+
+_OBJECTS = 3
+_SIDE = 320  # of a photograph [px]
+_DISTANCES_M, _ELEVATIONS_DEG = (0.4, 1.5), (20.0, 80.0)
+_AIM_M = 0.05
+_OUTER_DEG, _INNER_SHARE = (20.0, 50.0), (0.5, 0.9)
+_AMBIENT = 0.1, 0.5  # over ambient and diffuse together
+_BRIGHT, _LEVEL = 99.0, (0.6, 0.95)  # percentile that is exposed to this level
+_BALANCE, _NOISE = 0.1, 0.004
+_FEWEST = 100  # pixels of an object; what shows less is not marked
+_SATURATED, _BLACK = 251, 2  # of eight bits
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LampScene:
+    """Photographs of one table, and the truth.
+
+    Attributes:
+        photos: of one scene, on the table.
+        poses: of the objects that are seen, in the world.
+        spot: the lamp; None if it is distant.
+        direction: unit vector from the table's centre toward the lamp.
+    """
+
+    photos: tuple[Photograph, ...]
+    poses: Mapping[str, Pose]
+    spot: SpotLamp | None
+    direction: np.ndarray
+
+
+def lamp_scene(
+    library: AssetLibrary, among: Sequence[str], seed: int, number: int, views: int, *, is_near: bool, is_wooden: bool
+) -> LampScene:
+    """One scene and its photographs.
+
+    Args:
+        library: of meshes.
+        among: which objects there are to choose from.
+        seed: of everything random.
+        number: of the scene.
+        views: 1 to 4.
+        is_near: whether its lamp is near.
+        is_wooden: whether the table has a grain; it has one colour otherwise.
+    """
+    rng = stream_rng(seed, Stream.LAMP_SCENE, number, int(is_near))
+    spot = random_spot(rng)
+    light = spot.distant
+    ambient = rng.uniform(*_AMBIENT)
+    table = TableSurface(texture=wooden_texture(rng)) if is_wooden else TableSurface(tuple(rng.uniform(0.3, 0.8, 3)))
+    conditions = Conditions(lamp=Lamp(ambient, 1 - ambient), table=table, spot=spot if is_near else None)
+    request = SceneRequest(count=_OBJECTS, light=Light(light.position), among=tuple(among))
+    cameras = default_cameras(_SIDE)
+    first = int(rng.integers(len(cameras)))
+    chosen = tuple(cameras[(first + k) % len(cameras)] for k in range(views))
+    world = Tabletop(library, cameras=chosen, request=request, conditions=conditions)
+    try:
+        world.arrange(stream_seed(seed, Stream.LAMP_SCENE, number, int(is_near)))
+        observed, truth = world.render(chosen, masks=True, with_pusher=False), world.truth()
+    finally:
+        world.close()
+    photos = tuple(_taken(observed, k, rng) for k in range(views))
+    poses = {name: truth.pose(name) for name in truth.names if any(name in photo.masks for photo in photos)}
+    return LampScene(photos, poses, spot if is_near else None, light.direction)
+
+
+def random_spot(rng: np.random.Generator) -> SpotLamp:
+    """A near lamp that looks at the table, about its centre."""
+    distance = float(np.exp(rng.uniform(*np.log(_DISTANCES_M))))
+    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(*_ELEVATIONS_DEG))
+    aim = np.array([*rng.uniform(-_AIM_M, _AIM_M, 2), 0.0])
+    outer = rng.uniform(*_OUTER_DEG)
+    place = distance * Light.from_angles(azimuth, elevation).direction
+    return SpotLamp(place, aim, outer * rng.uniform(*_INNER_SHARE), outer)
+
+
+def _taken(observed: Observation, view: int, rng: np.random.Generator) -> Photograph:
+    """A view as a camera stores it."""
+    assert observed.masks is not None
+    image, camera = observed.images[view], observed.cameras[view]
+    gain = rng.uniform(*_LEVEL) / np.percentile(image, _BRIGHT) * np.exp(rng.normal(0, _BALANCE, 3))
+    noisy = gain * image + rng.normal(0, _NOISE, image.shape)
+    stored = to_uint8(srgb_of_linear(np.clip(noisy, 0, 1)))
+    linear = linear_from_encoded(stored / 255.0, "srgb").astype(np.float32)
+    exposed = np.all(stored < _SATURATED, axis=-1) & np.any(stored > _BLACK, axis=-1)
+    shown = {name: observed.masks[view, k] for k, name in enumerate(observed.names)}
+    masks = {name: mask for name, mask in shown.items() if mask.sum() >= _FEWEST}
+    return Photograph(linear, exposed, camera.intrinsics, camera.T_world_camera, True, masks)
+
+
+_RIGHT_DEG, _RIGHT_PERCENT = 5.0, 15.0
+_CLOSE_M, _CLOSE_DEG = 0.015, 10.0
+_FAR_EVERY = 4  # near lamps there is a distant one
+_MOST_TASKS = 1000
+_MOST_VIEWS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateLamps:
+    """What to measure.
+
+    Attributes:
+        folder: for report.json.
+        tasks: scenes with a near lamp; a fourth as many, rounded up, have a distant one. Every other table is of wood.
+        views: photographs of each scene.
+        seed: of everything random.
+    """
+
+    folder: Path
+    tasks: int = 20
+    views: int = 1
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LampScore:
+    """One scene.
+
+    Attributes:
+        number: of the scene.
+        is_near: whether its lamp is near.
+        is_wooden: whether its table has a grain.
+        direction_deg: error of the direction, seen from the table's centre.
+        std_deg: that was told of it.
+        true_m: distance from there; None for a distant lamp.
+        distance_m: that was found; None if it was said to be unknown.
+        is_diffuse: the light was called diffuse.
+        poses: objects that were found.
+        right_poses: of them, those within 15 mm and 10 deg, symmetries counted.
+        seconds: that the lamp took.
+    """
+
+    number: int
+    is_near: bool
+    is_wooden: bool
+    direction_deg: float
+    std_deg: float
+    true_m: float | None
+    distance_m: float | None
+    is_diffuse: bool
+    poses: int
+    right_poses: int
+    seconds: float
+
+    @property
+    def distance_percent(self) -> float | None:
+        """Error of the distance, of the true one; None where either is unknown."""
+        if self.true_m is None or self.distance_m is None:
+            return None
+        return 100 * abs(self.distance_m / self.true_m - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class LampReport:
+    """All figures; None where nothing tells.
+
+    Attributes:
+        scores: of each scene.
+    """
+
+    scores: tuple[LampScore, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Figures by name, and the scores that they come from."""
+        near, far = ([s for s in self.scores if s.is_near is is_near] for is_near in (True, False))
+        angles = [s.direction_deg for s in near]
+        known = [p for s in near if (p := s.distance_percent) is not None]
+        return {
+            "lamp_tasks": len(near),
+            **_figures("lamp_direction_deg", angles),
+            **_figures("lamp_distance_percent", known),
+            "lamp_undetermined": sum(s.distance_m is None for s in near),
+            "lamp_diffuse": sum(s.is_diffuse for s in near),
+            "lamp_within_5deg": _mean([a <= _RIGHT_DEG for a in angles]),
+            "lamp_within_15percent": _mean([p <= _RIGHT_PERCENT for p in known]),
+            "distant_tasks": len(far),
+            **_figures("distant_direction_deg", [s.direction_deg for s in far]),
+            "distant_undetermined": sum(s.distance_m is None for s in far),
+            "poses_total": sum(s.poses for s in self.scores),
+            "poses_15mm_10deg": sum(s.right_poses for s in self.scores) / max(sum(s.poses for s in self.scores), 1),
+            "lamp_s_median": float(np.median([s.seconds for s in self.scores])) if self.scores else None,
+            "scores": [asdict(s) for s in self.scores],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class LampsStep:
+    """How far an evaluation is; the last step brings the report."""
+
+    done: int
+    total: int
+    note: str
+    report: LampReport | None = None
+
+
+def evaluate_lamps(config: EvaluateLamps, library: AssetLibrary, fields: FieldLibrary) -> Iterator[LampsStep]:
+    """Estimate the lamps of random scenes; report.json goes to `config.folder`.
+
+    Args:
+        config: what to measure.
+        library: of the objects' meshes.
+        fields: of the objects; those without one are left out.
+
+    Raises:
+        InvalidInput: if a number is out of range, or fewer than three objects have a field and a mesh.
+        CannotWrite: if the report cannot be written.
+    """
+    check_seed(config.seed)
+    check_ranges(("scenes", config.tasks, 1, _MOST_TASKS), ("photographs of each scene", config.views, 1, _MOST_VIEWS))
+    names = sorted(set(fields.names()) & set(library.names()))
+    models = PhotoModels({name: fields.load(name) for name in names})
+    cases = [(True, k) for k in range(config.tasks)] + [(False, k) for k in range(-(-config.tasks // _FAR_EVERY))]
+    scores: list[LampScore] = []
+    for done, (is_near, number) in enumerate(cases):
+        yield LampsStep(done, len(cases), f"A {'near' if is_near else 'distant'} lamp")
+        wooden = bool(number % 2)
+        scene = lamp_scene(library, names, config.seed, number, config.views, is_near=is_near, is_wooden=wooden)
+        rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, number, int(is_near))
+        scores.append(_score(models, scene, number, rng, is_wooden=wooden))
+    report = LampReport(tuple(scores))
+    write_json(config.folder / "report.json", report.to_json())
+    yield LampsStep(len(cases), len(cases), "Everything is measured", report)
+
+
+def _score(
+    models: PhotoModels, scene: LampScene, number: int, rng: np.random.Generator, *, is_wooden: bool
+) -> LampScore:
+    *_, last = estimate_photo(models, scene.photos, tuple(scene.poses), rng)
+    surfels = [models.surfels(name, FINE_ACROSS) for name in scene.poses]
+    start = time.perf_counter()
+    found = photo_lamp(scene.photos, last.found, surfels)
+    seconds = time.perf_counter() - start
+    angle = float(np.rad2deg(np.arccos(np.clip(found.direction @ scene.direction, -1, 1))))
+    true_m = None if scene.spot is None else scene.spot.distance
+    distance_m = found.distance if found.distance_known else None
+    std_deg = float(np.rad2deg(found.std))
+    is_near, right = scene.spot is not None, sum(_is_right(one, scene.poses[one.name]) for one in last.found)
+    return LampScore(number, is_near, is_wooden, angle, std_deg, true_m, distance_m, found.is_diffuse,
+                     len(last.found), right, seconds)  # fmt: skip
+
+
+def _is_right(found: PhotoObject, truth: Pose) -> bool:
+    pose = found.best.pose
+    turn_rad = float(rotation_error(CATALOGUE[found.name].symmetry, pose.quaternion, truth.quaternion))
+    return bool(np.linalg.norm(pose.position - truth.position) <= _CLOSE_M and np.rad2deg(turn_rad) <= _CLOSE_DEG)
+
+
+def _figures(name: str, values: Sequence[float]) -> dict[str, float | None]:
+    """Mean, median, 90th percentile and the largest."""
+    if not values:
+        return {f"{name}_{what}": None for what in ("mean", "median", "p90", "max")}
+    mean, median, p90 = np.mean(values), np.median(values), np.quantile(values, 0.9)
+    return {f"{name}_mean": float(mean), f"{name}_median": float(median), f"{name}_p90": float(p90),
+            f"{name}_max": float(max(values))}  # fmt: skip
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -1,1 +1,0 @@
-"""Evaluation of photographs, real ones and synthetic views of the calibration board."""

@@ -1,0 +1,507 @@
+"""How well tables become what a goal image shows (paper, section 5.4 and figure 7).
+
+The loop sees four cameras, masks in the first frame, and the goal image; it has 30 actions, or as many as are asked
+for. The same tasks are given to the same planner with true poses, whose best of several tries counts (an oracle: an
+upper bound), and to nobody. A goal that is refused counts as a failure, for nothing is moved then; beside it stands
+what happens if the doubt is overruled. Results of finished tasks are kept in the output folder: a killed evaluation
+goes on where it was. Methods other than ours refuse no goal.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from osfcore.control.estimators import SceneModels, load_scene_models
+from osfcore.control.events import (
+    ActionExecuted,
+    CostKind,
+    EpisodeSettings,
+    Event,
+    Finished,
+    GoalFound,
+    Noticed,
+    Stepped,
+)
+from osfcore.dynamics.graph import read_network
+from osfcore.dynamics.rollout import PushModel, network_path, shipped
+from osfcore.errors import InvalidInput, MissingAssets, check_ranges, check_seed
+from osfcore.experiments.dynamics_scores import MOVED_DEG, MOVED_MM
+from osfcore.experiments.factors import UNSEEN_NETWORK, Factor, factor_named
+from osfcore.experiments.harness import (
+    EvaluationStep,
+    Piece,
+    TaskCache,
+    TaskResult,
+    file_sha256,
+    finished,
+    table_sha256,
+)
+from osfcore.experiments.images import field_path, known_names
+from osfcore.experiments.rearrangement_report import MpcReport, write_pictures
+from osfcore.experiments.rearrangement_runs import (
+    Ended,
+    TrueState,
+    Variant,
+    check_variant,
+    loop_parts,
+    run_from_images,
+    run_told_the_truth,
+)
+from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
+from osfcore.experiments.rivals.visual_foresight import Foreseen, ForesightSettings, run_visual_foresight
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import STEP_S
+from osfcore.inspection.contact_sheet import Comparison
+from osfcore.io.files import write_json
+from osfcore.io.image_file import to_uint8
+from osfcore.metrics.pose_errors import rotation_error
+from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
+from osfcore.objects.asset import Symmetry
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.dynamics import weights_path
+from osfcore.paper.mppi import GaussianPlanSettings
+from osfcore.planning.mppi import PlanSettings
+from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.tasks import DrawnTask, Family, TaskSet, check_tasks, draw_task
+
+# How well the pushes are predicted that the planner itself makes, from estimated poses.
+#
+# Open-loop evaluations start from true poses and take pushes of a random pusher; a planner sees neither.
+
+
+AHEAD = 4  # actions
+
+
+@dataclass(slots=True)
+class Course:
+    """An episode as it went: grows while it runs.
+
+    Attributes:
+        actions: by their number, from 1 [m/s].
+        estimated: states by the number of actions before them.
+        true: likewise.
+    """
+
+    actions: dict[int, Float[np.ndarray, "3"]] = field(default_factory=dict)
+    estimated: dict[int, SceneState] = field(default_factory=dict)
+    true: dict[int, SceneState] = field(default_factory=dict)
+
+
+def prediction_errors(course: Course, models: SceneModels) -> dict[str, list[float]]:
+    """Errors four actions ahead of all objects that truly moved by over 1 cm or 5 deg meanwhile.
+
+    Args:
+        course: of the episode.
+        models: of its objects.
+
+    Returns:
+        "mm" and "deg", symmetries considered, one entry for each object and start.
+    """
+    told: dict[str, list[float]] = {"mm": [], "deg": []}
+    for start, state in sorted(course.estimated.items()):
+        numbers = range(start + 1, start + AHEAD + 1)
+        if start + AHEAD not in course.true or any(number not in course.actions for number in numbers):
+            continue
+        actions = np.array([course.actions[number] for number in numbers])
+        rollouts = models.dynamics.rollout(state, actions[None], course.estimated.get(start - 1))
+        before, after = course.true[start], course.true[start + AHEAD]
+        for n, name in enumerate(rollouts.names):
+            way = _apart(models.symmetries, name, before.pose(name), after.pose(name))
+            if way[0] > MOVED_MM or way[1] > MOVED_DEG:
+                predicted = Pose(rollouts.positions[0, AHEAD, n], rollouts.quaternions[0, AHEAD, n])
+                mm, deg = _apart(models.symmetries, name, predicted, after.pose(name))
+                told["mm"].append(round(mm, 3))
+                told["deg"].append(round(deg, 3))
+    return told
+
+
+def _apart(symmetries: Mapping[str, Symmetry], name: str, one: Pose, other: Pose) -> tuple[float, float]:
+    """Distance [mm] and angle [deg] between two poses of an object."""
+    mm = 1000 * float(np.linalg.norm(one.position - other.position))
+    return mm, float(np.rad2deg(rotation_error(symmetries[name], one.quaternion, other.quaternion)))
+
+
+# Single episodes, measured: those of methods that see images, and of the planner that is told the truth.
+
+
+_NO_ERRORS: Mapping[str, list[float]] = MappingProxyType({"mm": [], "deg": []})  # of who predicts no poses
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MeasuredEpisodes:
+    """Runs single tasks; can be sent to other processes.
+
+    Attributes:
+        tasks: which.
+        fields: of their objects.
+        assets: meshes for the simulator.
+        data_dir: where networks trained on this machine are.
+        factor: name of what differs from the usual world; "" for nothing.
+        variant: whose episodes.
+    """
+
+    tasks: TaskSet
+    fields: FieldLibrary
+    assets: AssetLibrary
+    data_dir: Path
+    factor: str = ""
+    variant: Variant = field(default_factory=Variant)
+
+    def from_images(
+        self, number: int, settings: EpisodeSettings, published: GaussianPlanSettings | None = None
+    ) -> TaskResult:
+        """A task for a method that sees images alone; doubts about its goal are noted and overruled."""
+        drawn = self._drawn(number)
+        models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
+        if self._factor().has_unseen_objects:
+            models = replace(models, dynamics=PushModel(read_network(shipped(UNSEEN_NETWORK)), models.shapes))
+        parts = loop_parts(self.variant, models, drawn.task, self.fields, self.data_dir)
+        settings, rng = replace(settings, despite_doubts=True), stream_rng(self.tasks.seed, Stream.EPISODE, number)
+        log = _Log(drawn.task, models.symmetries)
+        given = drawn.task, self.assets, parts, settings, rng, self._factor(), self.variant, published
+        ended = log.follow(run_from_images(*given))
+        return self._scored(drawn, ended, {**log.summary(), "predicted": prediction_errors(log.course, parts.models)})
+
+    def by_foresight(self, number: int, settings: ForesightSettings, actions: int) -> TaskResult:
+        """A task for visual foresight, which pushes until all actions are done."""
+        drawn = self._drawn(number)
+        rng = stream_rng(self.tasks.seed, Stream.EPISODE, number)
+        log, predictor = _Log(drawn.task, {}), read_fitvid(fitvid_path(self.data_dir), torch.bfloat16)
+        given = drawn.task, self.assets, predictor, settings, actions, rng, self._factor(), predictor.settings.side
+        ended = log.follow(run_visual_foresight(*given))
+        return self._scored(drawn, ended, {**log.summary(), "predicted": dict(_NO_ERRORS)})
+
+    def oracle(self, number: int, settings: EpisodeSettings, tries: int) -> TaskResult:
+        """The best of several tries of the planner at a task with true poses; the simulator can be set back.
+
+        They end with the first that succeeds. The last has the simulator as its dynamics, which takes far longer than
+        the learned model, and plans before every second action.
+        """
+        drawn = self._drawn(number)
+        models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
+        slow = replace(settings, replan_every=2, plan=replace(settings.plan, begins_m=0.0))
+        ends: list[tuple[RearrangementScore, Ended]] = []
+        for count in range(1, tries + 1):
+            rng, is_last = stream_rng(self.tasks.seed, Stream.ORACLE, number, count), count == tries
+            given = drawn.task, self.assets, models, slow if is_last else settings, rng
+            end = run_told_the_truth(*given, knows_pushes=is_last)
+            ends.append((self._score(drawn.task, end.state), end))
+            if ends[-1][0].is_tight():
+                break
+        _, best = max(ends, key=lambda tried: _quality(tried[0]))
+        return self._scored(drawn, best, {"tries": len(ends)})
+
+    def _drawn(self, number: int) -> DrawnTask:
+        drawn = draw_task(self.assets, self.tasks, number)
+        task = self._factor().task(drawn.task, stream_rng(self.tasks.seed, Stream.FACTOR_LIGHT, number))
+        return replace(drawn, task=task)
+
+    def _factor(self) -> Factor:
+        return factor_named(self.factor) if self.factor else Factor()
+
+    def _scored(self, drawn: DrawnTask, ended: Ended, figures: dict[str, Any]) -> TaskResult:
+        task = drawn.task
+        score, nothing = (self._score(task, state) for state in (ended.state, task.start))
+        told = {"score": score.to_json(), "noaction": nothing.to_json(), "rejected": dict(drawn.rejected), **figures}
+        label = f"{task.number}: {score.moved_mm:.0f} mm"
+        return TaskResult(told, (Comparison(label, to_uint8(ended.goal), to_uint8(ended.image)),))
+
+    def _score(self, task: RearrangementTask, state: SceneState) -> RearrangementScore:
+        return score_of(task, state, {name: self.assets.info(name).symmetry for name in task.start.names})
+
+
+def _quality(score: RearrangementScore) -> tuple[bool, bool, float]:
+    """What makes one end better than another."""
+    return score.is_tight(), score.is_success(), -score.pose6d_symmetric
+
+
+class _Log:
+    """What is kept of a task's events."""
+
+    def __init__(self, task: RearrangementTask, symmetries: Mapping[str, Symmetry]) -> None:
+        self._task, self._symmetries = task, symmetries
+        unknown = dict.fromkeys(("goal_mm", "first_mm", "first_deg", "light_deg"))
+        self.figures: dict[str, Any] = {"goal_doubt": "", "noticed": [], **unknown}
+        self._seconds: dict[str, list[float]] = {}
+        self.course = Course()
+        self._truth: SceneState | None = None
+
+    def follow(self, events: Iterator[Event | TrueState | Foreseen | Ended]) -> Ended:
+        """Take note of all events of an episode; how it ended is the last of them."""
+        began, ended = time.perf_counter(), None
+        for event in events:
+            if isinstance(event, Ended):
+                ended = event
+            else:
+                self.take(event)
+        assert ended is not None, "the last event tells how it ended"
+        self.figures["episode_s"] = round(time.perf_counter() - began, 2)
+        return ended
+
+    def take(self, event: Event | TrueState | Foreseen) -> None:
+        """Take note of an event."""
+        match event:
+            case GoalFound():
+                if event.estimate is not None:
+                    self.figures["goal_doubt"] = event.estimate.reason
+                    offsets = event.goal.offsets_m(self._task.goal)
+                    self.figures["goal_mm"] = 1000 * float(np.linalg.norm(offsets, axis=1).max())
+            case Noticed():
+                self.figures["noticed"].append([event.number, event.matter, event.text])
+            case TrueState():
+                self._truth = event.state
+            case ActionExecuted():
+                self.course.actions[event.number] = event.action
+            case Stepped():
+                self.course.estimated[event.number] = event.estimate.state
+                if self._truth is not None:
+                    self.course.true[event.number] = self._truth
+                if event.number == 0:
+                    self.figures |= self._first_errors(event.estimate.state)
+                for stage, seconds in event.seconds.items():
+                    self._seconds.setdefault(stage, []).append(seconds)
+            case Foreseen():
+                self._seconds.setdefault("plan", []).append(event.plan.seconds)
+                self._note_end("out of steps", event.number + 1)
+            case Finished():
+                self._note_end(event.outcome, event.number)
+            case _:
+                pass
+
+    def _note_end(self, outcome: str, steps: int) -> None:
+        self.figures |= {"outcome": outcome, "steps": steps, "robot_s": round(STEP_S * steps, 3)}
+
+    def _first_errors(self, state: SceneState) -> dict[str, float]:
+        """Of the first estimate: means over all objects [mm, deg], and the angle of the light [deg]."""
+        start = self._task.start
+        score = score_of(replace(self._task, goal=start), state, self._symmetries)
+        return {
+            "first_mm": float(np.mean([one.mm for one in score.objects])),
+            "first_deg": float(np.mean([one.deg for one in score.objects])),
+            "light_deg": float(np.rad2deg(state.light.angle_to(start.light))),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """All figures."""
+        seconds = {}
+        for stage in ("first", "goal", "estimate", "plan"):
+            told = self._seconds.get(stage)
+            seconds[f"{stage}_s"] = round(float(np.median(told)), 3) if told else None
+        return {**self.figures, **seconds}
+
+
+REPORT_FILE = "mpc.json"
+MAX_TASKS = 10_000
+MAX_TRIES = 1000
+ORACLE_PLAN = PlanSettings(samples=192)
+_ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
+
+VERSION = 1  # raised by hand when figures may change
+
+Plan = PlanSettings | GaussianPlanSettings | ForesightSettings
+_Work = Callable[[int], TaskResult]
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateMpc:
+    """What to measure.
+
+    Attributes:
+        folder: for results, pictures and mpc.json.
+        data_dir: where objects, and fields and networks trained on this machine, are.
+        tasks: how many.
+        objects: in each scene.
+        seed: of the tasks.
+        family: what goals ask for.
+        actions: that an episode may have.
+        variant: whose episodes, and through how many cameras.
+        factor: name of what differs from the usual world; "" for nothing.
+        cost: what futures are compared by.
+        names: objects to draw from; all that have a field and a mesh if None.
+        oracle: also run the planner that is told the truth.
+        oracle_tries: that it has at each task.
+        settings: of the episodes but for their cost and number of actions.
+        oracle_plan: how the oracle plans.
+        published: how planning as published samples.
+        foresight: how visual foresight plans.
+    """
+
+    folder: Path
+    data_dir: Path
+    tasks: int = 20
+    objects: int = 3
+    seed: int = 0
+    family: Family = "shifted"
+    actions: int = 30
+    variant: Variant = field(default_factory=Variant)
+    factor: str = ""
+    cost: CostKind = "pose"
+    names: tuple[str, ...] | None = None
+    oracle: bool = True
+    oracle_tries: int = 8
+    settings: EpisodeSettings = field(default_factory=EpisodeSettings)
+    oracle_plan: PlanSettings = ORACLE_PLAN
+    published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
+    foresight: ForesightSettings = field(default_factory=ForesightSettings)
+
+    @property
+    def plan(self) -> Plan:
+        """How the method plans."""
+        if self.variant.method == "foresight":
+            return self.foresight
+        return self.published if self.variant.published("planning") else self.settings.plan
+
+
+def evaluate_mpc(
+    config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
+) -> Iterator[EvaluationStep]:
+    """Run all tasks; pictures and mpc.json go to `config.folder`.
+
+    Args:
+        config: what to measure.
+        fields: of the objects.
+        assets: meshes for the simulator.
+        executor: runs tasks side by side, if given; then their times are those of a busy machine.
+
+    Raises:
+        UnknownName, MissingAssets: if an object lacks a field or a mesh, or no factor is called so.
+        InvalidInput: if a number is out of range.
+        NoRoom: if there is no room for a task's objects.
+        WorkerDied: if a worker process ended.
+        CorruptFile, CannotWrite: as files are.
+    """
+    config = replace(config, names=_checked(config, fields, assets))
+    pieces = episode_pieces(config, fields, assets)
+    results = yield from finished(pieces, executor, "episodes")
+    report = episodes_report(config, results)
+    write_pictures(config.folder, report)
+    figures = figures_of(config, report)
+    write_json(config.folder / REPORT_FILE, figures)
+    yield EvaluationStep(len(pieces), len(pieces), "Everything is measured", figures)
+
+
+def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcReport:
+    """What the results of `episode_pieces` tell, in their order."""
+    is_ours = config.variant.method == "ours"
+    return MpcReport(tuple(results[: config.tasks]), tuple(results[config.tasks :]), may_refuse=is_ours)
+
+
+def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
+    """The figures of a report with what was measured, as plain JSON."""
+    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor")}
+    variant = config.variant
+    about["cost"] = "image" if variant.method == "foresight" or variant.published("planning") else config.cost
+    about |= {"names": list(config.names or ()), "samples": config.plan.samples, "horizon": config.plan.horizon}
+    about |= {"method": variant.method, "views": variant.views, "masks": variant.has_masks}
+    about |= {"ours": sorted(variant.replaced), "truths": sorted(variant.truths)}
+    return {**report.to_json(), **about}
+
+
+def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    check_ranges(
+        ("number of tasks", config.tasks, 1, MAX_TASKS),
+        ("number of the oracle's tries", config.oracle_tries, 1, MAX_TRIES),
+    )
+    check_variant(config.variant)
+    if config.factor and factor_named(config.factor).has_unseen_objects and config.variant.published("dynamics"):
+        allowed = "left out with the paper's dynamics: they are of objects that have a name"
+        raise InvalidInput("factor of variation", config.factor, allowed)
+    check_seed(config.seed)
+    if config.names is None:
+        known = known_names(config.variant.fields, fields, config.data_dir)
+        names = tuple(name for name in known if fields.has(name) and assets.has(name))
+    else:
+        names = tuple(dict.fromkeys(config.names))
+        for name in names:
+            fields.info(name)
+            if not assets.has(name):
+                raise MissingAssets([name])
+            field_path(config.variant.fields, name, fields, config.data_dir)
+    check_tasks(_tasks(replace(config, names=names)))
+    return names
+
+
+def _tasks(config: EvaluateMpc) -> TaskSet:
+    return TaskSet(config.names or (), config.family, config.objects, config.seed)
+
+
+def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
+    """The method's episodes, then the oracle's, after everything asked for was found possible.
+
+    Args:
+        config: what to measure.
+        fields: of the objects.
+        assets: meshes for the simulator.
+
+    Raises:
+        UnknownName, MissingAssets, InvalidInput, NoRoom: as `evaluate_mpc` does.
+    """
+    config = replace(config, names=_checked(config, fields, assets))
+    settings = replace(config.settings, cost=config.cost, steps=config.actions, renewed=False)
+    told_truth = replace(
+        config.settings, steps=config.actions, plan=config.oracle_plan, reached_rad=_ORACLE_REACHED_RAD, renewed=False
+    )
+    episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
+    given, own = _circumstances(config, fields, assets)
+    folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
+    usual = type(config.plan)()
+    parts = (config.variant.name(), config.cost, _plan_name(config.plan, usual), config.factor)
+    method = "-".join(part for part in parts if part)
+    kinds: list[tuple[str, dict[str, Any], _Work]]
+    if config.variant.method == "foresight":
+        work: _Work = partial(episodes.by_foresight, settings=config.foresight, actions=settings.steps)
+    else:
+        work = partial(episodes.from_images, settings=settings, published=config.published)
+    kinds = [(method, {**own, "settings": asdict(settings), "plan": asdict(config.plan)}, work)]
+    if config.oracle:
+        told = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN)) if part)
+        tries = config.oracle_tries
+        work = partial(episodes.oracle, settings=told_truth, tries=tries)
+        kinds.append((told, {"settings": asdict(told_truth), "tries": tries}, work))
+    return [
+        Piece(f"{n:04d}", TaskCache(folder / kind), {**given, **circumstances}, partial(work, n))
+        for kind, circumstances, work in kinds
+        for n in range(config.tasks)
+    ]
+
+
+def _plan_name(plan: Plan, usual: Plan) -> str:
+    """What tells results of unusual plans from others."""
+    return "" if plan == usual else f"K{plan.samples}T{plan.horizon}"
+
+
+def _circumstances(
+    config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What all results depend on, and what those of the method do besides."""
+    names = config.names or ()
+    given = {
+        "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in names},
+        "network": file_sha256(network_path(config.data_dir)),
+        "table": table_sha256(fields.load_table()),
+        "version": VERSION,
+    }
+    own: dict[str, Any] = {}
+    if config.variant.fields != "ours":
+        paths = [field_path(config.variant.fields, name, fields, config.data_dir) for name in names]
+        own["own_fields"] = [file_sha256(path) for path in paths]
+    if config.variant.published("dynamics"):
+        own["own_network"] = file_sha256(weights_path(config.data_dir))
+    if config.variant.method == "foresight":
+        own["own_network"] = file_sha256(fitvid_path(config.data_dir))
+    if config.factor and factor_named(config.factor).has_unseen_objects:
+        own["own_network"] = file_sha256(shipped(UNSEEN_NETWORK))
+    return given, own

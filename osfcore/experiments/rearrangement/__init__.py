@@ -1,1 +1,0 @@
-"""Evaluation of rearrangement from goal images (paper, section 5.4)."""

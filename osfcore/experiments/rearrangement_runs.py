@@ -1,0 +1,386 @@
+"""One task of planning, done: by us from images, and by the same planner that is told the truth."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from osfcore.control.closed_loop import Episode, offsets
+from osfcore.control.estimators import EpisodeParts, Estimators, SceneModels
+from osfcore.control.events import EpisodeSettings, Event, Stepped
+from osfcore.control.goal import GoalImage, nearest_symmetric_goal
+from osfcore.errors import InvalidInput
+from osfcore.estimation.objective import ObjectModels
+from osfcore.estimation.steps import EstimateStep
+from osfcore.experiments.factors import Factor, VariedWorld
+from osfcore.experiments.rivals.nerf import with_nerfs
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import default_cameras, goal_camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
+from osfcore.metrics.success import RearrangementTask
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
+from osfcore.paper.mppi import GaussianPlanSettings
+from osfcore.paper.stages import STAGES, PaperEstimators, StageName, with_paper_stages
+from osfcore.planning.costs import PoseCost, PoseGoal
+from osfcore.planning.mppi import MPPIPlanner, Rollout
+from osfcore.planning.pushes import PushProposals
+from osfcore.progress import Progress
+from osfcore.world.simulated_dynamics import SimulatedPushes
+from osfcore.world.tabletop import Tabletop
+
+# Whose episodes are measured.
+#
+# Methods:
+#     ours         the loop as it ships.
+#     overhead     the same, but it takes the light to be overhead: what estimating the light is worth.
+#     known_light  the same, told the true lights of scene and goal image: what knowing them would be worth.
+#     nerf         the same with fields that know of no light (compositional NeRFs).
+#     paper        the method as published; each of its stages can be replaced by ours.
+#     foresight    visual foresight with FitVid: neither objects nor poses nor light.
+#
+# Stages of ours can be replaced by the truth, to find what each costs:
+#     poses     true poses and light at each look.
+#     goal      the goal's true poses.
+#     dynamics  the simulator.
+
+
+Method = Literal["ours", "overhead", "known_light", "nerf", "paper", "foresight"]
+METHODS: tuple[Method, ...] = get_args(Method)
+TruthName = Literal["poses", "goal", "dynamics"]
+TRUTHS: tuple[TruthName, ...] = get_args(TruthName)
+_SURE = 1e-3  # claimed deviation of a true pose [m or rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """What is measured of a method, and what it sees.
+
+    Attributes:
+        method: whose episodes.
+        replaced: stages of the paper's method that are ours.
+        truths: stages of ours that are replaced by the truth.
+        views: cameras that it looks through.
+        has_masks: whether the paper's method gets masks at every step, as in the paper's evaluation.
+    """
+
+    method: Method = "ours"
+    replaced: frozenset[StageName] = frozenset()
+    truths: frozenset[TruthName] = frozenset()
+    views: int = 4
+    has_masks: bool = False
+
+    @property
+    def fields(self) -> str:
+        """Whose fields it has: one of `image_methods.FIELD_METHODS`."""
+        return "paper" if self.published("fields") else "nerf" if self.method == "nerf" else "ours"
+
+    def published(self, stage: StageName) -> bool:
+        """Whether a stage is the paper's."""
+        return self.method == "paper" and stage not in self.replaced
+
+    def name(self) -> str:
+        """Of its files: the method, then what differs from it."""
+        views = f"{self.views}views" if self.views != Variant().views else ""
+        true = (f"true_{truth}" for truth in sorted(self.truths))
+        masks = "masks" if self.has_masks else ""
+        return "-".join(part for part in (self.method, *sorted(self.replaced), *true, views, masks) if part)
+
+
+@dataclass(frozen=True, slots=True)
+class LoopParts:
+    """What a closed loop is made of.
+
+    Attributes:
+        models: of the objects.
+        estimators: how everything is estimated.
+    """
+
+    models: SceneModels
+    estimators: Estimators
+
+
+@dataclass(frozen=True)
+class TrueEstimators(Estimators):
+    """Estimators that are told the truth of the scene, but not of the goal.
+
+    Attributes:
+        truth: tells the true state.
+    """
+
+    truth: Callable[[], SceneState] = field(kw_only=True)
+
+    def first_frame(
+        self, models: ObjectModels, observation: Observation, rng: np.random.Generator
+    ) -> Iterator[EstimateStep]:
+        """The truth."""
+        yield _true_step(self.truth())
+
+    def later_frame(
+        self,
+        models: ObjectModels,
+        observation: Observation,
+        expected: SceneState,
+        rng: np.random.Generator,
+        usual: Float[np.ndarray, "N"] | None = None,
+    ) -> Iterator[EstimateStep]:
+        """The truth."""
+        yield _true_step(self.truth())
+
+
+def _true_step(state: SceneState) -> EstimateStep:
+    sure = np.full(len(state.names), _SURE)
+    estimate = EstimatedState(state, sure, sure, _SURE, ("",) * len(sure), "")
+    return EstimateStep(Progress(1, 1, "Told the truth"), "done", state, estimate=estimate)
+
+
+class SimulatedModel(SimulatedPushes):
+    """The simulator as a `DynamicsModel`.
+
+    Args:
+        assets: meshes.
+        names: of the scene's objects.
+    """
+
+    device = torch.device("cpu")
+
+    def __init__(self, assets: AssetLibrary, names: tuple[str, ...]) -> None:
+        super().__init__({name: assets.load(name) for name in names})
+        self.names = names
+
+
+def check_variant(variant: Variant) -> None:
+    """Refuse what cannot be combined.
+
+    Raises:
+        InvalidInput: naming it.
+    """
+    if variant.method not in METHODS:
+        raise InvalidInput("method", repr(variant.method), f"one of {', '.join(METHODS)}")
+    _check_choice("stages of ours", variant.replaced, STAGES, variant.method, "paper")
+    if len(variant.replaced) == len(STAGES):
+        raise InvalidInput("stages of ours", "all of them", "some; method ours is what replaces all")
+    _check_choice("stages replaced by the truth", variant.truths, TRUTHS, variant.method, "ours")
+    if variant.has_masks and not (variant.published("estimation") and variant.published("planning")):
+        raise InvalidInput(
+            "masks at every step", "given", "left out: only the paper's estimation and planning use them"
+        )
+    most = Variant().views
+    if not 1 <= variant.views <= most:
+        raise InvalidInput("number of views", variant.views, f"between 1 and {most}")
+    if variant.views != most and variant.method == "foresight":
+        raise InvalidInput(
+            "number of views", variant.views, "left out with method foresight, which has the goal's view"
+        )
+
+
+def _check_choice(what: str, chosen: Iterable[str], among: Iterable[str], method: str, needed: str) -> None:
+    chosen, among = sorted(chosen), tuple(among)
+    for one in chosen:
+        if one not in among:
+            raise InvalidInput(what, one, ", ".join(among))
+    if chosen and method != needed:
+        raise InvalidInput(what, ", ".join(chosen), f"given with method {needed} alone")
+
+
+def loop_parts(
+    variant: Variant, models: SceneModels, task: RearrangementTask, fields: FieldLibrary, data_dir: Path | None
+) -> LoopParts:
+    """What a method's loop is made of; truths come to it when its world is there.
+
+    Args:
+        variant: of any method but foresight.
+        models: ours, of the task's objects.
+        task: of which a method is told the lights at most.
+        fields: library of the fields.
+        data_dir: whose files come before the installed ones.
+
+    Raises:
+        UnknownName: if an object has no such field.
+        CorruptFile: if a file is broken.
+    """
+    overhead = Light(np.array([0.0, 0.0, 1.0]))
+    match variant.method:
+        case "overhead":
+            return LoopParts(models, Estimators.with_known_lights(overhead, overhead))
+        case "known_light":
+            return LoopParts(models, Estimators.with_known_lights(task.start.light, task.goal.light))
+        case "nerf":  # no light changes what its fields show, so none is looked for
+            given = Estimators.with_known_lights(overhead, overhead)
+            return LoopParts(with_nerfs(models, fields, data_dir), given)
+        case "paper":
+            stages = frozenset(STAGES) - variant.replaced
+            estimators = PaperEstimators() if "estimation" in stages else Estimators()
+            return LoopParts(with_paper_stages(models, stages, fields, data_dir), estimators)
+        case _:
+            return LoopParts(models, Estimators())
+
+
+def told_truths(
+    parts: LoopParts, truths: frozenset[TruthName], truth: Callable[[], SceneState], assets: AssetLibrary
+) -> LoopParts:
+    """The same with stages replaced by the truth; the goal's is the caller's matter.
+
+    Args:
+        parts: of our loop.
+        truths: which.
+        truth: tells the true state.
+        assets: meshes for the simulator.
+    """
+    models, estimators = parts.models, parts.estimators
+    if "dynamics" in truths:
+        models = replace(models, dynamics=SimulatedModel(assets, tuple(models.shapes)))
+    if "poses" in truths:
+        estimators = TrueEstimators(estimators.first, estimators.later, estimators.goal, truth=truth)
+    return LoopParts(models, estimators)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueState:
+    """The truth at an instant that the loop has just estimated.
+
+    Attributes:
+        state: which the loop must not see.
+    """
+
+    state: SceneState
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Ended:
+    """A table that planning has left.
+
+    Attributes:
+        state: the truth.
+        image: as the goal camera sees it, without the pusher.
+        goal: the goal image.
+    """
+
+    state: SceneState
+    image: Float[np.ndarray, "h w 3"]
+    goal: Float[np.ndarray, "h w 3"]
+
+
+def run_from_images(
+    task: RearrangementTask,
+    assets: AssetLibrary,
+    parts: LoopParts,
+    settings: EpisodeSettings,
+    rng: np.random.Generator,
+    factor: Factor | None = None,
+    variant: Variant | None = None,
+    published: GaussianPlanSettings | None = None,
+) -> Iterator[Event | TrueState | Ended]:
+    """The whole loop, with the truth before each `Stepped`; the last step is how it ended.
+
+    Args:
+        task: what is told of it is the goal image alone.
+        assets: meshes, for the simulator.
+        parts: what the loop is made of.
+        settings: how the loop goes; of planning as published, the number of steps alone.
+        rng: of estimates and plans.
+        factor: how the world differs from what is taken for granted.
+        variant: tells who plans, what is replaced by the truth, and how many cameras there are.
+        published: how planning as published samples.
+    """
+    variant = variant or Variant()
+    cameras = default_cameras()[: variant.views]
+    world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)
+    try:
+        goal = world.goal_image(task.goal, goal_camera())
+        world.restore(task.start)
+        parts = told_truths(parts, variant.truths, world.truth, assets)
+        if variant.published("planning"):
+            how = AlgorithmSettings(settings.steps, published or GaussianPlanSettings(), variant.has_masks)
+            events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
+        else:
+            target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal
+            events = Episode(world, parts.models, target, settings, rng, parts=EpisodeParts(parts.estimators)).run()
+        for event in events:
+            if isinstance(event, Stepped):
+                yield TrueState(world.truth())
+            yield event
+        yield _ended(world, goal)
+    finally:
+        world.close()
+
+
+def run_told_the_truth(
+    task: RearrangementTask,
+    assets: AssetLibrary,
+    models: SceneModels,
+    settings: EpisodeSettings,
+    rng: np.random.Generator,
+    *,
+    knows_pushes: bool,
+) -> Ended:
+    """How the same planner leaves the table with true poses.
+
+    Args:
+        task: with the true goal.
+        assets: meshes, for the simulator.
+        models: of which only shapes, symmetries and pushes play a part.
+        settings: of which only steps, plans and what counts as arrived play a part.
+        rng: of the plans.
+        knows_pushes: whether the simulator is its dynamics, and not the learned model.
+    """
+    with contextlib.ExitStack() as stack:
+        world = stack.enter_context(contextlib.closing(Tabletop(assets)))
+        rollout: Rollout = models.pushes.rollout
+        if knows_pushes:
+            meshes = {name: assets.load(name) for name in task.start.names}
+            rollout = stack.enter_context(contextlib.closing(SimulatedPushes(meshes))).rollout
+        image = _goal_image(world, task)
+        world.restore(task.start)
+        _push_there(world, rollout, task, models, settings, rng)
+        return _ended(world, image)
+
+
+def _push_there(
+    world: Tabletop,
+    rollout: Rollout,
+    task: RearrangementTask,
+    models: SceneModels,
+    settings: EpisodeSettings,
+    rng: np.random.Generator,
+) -> None:
+    planner = MPPIPlanner(rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
+    goal, number = _moved_goal(task), 0
+    while number < settings.steps:
+        state = world.truth()
+        goal = nearest_symmetric_goal(goal, state, models.symmetries)
+        far, turned = offsets(goal, state)
+        if far.max() <= settings.reached_m and turned.max() <= settings.reached_rad:
+            return
+        left = settings.steps - number
+        planner.settings = replace(settings.plan, horizon=min(settings.plan.horizon, left))
+        for _ in planner.plan(state, goal, PoseCost(goal), rng):
+            pass
+        actions = planner.nominal(min(settings.replan_every, left))
+        for action in actions:
+            world.act(action)
+        planner.shift(len(actions))
+        number += len(actions)
+
+
+def _moved_goal(task: RearrangementTask) -> PoseGoal:
+    return PoseGoal.of(task.start, {name: task.goal.pose(name) for name in task.moved})
+
+
+def _goal_image(world: Tabletop, task: RearrangementTask) -> GoalImage:
+    world.restore(task.goal)
+    camera = goal_camera()
+    return GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
+
+
+def _ended(world: Tabletop | VariedWorld, goal: GoalImage) -> Ended:
+    image = world.render((goal.camera,), with_pusher=False).images[0]
+    return Ended(world.truth(), image, goal.image)

@@ -1,0 +1,576 @@
+"""FitVid: variational video prediction that is conditioned on actions (Babaeizadeh et al., 2021, arXiv 2106.13195).
+
+A frame x_t becomes a vector h_t and feature maps in the encoder. From there on everything is recurrent over vectors:
+
+    posterior   q(z_t | x_1..t)     from h_t
+    prior       p(z_t | x_1..t-1)   from h_t-1
+    next frame  h'_t = sigmoid(LSTM(h_t-1, a_t-1, z_t)),    x'_t = decoder(h'_t, c, feature maps of c)
+
+with the last context frame c, and what is minimised is sum_t |x_t - x'_t|^2 (a mean over pixels) + beta * KL(q || p),
+with z_t from the posterior and true frames behind h_t-1. To predict, z_t comes from the prior, and behind the context
+h_t-1 from the predicted frame.
+
+Deviations from the published program: images are of 128 pixels instead of 64, as in the paper that is reproduced here,
+by one more stage in front, so that the coarsest maps stay 8 x 8 pixels; channels start with 4 at full size and double
+per stage, so that at 64 pixels there are 8 where the original has 64 (7.4 instead of 302 million parameters). Batch
+norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no variance,
+which the original computes and never uses. The decoder changes the last context frame, where the original's draws a
+new one (`coders`). Encoder and decoder may compute in bfloat16. Predictions take the skip connections from the last
+context frame, as training does; the original takes those of the first one there. Actions are in units of the highest
+speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.nn import functional
+
+from osfcore.errors import CorruptFile, InvalidInput, check_ranges, shown
+from osfcore.geometry.workspace import MAX_SPEED_M_S
+from osfcore.io.checkpoint import read_parameters
+from osfcore.io.files import write_atomically
+
+# Residual cells of NVAE (Vahdat and Kautz, 2020) as FitVid uses them, and squeeze-and-excitation in them.
+
+
+EXPANSION = 4  # of the channels within a decoder's cell
+_MOMENTUM, _EPSILON = 0.1, 1e-5
+_SQUEEZE, _LEAST_SQUEEZED = 16, 4
+
+
+def _norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, eps=_EPSILON, momentum=_MOMENTUM)
+
+
+def _conv(before: int, after: int, side: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(before, after, side, stride, padding=side // 2, bias=False)
+
+
+class SqueezeExcitation(nn.Module):
+    """Channels scaled by what all of them are on average (Hu et al., 2018).
+
+        y = x * sigmoid(E relu(R mean(x)))
+
+    Args:
+        channels: of x; a sixteenth of them, four at least, are in the middle.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        squeezed = max(channels // _SQUEEZE, _LEAST_SQUEEZED)
+        self.reduce, self.expand = nn.Linear(channels, squeezed), nn.Linear(squeezed, channels)
+
+    def forward(self, x: Float[Tensor, "B c h w"]) -> Float[Tensor, "B c h w"]:
+        """The same with its channels scaled."""
+        scale = self.expand(functional.relu(self.reduce(x.mean(dim=(2, 3))))).sigmoid()
+        return x * scale[:, :, None, None]
+
+
+class EncoderCell(nn.Module):
+    """Two 3 x 3 convolutions, each behind batch norm and swish, and squeeze-and-excitation beside a shortcut.
+
+    Args:
+        before: channels.
+        after: channels.
+        stride: 2 to halve height and width.
+    """
+
+    def __init__(self, before: int, after: int, stride: int = 1) -> None:
+        super().__init__()
+        self.first, self.second = _conv(before, after, 3, stride), _conv(after, after, 3)
+        self.norms = nn.ModuleList([_norm(before), _norm(after)])
+        self.excitation = SqueezeExcitation(after)
+        same = before == after and stride == 1
+        self.shortcut = nn.Identity() if same else nn.Sequential(_conv(before, after, 1, stride), _norm(after))
+
+    def forward(self, x: Float[Tensor, "B before h w"]) -> Float[Tensor, "B after h2 w2"]:
+        """Features of the same or half the height and width."""
+        y = self.first(functional.silu(self.norms[0](x)))
+        y = self.second(functional.silu(self.norms[1](y)))
+        return functional.silu(self.shortcut(x) + self.excitation(y))
+
+
+class DecoderCell(nn.Module):
+    """An inverted bottleneck: 1 x 1 to four times the channels, 5 x 5 among them, 1 x 1 back, beside a shortcut.
+
+    The last batch norm begins with scale 0, so that the cell begins as its shortcut.
+
+    Args:
+        before: channels.
+        after: channels.
+        grows: whether height and width are doubled first, by repetition.
+    """
+
+    def __init__(self, before: int, after: int, *, grows: bool = False) -> None:
+        super().__init__()
+        inner = EXPANSION * after
+        self.grows = grows
+        self.widen, self.mix, self.narrow = _conv(before, inner, 1), _conv(inner, inner, 5), _conv(inner, after, 1)
+        self.norms = nn.ModuleList([_norm(before), _norm(inner), _norm(inner), _norm(after)])
+        nn.init.zeros_(self.norms[-1].get_parameter("weight"))
+        self.excitation = SqueezeExcitation(after)
+        same = before == after
+        self.shortcut = nn.Identity() if same else nn.Sequential(_conv(before, after, 1), _norm(after))
+
+    def forward(self, x: Float[Tensor, "B before h w"]) -> Float[Tensor, "B after h2 w2"]:
+        """Features of the same or twice the height and width."""
+        if self.grows:
+            x = functional.interpolate(x, scale_factor=2, mode="nearest")
+        y = self.widen(self.norms[0](x))
+        y = self.mix(functional.silu(self.norms[1](y)))
+        y = self.norms[3](self.narrow(functional.silu(self.norms[2](y))))
+        return functional.silu(self.shortcut(x) + self.excitation(y))
+
+
+# FitVid's recurrent parts: Gaussians over the latent, step by step, and the vector of the next frame.
+
+
+State = tuple[Float[Tensor, "layers B hidden"], Float[Tensor, "layers B hidden"]]
+
+
+class Gaussian(NamedTuple):
+    """A normal distribution with a diagonal covariance.
+
+    Attributes:
+        mean: of each component.
+        logvar: logarithm of the variance.
+    """
+
+    mean: Float[Tensor, "*batch z"]
+    logvar: Float[Tensor, "*batch z"]
+
+    def sample(self, generator: torch.Generator | None) -> Float[Tensor, "*batch z"]:
+        """A draw that gradients pass through.
+
+        Args:
+            generator: draws it, on the device of the mean.
+        """
+        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+        return self.mean + (self.logvar / 2).exp() * noise
+
+
+def kl_divergence(p: Gaussian, q: Gaussian) -> Float[Tensor, "*batch"]:
+    """KL(p || q) in closed form, summed over the components.
+
+        sum_i (ln s_q^2 - ln s_p^2 + (s_p^2 + (m_p - m_q)^2) / s_q^2 - 1) / 2
+
+    Args:
+        p: such as the posterior.
+        q: such as the prior.
+    """
+    ratio = (p.logvar - q.logvar).exp()
+    far = (p.mean - q.mean).square() * (-q.logvar).exp()
+    return (q.logvar - p.logvar + ratio + far - 1).sum(dim=-1) / 2
+
+
+class Recurrence(nn.Module):
+    """A linear embedding and layers of LSTM.
+
+    Args:
+        inputs: numbers taken in at each step.
+        hidden: units of embedding and layers.
+        layers: of LSTM.
+    """
+
+    def __init__(self, inputs: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        self.embedding, self.lstm = nn.Linear(inputs, hidden), nn.LSTM(hidden, hidden, layers, batch_first=True)
+
+    def forward(
+        self, x: Float[Tensor, "B T inputs"], state: State | None = None
+    ) -> tuple[Float[Tensor, "B T hidden"], State]:
+        """Outputs of the last layer, and the state after the last step; without a state it begins with zeros."""
+        return self.lstm(self.embedding(x), state)
+
+
+class LatentLSTM(nn.Module):
+    """The posterior or the learned prior: a Gaussian over the latent at each step, given all vectors so far.
+
+    Args:
+        inputs: length of the vectors.
+        hidden: units.
+        latent: components of the latent (z).
+    """
+
+    def __init__(self, inputs: int, hidden: int, latent: int) -> None:
+        super().__init__()
+        self.recurrence = Recurrence(inputs, hidden, 1)
+        self.mean, self.logvar = nn.Linear(hidden, latent), nn.Linear(hidden, latent)
+
+    def forward(self, x: Float[Tensor, "B T inputs"], state: State | None = None) -> tuple[Gaussian, State]:
+        """Gaussians (B, T, z), and the state to go on from."""
+        y, after = self.recurrence(x, state)
+        return Gaussian(self.mean(y), self.logvar(y)), after
+
+
+class FrameLSTM(nn.Module):
+    """The vector of the next frame from that of this one, the action and the latent.
+
+    Args:
+        inputs: length of all three together.
+        hidden: units of each of both layers.
+        features: length of the vector (g).
+    """
+
+    def __init__(self, inputs: int, hidden: int, features: int) -> None:
+        super().__init__()
+        self.recurrence, self.head = Recurrence(inputs, hidden, 2), nn.Linear(hidden, features)
+
+    def forward(
+        self, x: Float[Tensor, "B T inputs"], state: State | None = None
+    ) -> tuple[Float[Tensor, "B T g"], State]:
+        """Vectors in (0, 1), and the state to go on from."""
+        y, after = self.recurrence(x, state)
+        return self.head(y).sigmoid(), after
+
+
+# FitVid's encoder of a frame, and the decoder that mirrors it and takes its features over skip connections.
+#
+# Deviation: the decoder's last layer, which begins at zero, changes the logits of a known frame, where the
+# original's makes all of a frame. A network begins at copying that way, and what it learns are the changes; 50
+# minutes on one core did not teach ours to draw the standing background anew as well as a copied frame shows it.
+
+
+COARSEST_SIDE = 8  # of the feature maps between encoder and decoder, as in the original [px]
+_CELLS = 2  # of a stage
+_LEAST = 1 / 256  # of a colour whose logit is taken
+
+Skips = Sequence[Float[Tensor, "_ _ _ _"]]  # features after each of the encoder's cells, the finest first
+
+
+class Encoder(nn.Module):
+    """A frame as a vector: stages of two cells, all but the first beginning by halving the image, then a mean over it.
+
+    Args:
+        stages: their number; channels double from one to the next.
+        width: channels of the first stage.
+        features: length of the vector (g).
+    """
+
+    def __init__(self, stages: int, width: int, features: int) -> None:
+        super().__init__()
+        cells, before = [], 3
+        for stage in range(stages):
+            for cell in range(_CELLS):
+                after = width * 2**stage
+                cells.append(EncoderCell(before, after, 2 if stage > 0 and cell == 0 else 1))
+                before = after
+        self.cells = nn.ModuleList(cells)
+        self.head = nn.Linear(before, features)
+
+    def forward(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B _ _ _"]]]:
+        """The vector of each frame, and the features after each cell."""
+        # With colours last in memory, 1 x 1 convolutions of few channels at stride 2 crash PyTorch 2.13.
+        skips, x = [], frames.contiguous()
+        for cell in self.cells:
+            x = cell(x)
+            skips.append(x)
+        return self.head(x.mean(dim=(2, 3))), skips
+
+
+class Decoder(nn.Module):
+    """A vector as a frame: a linear layer to the coarsest map, the encoder's stages backwards, a 3 x 3 convolution.
+
+    After each cell the features of the encoder's cell across from it are added.
+
+    Args:
+        stages: of the encoder.
+        width: channels of its first stage.
+        features: length of the vector (g).
+    """
+
+    def __init__(self, stages: int, width: int, features: int) -> None:
+        super().__init__()
+        self._channels = before = width * 2 ** (stages - 1)
+        self.ground = nn.Linear(features, before * COARSEST_SIDE**2)
+        cells = []
+        for stage in reversed(range(stages)):
+            for cell in range(_CELLS):
+                after = width * 2**stage
+                cells.append(DecoderCell(before, after, grows=stage < stages - 1 and cell == 0))
+                before = after
+        self.cells = nn.ModuleList(cells)
+        self.colours = nn.Conv2d(before, 3, 3, padding=1, bias=False)
+
+    def forward(
+        self, vectors: Float[Tensor, "B g"], skips: Skips, known: Float[Tensor, "_ 3 h w"]
+    ) -> Float[Tensor, "B 3 h w"]:
+        """Frames in [0, 1].
+
+        Args:
+            vectors: of frames.
+            skips: of the encoder, for each of the vectors or of one frame for all of them.
+            known: the frames of which those are.
+        """
+        x = self.ground(vectors).view(len(vectors), self._channels, COARSEST_SIDE, COARSEST_SIDE)
+        for cell, skip in zip(self.cells, reversed(skips), strict=True):
+            x = cell(x) + skip
+        return (torch.logit(known, _LEAST) + self.colours(x).float()).sigmoid()
+
+
+CONTEXT = 2  # frames that are given
+_ACTION = 3
+_MOST_STAGES = 8
+_AT_ONCE = 32  # sequences: more would take memory and no less time
+
+
+@dataclass(frozen=True, slots=True)
+class FitVidSettings:
+    """How large a network is.
+
+    Attributes:
+        side: of its square images [px]: 8 times a power of two.
+        width: channels at full size; they double whenever the image is halved (original: 64 for 64 pixels).
+        features: length of a frame's vector (g).
+        hidden: units of the LSTMs.
+        latent: components of z.
+    """
+
+    side: int = 128
+    width: int = 4
+    features: int = 128
+    hidden: int = 256
+    latent: int = 10
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            InvalidInput: naming what is out of range.
+        """
+        if self.side not in [COARSEST_SIDE * 2**n for n in range(1, _MOST_STAGES)]:
+            raise InvalidInput("side of the frames [px]", self.side, "16, 32, 64, 128, 256, 512 or 1024")
+        check_ranges(
+            ("width of the network", self.width, 1, 256),
+            ("features of a frame", self.features, 1, 4096),
+            ("units of the LSTMs", self.hidden, 1, 4096),
+            ("components of the latent", self.latent, 1, 1024),
+        )
+
+    @property
+    def stages(self) -> int:
+        """Sizes of image between full size and 8 pixels, both included."""
+        return (self.side // COARSEST_SIDE).bit_length()
+
+
+class Losses(NamedTuple):
+    """What is minimised: squared_error + beta * kl.
+
+    Attributes:
+        squared_error: mean over pixels and sequences, summed over the predicted frames.
+        kl: of posterior and prior, likewise summed; mean over sequences [nat].
+    """
+
+    squared_error: Float[Tensor, ""]
+    kl: Float[Tensor, ""]
+
+
+class FitVidModel(nn.Module):
+    """The network.
+
+    Attributes:
+        settings: how large it is.
+        precision: what encoder and decoder compute in; parameters and frames are float32 in any case.
+    """
+
+    def __init__(self, settings: FitVidSettings | None = None, precision: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        self.settings = s = settings or FitVidSettings()
+        self.precision = precision
+        self.encoder = Encoder(s.stages, s.width, s.features)
+        self.decoder = Decoder(s.stages, s.width, s.features)
+        self.posterior = LatentLSTM(s.features, s.hidden, s.latent)
+        self.prior = LatentLSTM(s.features, s.hidden, s.latent)
+        self.frame_predictor = FrameLSTM(s.features + _ACTION + s.latent, s.hidden, s.features)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.Linear):  # as the original begins (LeCun)
+                nn.init.normal_(module.weight, std=module.weight[0].numel() ** -0.5)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        nn.init.zeros_(self.decoder.colours.weight)
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers that are learned."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def _encoded(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Tensor]]:
+        with torch.autocast(frames.device.type, self.precision, enabled=self.precision != torch.float32):
+            vectors, skips = self.encoder(frames)
+        return vectors.float(), skips
+
+    def _decoded(self, vectors: Float[Tensor, "B g"], skips: Skips, known: Tensor) -> Float[Tensor, "B 3 h w"]:
+        with torch.autocast(vectors.device.type, self.precision, enabled=self.precision != torch.float32):
+            return self.decoder(vectors, skips, known)
+
+    def losses(
+        self,
+        frames: Float[Tensor, "B T1 3 side side"],
+        actions: Float[Tensor, "B T 3"],
+        generator: torch.Generator | None,
+    ) -> Losses:
+        """How well each frame but the first is predicted from the true ones before it.
+
+        Args:
+            frames: in [0, 1], three at least.
+            actions: between them [m/s].
+            generator: draws the latents.
+        """
+        count, length = frames.shape[:2]
+        vectors, skips = self._encoded(frames.flatten(0, 1))
+        vectors = vectors.unflatten(0, (count, length))
+        posterior, _ = self.posterior(vectors[:, 1:])
+        prior, _ = self.prior(vectors[:, :-1])
+        inputs = [vectors[:, :-1], actions / MAX_SPEED_M_S, posterior.sample(generator)]
+        following, _ = self.frame_predictor(torch.cat(inputs, dim=-1))
+        seen = [min(step, CONTEXT - 1) for step in range(length - 1)]  # frames whose maps are handed over
+        skips = [skip.unflatten(0, (count, length))[:, seen].flatten(0, 1) for skip in skips]
+        predicted = self._decoded(following.flatten(0, 1), skips, frames[:, seen].flatten(0, 1))
+        predicted = predicted.unflatten(0, (count, length - 1))
+        squared_error = (predicted - frames[:, 1:]).square().mean(dim=(0, 2, 3, 4)).sum()
+        return Losses(squared_error, kl_divergence(posterior, prior).sum(dim=1).mean())
+
+    def rollout(
+        self,
+        context: Float[Tensor, "B 2 3 side side"],
+        actions: Float[Tensor, "B T1 3"],
+        generator: torch.Generator | None = None,
+    ) -> Iterator[Tensor]:
+        """The frames (B, 3, side, side) after the context, one after the other.
+
+        Args:
+            context: true frames in [0, 1].
+            actions: the first one between the context's frames, then one for each frame that is predicted [m/s].
+            generator: draws latents from the prior; its mean is taken if None.
+        """
+        vectors, skips = self._context(context)
+        yield from self._continued(vectors, skips, context[:, -1], actions, generator)
+
+    @torch.inference_mode()
+    def _context(self, context: Float[Tensor, "B 2 3 side side"]) -> tuple[Float[Tensor, "B 2 g"], list[Tensor]]:
+        """Vectors of the context's frames, and the feature maps of the last ones."""
+        vectors, skips = self._encoded(context.flatten(0, 1))
+        return vectors.unflatten(0, (-1, CONTEXT)), [skip[CONTEXT - 1 :: CONTEXT] for skip in skips]
+
+    def _continued(
+        self,
+        vectors: Float[Tensor, "B 2 g"],
+        skips: list[Tensor],
+        known: Float[Tensor, "_ 3 side side"],
+        actions: Float[Tensor, "B T1 3"],
+        generator: torch.Generator | None,
+    ) -> Iterator[Tensor]:
+        prior_state = frame_state = frame = None
+        for step in range(actions.shape[1]):
+            with torch.inference_mode():
+                vector = vectors[:, step] if frame is None else self._encoded(frame)[0]
+                prior, prior_state = self.prior(vector[:, None], prior_state)
+                latent = prior.mean if generator is None else prior.sample(generator)
+                inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, latent]
+                following, frame_state = self.frame_predictor(torch.cat(inputs, dim=-1), frame_state)
+                frame = self._decoded(following[:, 0], skips, known) if step + 1 >= CONTEXT else None
+            if frame is not None:
+                yield frame
+
+    def predict(
+        self,
+        context_frames: Float[np.ndarray, "2 h w 3"],
+        actions: Float[np.ndarray, "K T 3"],
+        *,
+        between: Float[np.ndarray, "3"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Float32[np.ndarray, "K T h w 3"]:
+        """What will be seen after each action of each sequence.
+
+        Args:
+            context_frames: what was seen one action ago, and now, in [0, 1].
+            actions: sequences [m/s].
+            between: the action between the context's frames [m/s]; standing still if None.
+            generator: draws a latent for each sequence and step, on this network's device; the prior's means are taken
+                if None, so that the same is predicted each time.
+
+        Raises:
+            InvalidInput: if the frames are of another size than the network's.
+        """
+        side = self.settings.side
+        if context_frames.shape != (CONTEXT, side, side, 3):
+            raise InvalidInput("shape of the context frames", context_frames.shape, f"{(CONTEXT, side, side, 3)}")
+        device = next(self.parameters()).device
+        context = torch.as_tensor(context_frames, dtype=torch.float32, device=device).permute(0, 3, 1, 2)
+        first = np.zeros(_ACTION) if between is None else between
+        all_actions = np.concatenate([np.broadcast_to(first, (len(actions), 1, _ACTION)), actions], axis=1)
+        given = torch.as_tensor(all_actions, dtype=torch.float32, device=device)
+        vectors, skips = self._context(context[None])  # once for all sequences
+        parts = []
+        for part in given.split(_AT_ONCE):
+            futures = self._continued(vectors.expand(len(part), -1, -1), skips, context[None, -1], part, generator)
+            parts.append(torch.stack(list(futures), dim=1))
+        return torch.cat(parts).movedim(2, -1).contiguous().cpu().numpy()
+
+
+# Files of trained FitVid networks: safetensors with half-precision parameters, checked when read.
+
+
+FORMAT = "fitvid-2"
+_FILE = "fitvid.safetensors"
+_SIZES = ("side", "width", "features", "hidden", "latent")
+
+
+def fitvid_path(data_dir: Path | None) -> Path:
+    """Where the network lies: DATA_DIR/fitvid.safetensors, else the package's."""
+    own = None if data_dir is None else data_dir / _FILE
+    shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / _FILE))
+    return own if own is not None and own.is_file() else shipped
+
+
+def fitvid_bytes(model: FitVidModel) -> bytes:
+    """A network as the contents of a file; the statistics of batch norm keep their precision."""
+    halved = {name for name, _ in model.named_parameters()}
+    tensors = {
+        name: (value.detach().half() if name in halved else value.detach()).cpu().contiguous()
+        for name, value in model.state_dict().items()
+    }
+    return save(tensors, {"format": FORMAT, **{name: str(value) for name, value in asdict(model.settings).items()}})
+
+
+def write_fitvid(path: Path, model: FitVidModel) -> None:
+    """Write a network; the file appears only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_atomically(path, fitvid_bytes(model))
+
+
+def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidModel:
+    """Read a network, ready to predict.
+
+    Args:
+        path: of the file.
+        precision: what it shall compute in.
+
+    Raises:
+        CorruptFile: if the file is missing, cut short, of another version or no such network.
+    """
+    metadata, values = read_parameters(path, FORMAT, "video prediction network")
+    try:
+        settings = FitVidSettings(**{name: int(metadata[name]) for name in _SIZES})
+    except (KeyError, ValueError) as error:
+        raise CorruptFile(path, f"it holds no video prediction network of known size ({shown(error)})") from error
+    with torch.device("meta"):  # what the file describes may be larger than what it holds
+        model = FitVidModel(settings, precision)
+    expected = model.state_dict()
+    if {n: v.shape for n, v in values.items()} != {n: v.shape for n, v in expected.items()}:
+        raise CorruptFile(path, "its parameters do not fit its description")
+    model.load_state_dict({name: value.to(expected[name].dtype) for name, value in values.items()}, assign=True)
+    return model.eval()

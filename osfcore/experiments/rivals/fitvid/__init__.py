@@ -1,1 +1,0 @@
-"""FitVid (Babaeizadeh et al., 2021): what a camera will see, predicted pixel by pixel."""

@@ -1,0 +1,576 @@
+"""Training FitVid on recorded frames and actions.
+
+As in the published program: windows of two context frames and ten more, beta 1e-4, Adam at a rate of 1e-3, gradients
+clipped at a norm of 100. Deviations: batches are of 8 instead of 128 windows, and the rate falls over the last fifth of
+the budget, for there are minutes where the original has ten million steps. The package's network learned at a rate of
+5e-3 in batches of 4 without augmentation, from pushes that seek contact, of which videos show four times as much motion
+as of the paper's random ones; as for our dynamics, episodes with a held-out pair of objects are left out.
+"""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import h5py
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from osfcore.dynamics.train import has_held_out_pair, is_for_validation
+from osfcore.errors import CorruptFile, InvalidInput, check_ranges, check_seed
+from osfcore.experiments.rivals.fitvid import CONTEXT, FitVidModel, FitVidSettings, fitvid_bytes
+from osfcore.fields.devices import pick_device
+from osfcore.io.checkpoint import resume_from, write_checkpoint
+from osfcore.io.files import write_atomically, write_json
+from osfcore.io.output_paths import check_weights_place
+from osfcore.metrics.image_errors import MOST_DB
+from osfcore.progress import Progress
+from osfcore.random_streams import Stream, stream_rng, stream_seed
+
+# Variations of videos while FitVid learns: a random crop and one random change of colours, the same for all frames.
+#
+# Deviations from the paper, which takes most operations of RandAugment (Cubuk et al., 2020): none that moves the
+# image (flips, rotations, shears, translations), for actions stay what they are and would then point elsewhere; a
+# crop is close enough to a camera that moved. The strength of a change is drawn, for the published program's fixed
+# one leaves colour, contrast and brightness as they are. No equalisation of histograms. What an operation reads off
+# the image, such as the mean grey that contrast is relative to, it reads off the whole video.
+
+
+LEAST_CROP = 0.8  # of the side
+_STRENGTH = 0.3  # by which colour, contrast, brightness and sharpness are changed at most
+_BITS = (5, 9)  # of colours after posterisation: the first, and the one after the last
+_GREY = (0.299, 0.587, 0.114)
+
+Frames = Float[Tensor, "T 3 h w"]
+
+
+def augmented(videos: Float[Tensor, "B T 3 h w"], rng: np.random.Generator) -> Float[Tensor, "B T 3 h w"]:
+    """Each video with a crop and a change of colours of its own.
+
+    Args:
+        videos: in [0, 1], square.
+        rng: draws crops and changes.
+
+    Returns:
+        Videos of the same size in [0, 1].
+    """
+    return torch.stack([_recoloured(_cropped(video, rng), rng).clamp(0, 1) for video in videos])
+
+
+def _cropped(video: Frames, rng: np.random.Generator) -> Frames:
+    """A square of at least four fifths of the side, brought back to the video's size."""
+    full = video.shape[-1]
+    side = int(rng.integers(round(LEAST_CROP * full), full + 1))
+    top, left = rng.integers(full - side + 1, size=2)
+    crop = video[..., top : top + side, left : left + side]
+    return functional.interpolate(crop, (full, full), mode="bilinear", align_corners=False)
+
+
+def _recoloured(video: Frames, rng: np.random.Generator) -> Frames:
+    change = _CHANGES[rng.integers(len(_CHANGES))]
+    return change(video, rng)
+
+
+def _blended(video: Frames, plain: Tensor, rng: np.random.Generator) -> Frames:
+    """Nearer to what it is blended with, or farther away."""
+    return plain + (1 + rng.uniform(-_STRENGTH, _STRENGTH)) * (video - plain)
+
+
+def _grey(video: Frames) -> Float[Tensor, "T 1 h w"]:
+    return (video * video.new_tensor(_GREY)[:, None, None]).sum(dim=1, keepdim=True)
+
+
+def _colour(video: Frames, rng: np.random.Generator) -> Frames:
+    return _blended(video, _grey(video), rng)
+
+
+def _contrast(video: Frames, rng: np.random.Generator) -> Frames:
+    return _blended(video, _grey(video).mean(), rng)
+
+
+def _brightness(video: Frames, rng: np.random.Generator) -> Frames:
+    return _blended(video, video.new_zeros(()), rng)
+
+
+def _sharpness(video: Frames, rng: np.random.Generator) -> Frames:
+    kernel = video.new_tensor([[1, 1, 1], [1, 5, 1], [1, 1, 1]]) / 13
+    padded = functional.pad(video, (1, 1, 1, 1), mode="replicate")
+    return _blended(video, functional.conv2d(padded, kernel.expand(3, 1, 3, 3), groups=3), rng)
+
+
+def _autocontrast(video: Frames, rng: np.random.Generator) -> Frames:
+    """Each colour stretched so that it spans everything from 0 to 1."""
+    low, high = video.amin(dim=(0, 2, 3), keepdim=True), video.amax(dim=(0, 2, 3), keepdim=True)
+    return torch.where(high > low, (video - low) / (high - low).clamp(min=1e-6), video)
+
+
+def _posterised(video: Frames, rng: np.random.Generator) -> Frames:
+    levels = 2 ** int(rng.integers(*_BITS)) - 1
+    return (video * levels).round() / levels
+
+
+_CHANGES: tuple[Callable[[Frames, np.random.Generator], Frames], ...] = (
+    _colour,
+    _contrast,
+    _brightness,
+    _sharpness,
+    _autocontrast,
+    _posterised,
+)
+
+
+# Frames and actions of recorded pushes, read window by window: thousands of videos need not fit into memory.
+
+
+LEAST_STEPS = 2  # of an episode: two frames of context, and one to predict
+_ERRORS = (OSError, KeyError, TypeError, ValueError, AttributeError)
+
+
+class Windows(NamedTuple):
+    """B stretches of T actions.
+
+    Attributes:
+        frames: before the first and after each action.
+        actions: [m/s].
+    """
+
+    frames: UInt8[np.ndarray, "B T1 h w 3"]
+    actions: Float32[np.ndarray, "B T 3"]
+
+
+class Video(NamedTuple):
+    """An episode in its file.
+
+    Attributes:
+        path: of the file.
+        group: of the episode.
+        steps: its actions.
+    """
+
+    path: Path
+    group: Any
+    steps: int
+
+    def read(self, start: int, steps: int) -> tuple[UInt8[np.ndarray, "T1 h w 3"], Float32[np.ndarray, "T 3"]]:
+        """A stretch of the episode.
+
+        Raises:
+            CorruptFile: if it cannot be read.
+        """
+        try:
+            frames = self.group["frames"][start : start + steps + 1]
+            actions = self.group["actions"][start : start + steps]
+        except _ERRORS as error:
+            raise CorruptFile(self.path, f"an episode in it cannot be read ({error})") from error
+        if not np.all(np.isfinite(actions)):
+            raise CorruptFile(self.path, "actions of an episode are not finite")
+        return frames, actions.astype(np.float32)
+
+
+class VideoFiles:
+    """The episodes of push files with frames, to be used as a context.
+
+    As for dynamics, one episode in twelve of each file is held out, and so is every other one in which a pair of
+    objects meets that shall not be learned from.
+
+    Args:
+        paths: of the files.
+
+    Raises:
+        CorruptFile: if one is no push file, or has no frames.
+        InvalidInput: if frames differ in size between files, or nothing is left to learn from or to measure on.
+
+    Attributes:
+        side: of the frames [px].
+        learned: episodes to learn from.
+        held_out: episodes to measure on.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.learned: list[Video] = []
+        self.held_out: list[Video] = []
+        sizes: dict[tuple[int, ...], Path] = {}
+        with ExitStack() as opened:
+            for path in paths:
+                self._sort(path, opened, sizes)
+            if len(sizes) > 1:
+                raise InvalidInput("sizes of the frames [px]", [size[:2] for size in sizes], "the same in all files")
+            for what, videos in (("learn from", self.learned), ("measure on", self.held_out)):
+                if not videos:
+                    raise InvalidInput(f"episodes with frames to {what}", 0, "at least 1: collect more")
+            self._opened = opened.pop_all()
+        self.side = next(iter(sizes))[0]
+
+    def _sort(self, path: Path, opened: ExitStack, sizes: dict[tuple[int, ...], Path]) -> None:
+        try:
+            file: Any = opened.enter_context(h5py.File(path))
+            for number, (_, group) in enumerate(sorted(file.items())):
+                if "frames" not in group:
+                    raise CorruptFile(path, "it holds no frames: 'osf collect pushes --images' keeps them")
+                frames, steps = group["frames"], len(group["actions"])
+                _check_shapes(path, frames, group["actions"].shape)
+                sizes.setdefault(frames.shape[1:], path)
+                names = [name.decode() for name in group["names"][()].tolist()]
+                if is_for_validation(number):
+                    self.held_out.append(Video(path, group, steps))
+                elif not has_held_out_pair(names):
+                    self.learned.append(Video(path, group, steps))
+        except _ERRORS as error:
+            if isinstance(error, CorruptFile):
+                raise
+            raise CorruptFile(path, f"it is not a push file ({error})") from error
+
+    def __enter__(self) -> VideoFiles:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._opened.close()
+
+    def drawn(self, rng: np.random.Generator, count: int, steps: int) -> Windows:
+        """Random stretches of random episodes to learn from.
+
+        Args:
+            rng: draws them.
+            count: of them.
+            steps: actions in each.
+
+        Raises:
+            InvalidInput: if no episode is so long.
+            CorruptFile: if an episode cannot be read.
+        """
+        long = [video for video in self.learned if video.steps >= steps]
+        if not long:
+            longest = max(video.steps for video in self.learned)
+            raise InvalidInput("frames of a window", steps + 1, f"at most {longest + 1}, as the longest episode has")
+        chosen = rng.integers(len(long), size=count)
+        starts = rng.integers([long[n].steps - steps + 1 for n in chosen])
+        return windows([long[n] for n in chosen], starts, steps)
+
+
+def _check_shapes(path: Path, frames: Any, actions: tuple[int, ...]) -> None:  # noqa: ANN401 - h5py's dataset
+    side = frames.shape[1] if frames.ndim == 4 else 0
+    if frames.dtype != np.uint8 or frames.shape != (actions[0] + 1, side, side, 3):
+        raise CorruptFile(path, f"its frames are {frames.dtype} of shape {frames.shape}, not square 8-bit images")
+    if len(actions) != 2 or actions[1] != 3:
+        raise CorruptFile(path, f"its actions have shape {actions}, not (T, 3)")
+    if actions[0] < LEAST_STEPS:
+        raise CorruptFile(path, f"its episodes have {actions[0]} actions, but {LEAST_STEPS} are needed to predict any")
+
+
+def windows(videos: Sequence[Video], starts: Int[np.ndarray, "B"], steps: int) -> Windows:
+    """Stretches of the same length.
+
+    Args:
+        videos: episodes, as often as wanted.
+        starts: first action of each stretch.
+        steps: actions in each.
+
+    Raises:
+        CorruptFile: if an episode cannot be read.
+    """
+    read = [video.read(int(start), steps) for video, start in zip(videos, starts, strict=True)]
+    return Windows(np.stack([frames for frames, _ in read]), np.stack([actions for _, actions in read]))
+
+
+# How well held-out videos are predicted, step by step, against the last context frame, copied.
+
+
+HORIZONS = (10, 30)  # predicted steps
+_AT_ONCE = 8  # videos
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class VideoErrors:
+    """Errors of N videos at T predicted steps.
+
+    Attributes:
+        predicted: mean squared error over the pixels of each frame.
+        copied: the same if nothing ever changed after the context.
+    """
+
+    predicted: Float[np.ndarray, "N T"]
+    copied: Float[np.ndarray, "N T"]
+
+    def report(self) -> dict[str, Any]:
+        """Means over each horizon that the videos are long enough for, and by step, as plain JSON."""
+        steps = self.predicted.shape[1]
+        shown = [horizon for horizon in HORIZONS if horizon <= steps] or [steps]
+        return {
+            "videos": len(self.predicted),
+            "horizons": {str(horizon): self._means(slice(horizon)) for horizon in shown},
+            "steps": [self._means(slice(step, step + 1)) for step in range(steps)],
+        }
+
+    def _means(self, steps: slice) -> dict[str, float]:
+        """Means of errors, and of each frame's own PSNR [dB]."""
+        report = {}
+        for name, errors in (("", self.predicted[:, steps]), ("_copied", self.copied[:, steps])):
+            psnr = np.minimum(-10 * np.log10(np.maximum(errors, 1e-12)), MOST_DB)
+            report |= {f"mse{name}": round(float(errors.mean()), 7), f"psnr{name}": round(float(psnr.mean()), 3)}
+        return report
+
+
+def measure(model: FitVidModel, videos: Sequence[Video]) -> Iterator[VideoErrors]:
+    """Predict the beginnings of videos with the prior's means; yields what there is after each few of them.
+
+    Args:
+        model: in evaluation mode.
+        videos: as far as the longest horizon, or as the shortest of them goes.
+
+    Raises:
+        CorruptFile: if one cannot be read.
+    """
+    steps = min(*(video.steps for video in videos), CONTEXT - 1 + max(HORIZONS))
+    device = next(model.parameters()).device
+    predicted, copied = [], []
+    for first in range(0, len(videos), _AT_ONCE):
+        some = videos[first : first + _AT_ONCE]
+        read = windows(some, np.zeros(len(some), int), steps)
+        frames = as_frames(read.frames, device)
+        futures = model.rollout(frames[:, :CONTEXT], torch.as_tensor(read.actions, device=device))
+        last, truths = frames[:, CONTEXT - 1], frames[:, CONTEXT:].unbind(dim=1)
+        errors = [(_error(future, truth), _error(last, truth)) for future, truth in zip(futures, truths, strict=True)]
+        predicted.append(np.stack([ours for ours, _ in errors], axis=1))
+        copied.append(np.stack([theirs for _, theirs in errors], axis=1))
+        yield VideoErrors(np.concatenate(predicted), np.concatenate(copied))
+
+
+def as_frames(frames: np.ndarray, device: torch.device) -> Float[Tensor, "B T 3 h w"]:
+    """Recorded 8-bit frames (B, T, h, w, 3) as the network takes them."""
+    return torch.as_tensor(frames, device=device).movedim(-1, 2).float() / 255
+
+
+def _error(images: Tensor, truth: Tensor) -> Float[np.ndarray, "B"]:
+    return (images - truth).square().mean(dim=(1, 2, 3)).cpu().numpy().astype(float)
+
+
+_CLIP = 100.0
+_FALLING = 0.2  # of the budget
+_RECENT = 0.9  # of what is told as recent, kept from step to step
+_OWN_METRICS = ("parameters", "horizons")
+Precision = Literal["bfloat16", "float32"]
+
+
+@dataclass(frozen=True, slots=True)
+class TrainFitVid:
+    """A training run.
+
+    Attributes:
+        data: push files with frames; one in twelve episodes is held out.
+        out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
+        minutes: how long to train [min], without reading at the beginning and measuring at the end.
+        iterations: instead of a time budget: that many steps of descent, repeatable on one machine.
+        width: channels at full size.
+        batch: windows in each step.
+        frames: of a window, context included.
+        rate: of learning.
+        beta: weight of the KL divergence.
+        augment: whether videos are varied.
+        precision: what convolutions compute in while training.
+        save_every: steps between checkpoints.
+        measured: held-out videos to measure on in the end, at most.
+        device: "auto", "cpu" or "cuda".
+        seed: of everything random.
+    """
+
+    data: tuple[Path, ...]
+    out: Path
+    minutes: float = 60.0
+    iterations: int | None = None
+    width: int = 4
+    batch: int = 8
+    frames: int = 12
+    rate: float = 1e-3
+    beta: float = 1e-4
+    augment: bool = True
+    precision: Precision = "bfloat16"
+    save_every: int = 20
+    measured: int = 32
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    seed: int = 0
+
+    @property
+    def command(self) -> str:
+        """How to do it again."""
+        parts = ["osf", "train", "fitvid", "--data", *(path.name for path in self.data), "--out", self.out.name]
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("data", "out", "device") or value == field.default:
+                continue
+            name = field.name.replace("_", "-")
+            parts += [f"--no-{name}"] if value is False else [f"--{name}", str(value)]
+        return shlex.join(parts)
+
+
+def train_fitvid(config: TrainFitVid) -> Iterator[Progress]:
+    """Train a network and write it; a killed run goes on from its last checkpoint.
+
+    Yields:
+        Seconds of the budget (or steps).
+
+    Raises:
+        InvalidInput: if a number is out of range, the device is not there, or nothing is left to learn from.
+        CorruptFile: if a push file cannot be read or has no frames, or the checkpoint of a killed run cannot be gone on
+            from.
+        CannotWrite: if the output cannot be written, which is tried first.
+    """
+    _check(config)
+    device = pick_device(config.device)
+    check_weights_place(config.out, _OWN_METRICS)
+    with VideoFiles(config.data) as videos:
+        run = _Run(config, videos, device)
+        run.resume()
+        yield run.progress("Reading the frames")
+        while run.share < 1:
+            note = run.iterate()
+            if run.steps % config.save_every == 0:
+                run.save()
+            yield run.progress(note)
+        run.save()  # a kill while it measures repeats no step
+        yield from run.finish()
+
+
+def _check(config: TrainFitVid) -> None:
+    check_seed(config.seed)
+    if config.precision not in ("bfloat16", "float32"):
+        raise InvalidInput("precision", repr(config.precision), '"bfloat16" or "float32"')
+    check_ranges(
+        ("minutes", config.minutes, 0.01, 7 * 24 * 60),
+        ("iterations", 1 if config.iterations is None else config.iterations, 1, 10_000_000),
+        ("width of the network", config.width, 1, 256),
+        ("batch", config.batch, 1, 10_000),
+        ("frames of a window", config.frames, CONTEXT + 1, 1000),
+        ("rate of learning", config.rate, 1e-9, 1),
+        ("beta", config.beta, 0, 1e6),
+        ("steps between checkpoints", config.save_every, 1, 1_000_000),
+        ("held-out videos", config.measured, 1, 1_000_000),
+    )
+
+
+class _Run:
+    """The state of a training run."""
+
+    def __init__(self, config: TrainFitVid, videos: VideoFiles, device: torch.device) -> None:
+        self._config, self._videos, self._device = config, videos, device
+        generator = torch.random.get_rng_state()
+        torch.manual_seed(stream_seed(config.seed, Stream.VIDEO_WEIGHTS))
+        self._model = FitVidModel(FitVidSettings(videos.side, config.width), getattr(torch, config.precision))
+        torch.random.set_rng_state(generator)
+        self._model.to(device)
+        self._adam = torch.optim.Adam(self._model.parameters(), config.rate)
+        self.steps, self._spent_s = 0, 0.0
+        self._recent: dict[str, float] = {}
+
+    @property
+    def share(self) -> float:
+        """Of the budget that is spent."""
+        if self._config.iterations is not None:
+            return self.steps / self._config.iterations
+        return self._spent_s / (60 * self._config.minutes)
+
+    def progress(self, note: str) -> Progress:
+        """In seconds, or in steps."""
+        config = self._config
+        total = config.iterations or max(1, round(60 * config.minutes))
+        return Progress(min(round(self.share * total), total), total, note)
+
+    def iterate(self) -> str:
+        """One step of descent. What is random in it depends on its number alone, not on the steps before it."""
+        began, config = time.monotonic(), self._config
+        rng = stream_rng(config.seed, Stream.VIDEO_WINDOWS, self.steps)
+        window = self._videos.drawn(rng, config.batch, config.frames - 1)
+        frames = as_frames(window.frames, self._device)
+        if config.augment:
+            frames = augmented(frames, rng)
+        latents = torch.Generator(self._device).manual_seed(int(rng.integers(2**62)))
+        actions = torch.as_tensor(window.actions, device=self._device)
+        losses = self._model.losses(frames, actions, latents)
+        self._descend(losses.squared_error + config.beta * losses.kl)
+        still = (frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean()
+        told = {
+            "error": float(losses.squared_error.detach()) / (config.frames - 1),
+            "kl": float(losses.kl.detach()) / (config.frames - 1),
+            "still": float(still),
+        }
+        for name, value in told.items():
+            self._recent[name] = value + _RECENT * (self._recent.get(name, value) - value)
+        self.steps += 1
+        self._spent_s += time.monotonic() - began
+        error, still, kl = (self._recent[name] for name in ("error", "still", "kl"))
+        return f"step {self.steps}: MSE {error:.5f}, of a copied frame {still:.5f}; KL {kl:.2f}"
+
+    def _descend(self, loss: torch.Tensor) -> None:
+        self._adam.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self._model.parameters(), _CLIP)
+        for group in self._adam.param_groups:
+            group["lr"] = self._config.rate * min(1.0, max((1 - self.share) / _FALLING, 1e-3))
+        if torch.isfinite(norm):  # else this step would spoil all that follow
+            self._adam.step()
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self._config.out.with_suffix(".checkpoint")
+
+    def _fingerprint(self) -> str:
+        free = {"out": "", "device": "", "save_every": 0, "measured": 0, "minutes": 0.0, "iterations": 0}
+        settings = {**asdict(self._config), **free, "data": [path.name for path in self._config.data]}
+        return repr((settings, self._videos.side, len(self._videos.learned)))
+
+    def save(self) -> None:
+        """Everything that is needed to go on, also with a larger budget."""
+        content: dict[str, Any] = {
+            "model": self._model.state_dict(),
+            "adam": self._adam.state_dict(),
+            "steps": self.steps,
+            "spent_s": self._spent_s,
+            "recent": self._recent,
+        }
+        write_checkpoint(self._checkpoint, self._fingerprint(), content)
+
+    def resume(self) -> None:
+        """Go on from the checkpoint of the same run, if there is one."""
+        resume_from(self._checkpoint, self._fingerprint(), self._restore)
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        self._model.load_state_dict(content["model"])
+        self._adam.load_state_dict(content["adam"])
+        self.steps, self._spent_s, self._recent = content["steps"], content["spent_s"], content["recent"]
+
+    def finish(self) -> Iterator[Progress]:
+        """Measure on held-out videos, and write weights and metrics."""
+        model, videos = self._model.eval(), self._videos.held_out[: self._config.measured]
+        errors = None
+        for errors in measure(model, videos):
+            yield self.progress(f"Measuring on held-out videos ({len(errors.predicted)} of {len(videos)})")
+        assert errors is not None
+        report, data = errors.report(), fitvid_bytes(model)
+        write_atomically(self._config.out, data)
+        own = {
+            "command": self._config.command,
+            "seed": self._config.seed,
+            "data": [path.name for path in self._config.data],
+            "parameters": model.parameter_count,
+            "bytes": len(data),
+            "minutes": round(self._spent_s / 60, 2),
+            "iterations": self.steps,
+            "episodes": len(self._videos.learned),
+            "device": str(self._device),
+            "threads": torch.get_num_threads(),
+            "training_mse": round(self._recent.get("error", 0.0), 7),
+            "training_mse_copied": round(self._recent.get("still", 0.0), 7),
+            "training_kl": round(self._recent.get("kl", 0.0), 4),
+        }
+        write_json(self._config.out.with_suffix(".json"), {**own, **report})
+        self._checkpoint.unlink(missing_ok=True)
+        horizon, means = list(report["horizons"].items())[-1]
+        told = f"{means['psnr']:.1f} dB over {horizon} steps (copied: {means['psnr_copied']:.1f} dB)"
+        yield self.progress(f"held out: {told}")

@@ -1,0 +1,342 @@
+"""How well futures are predicted as images: 30 steps of the goal camera's view (paper, section 5.3 and figure 6).
+
+Episodes of random pushes that nothing was trained on, each under a light from anywhere over the table. All methods know
+the actions and are given the same episodes, of objects that all of them know; `video_episodes` tells what each of them
+sees. Finished episodes are kept in the output folder, method by method: a killed comparison goes on where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from osfcore.control.estimators import Estimators, SceneModels, load_scene_models
+from osfcore.dynamics.rollout import network_path
+from osfcore.errors import InvalidInput, check_ranges, check_seed
+from osfcore.experiments.charts import Axis
+from osfcore.experiments.estimation_tasks import episode, first_frame, take_frame
+from osfcore.experiments.fields import SCENE_QUALITY
+from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, file_sha256, table_sha256
+from osfcore.experiments.images import (
+    TITLES,
+    check_methods,
+    common_names,
+    field_path,
+    measured,
+    summary,
+    tables_of,
+    write_comparison,
+)
+from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
+from osfcore.experiments.rivals.nerf import with_nerfs
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, default_cameras, goal_camera, image_side
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.rollouts import MAX_HORIZON
+from osfcore.geometry.states import Observation
+from osfcore.inspection.contact_sheet import Comparison, image_grid
+from osfcore.io.image_file import to_uint8, write_png
+from osfcore.metrics.image_errors import psnr, ssim
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.dynamics import weights_path
+from osfcore.paper.stages import STAGES, PaperEstimators, with_paper_stages
+from osfcore.random_streams import Stream, stream_rng
+from osfcore.render.types import SceneBatch
+from osfcore.world.tasks import Draw, draw_scene, opened
+
+# Episodes of pushes as the goal camera sees them, and how each method predicts them.
+#
+# Methods:
+#     copied  what is seen now stays as it is.
+#     ours    poses and light are estimated in one look of four cameras with masks, pushes are predicted by our
+#             dynamics, and each step is rendered through our fields.
+#     paper   the same as published: estimation, dynamics and fields.
+#     nerf    ours with fields that know of no light, so that none is estimated.
+#     fitvid  video prediction from two frames of the goal camera, at the look and one action before it.
+
+
+VIDEO_METHODS = ("copied", "ours", "paper", "nerf", "fitvid")
+MEASURES = ("mse", "psnr", "ssim")
+_SHOWN_STEPS = (1, 10, 20, 30)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class VideoEpisode:
+    """T actions that are known in advance, and what is seen.
+
+    Attributes:
+        context: frames of the goal camera, one action before the look and at it.
+        between: the action between the two [m/s].
+        look: four cameras with masks, for methods that estimate.
+        actions: after the look [m/s].
+        frames: of the goal camera after each of them, with the pusher.
+    """
+
+    context: Float[np.ndarray, "2 h w 3"]
+    between: Float[np.ndarray, "3"]
+    look: Observation
+    actions: Float[np.ndarray, "T 3"]
+    frames: Float[np.ndarray, "T h w 3"]
+
+
+def simulate_video(draw: Draw, library: AssetLibrary, steps: int, size: int) -> VideoEpisode:
+    """Pushes that move some object by 5 cm or more, and one action before them.
+
+    Args:
+        draw: the scene that it begins with.
+        library: meshes of its objects.
+        steps: actions that are predicted.
+        size: side of the frames [px].
+
+    Raises:
+        UnknownName, MissingAssets: if an object has no mesh here.
+        NoRoom: if the objects do not fit side by side.
+    """
+    camera = (goal_camera(size),)
+    before = first_frame(draw, library, camera)
+    pushes = episode(draw, library, camera, steps=steps + 1)
+    with opened(draw, library) as world:
+        world.restore(pushes.frames[0].truth)
+        look = take_frame(world, default_cameras(), masks=True).observation
+    frames = [frame.observation.images[0] for frame in (before, *pushes.frames)]
+    return VideoEpisode(np.stack(frames[:2]), pushes.actions[0], look, pushes.actions[1:], np.stack(frames[2:]))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class VideoEpisodes:
+    """Measures single episodes; can be sent to other processes.
+
+    Attributes:
+        fields: ours, and the table.
+        assets: meshes for the simulator.
+        data_dir: where networks and fields of other methods may be.
+        seed: of the estimates.
+        steps: actions that are predicted.
+        size: side of the frames [px].
+    """
+
+    fields: FieldLibrary
+    assets: AssetLibrary
+    data_dir: Path
+    seed: int
+    steps: int
+    size: int
+
+    def measure(self, number: int, draw: Draw, method: str) -> TaskResult:
+        """An episode as a method predicts it.
+
+        Args:
+            number: of the episode.
+            draw: the scene that it begins with.
+            method: one of `VIDEO_METHODS`.
+
+        Returns:
+            For each measure a figure for each step; comparisons after 1, 10, 20 and 30 actions.
+
+        Raises:
+            NoRoom: if the objects do not fit side by side.
+            UnknownName, CorruptFile: as fields and networks are.
+        """
+        video = simulate_video(draw, self.assets, self.steps, self.size)
+        predicted = self._predicted(number, video, method)
+        pairs = list(zip(video.frames, predicted, strict=True))
+        figures = {
+            "mse": [float(np.mean((true.astype(float) - image) ** 2)) for true, image in pairs],
+            "psnr": [psnr(true, image) for true, image in pairs],
+            "ssim": [ssim(true, image) for true, image in pairs],
+        }
+        shown = tuple(
+            Comparison(f"step {step}", *(to_uint8(image) for image in pairs[step - 1]))
+            for step in _SHOWN_STEPS
+            if step <= self.steps
+        )
+        return TaskResult(figures, shown)
+
+    def _predicted(self, number: int, video: VideoEpisode, method: str) -> Float[np.ndarray, "T h w 3"]:
+        match method:
+            case "copied":
+                return np.broadcast_to(video.context[1], video.frames.shape)
+            case "fitvid":
+                network = read_fitvid(fitvid_path(self.data_dir))
+                return network.predict(video.context, video.actions[None], between=video.between)[0]
+            case _:
+                models, estimators = self._models(method, video.look.names)
+                rng = stream_rng(self.seed, Stream.VIDEO_ESTIMATE, number)
+                return predict_through_fields(video, models, estimators, goal_camera(self.size), rng)
+
+    def _models(self, method: str, names: tuple[str, ...]) -> tuple[SceneModels, Estimators]:
+        models = load_scene_models(names, self.fields, self.assets, self.data_dir)
+        if method == "paper":
+            return with_paper_stages(models, frozenset(STAGES), self.fields, self.data_dir), PaperEstimators()
+        if method == "nerf":
+            overhead = Light(np.array([0.0, 0.0, 1.0]))
+            return with_nerfs(models, self.fields, self.data_dir), Estimators.with_known_lights(overhead, overhead)
+        return models, Estimators()
+
+
+def predict_through_fields(
+    video: VideoEpisode, models: SceneModels, estimators: Estimators, camera: Camera, rng: np.random.Generator
+) -> Float[np.ndarray, "T h w 3"]:
+    """Estimate what is seen, roll it out, render each step.
+
+    Args:
+        video: of which the look and the actions play a part.
+        models: fields and dynamics.
+        estimators: of poses and light.
+        camera: that sees the prediction.
+        rng: of the estimate.
+    """
+    *_, last = estimators.first_frame(models.appearance, video.look, rng)
+    assert last.estimate is not None, "the last step brings the estimate"
+    state = last.estimate.state
+    future = models.dynamics.rollout(state, video.actions[None])
+    lights = np.tile(state.light.direction, (len(video.actions), 1))
+    batch = SceneBatch(
+        future.names, future.positions[0, 1:], future.quaternions[0, 1:], lights, future.pusher[0, 1:]
+    )  # fmt: skip
+    rendered = models.appearance.together.render(batch, (camera,), quality=SCENE_QUALITY)
+    return np.clip(rendered.rgb[:, 0], 0, 1)
+
+
+REPORT_FILE, CHART_FILE, IMAGES_FILE = "video.json", "video.png", "video_episode.png"
+HORIZONS = (10, 30)  # steps over which means are told
+MAX_TASKS = 10_000
+VERSION = 1  # raised by hand when figures may change
+
+
+@dataclass(frozen=True, slots=True)
+class CompareVideos:
+    """What to compare.
+
+    Attributes:
+        folder: for results, pictures and video.json.
+        data_dir: where fields and networks trained on this machine are.
+        names: objects to draw from; all with a mesh and a field of every method if None.
+        tasks: number of episodes.
+        seed: of the episodes.
+        methods: some of `VIDEO_METHODS`.
+        objects: in each scene.
+        steps: actions of 0.2 s that are predicted.
+        size: side of the frames [px]; that of FitVid's network.
+    """
+
+    folder: Path
+    data_dir: Path
+    names: tuple[str, ...] | None = None
+    tasks: int = 20
+    seed: int = 0
+    methods: tuple[str, ...] = VIDEO_METHODS
+    objects: int = 3
+    steps: int = 30
+    size: int = DEFAULT_IMAGE_SIDE
+
+
+def compare_videos(
+    config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
+) -> Iterator[EvaluationStep]:
+    """Predict all episodes by all methods; the chart, images of the first episode and video.json go to `config.folder`.
+
+    Args:
+        config: what to compare.
+        fields: ours, and the table.
+        assets: meshes, for the simulator.
+        executor: works on episodes side by side, if given.
+
+    Raises:
+        UnknownName, MissingAssets: if an object lacks a field or a mesh.
+        InvalidInput: if a number is out of range, objects are too few, or FitVid's network has another image size.
+        NoRoom: if there is no room for a scene's objects.
+        WorkerDied: if a worker process ended.
+        CorruptFile, CannotWrite: as files are.
+    """
+    config = _checked(config, fields, assets)
+    pieces = {method: _pieces(config, method, fields, assets) for method in config.methods}
+    results = yield from measured(pieces, executor)
+    tables = tables_of(results, MEASURES)
+    spans = {str(horizon): range(horizon) for horizon in sorted({min(h, config.steps) for h in HORIZONS})}
+    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "steps", "size")}
+    report = {**about, "names": list(config.names or ()), **summary(tables, spans)}
+    x, places = Axis("predicted steps of 0.2 s", 0, config.steps), range(1, config.steps + 1)
+    files = config.folder / REPORT_FILE, config.folder / CHART_FILE
+    write_comparison(files, report, tables, x, places)
+    write_png(config.folder / IMAGES_FILE, _first_episode(results))
+    total = config.tasks * len(config.methods)
+    yield EvaluationStep(total, total, "Everything is measured", report)
+
+
+def _checked(config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary) -> CompareVideos:
+    """The same with methods and names in order."""
+    check_ranges(("number of tasks", config.tasks, 1, MAX_TASKS), ("predicted steps", config.steps, 1, MAX_HORIZON))
+    check_seed(config.seed)
+    image_side(config.size)
+    methods = check_methods(config.methods, VIDEO_METHODS)
+    names = common_names(methods, config.names, fields, assets, config.data_dir, config.objects)
+    if "fitvid" in methods:
+        side = read_fitvid(fitvid_path(config.data_dir)).settings.side
+        if side != config.size:
+            raise InvalidInput("image size [px]", config.size, f"{side}, as FitVid's network has")
+    return replace(config, methods=methods, names=names)
+
+
+def _pieces(config: CompareVideos, method: str, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
+    episodes = VideoEpisodes(fields, assets, config.data_dir, config.seed, config.steps, config.size)
+    given = {
+        "steps": config.steps,
+        "size": config.size,
+        "quality": asdict(SCENE_QUALITY),
+        "table": table_sha256(fields.load_table()),
+        "networks": [file_sha256(path) for path in _networks(method, config.data_dir)],
+        "version": VERSION,
+    }
+    cache = TaskCache(config.folder / "video" / f"{config.objects}-{config.seed}" / method)
+
+    def piece(number: int) -> Piece:
+        stream = Stream.VIDEO_SCENE
+        draw = draw_scene(
+            config.names or (), config.objects, config.seed, number, stream, MIN_LIGHT_ELEVATION_DEG
+        )  # fmt: skip
+        own = _circumstances(draw, method, fields, assets, config.data_dir)
+        return Piece(f"{number:04d}", cache, {**given, **own}, partial(episodes.measure, number, draw, method))
+
+    return [piece(number) for number in range(config.tasks)]
+
+
+def _networks(method: str, data_dir: Path) -> list[Path]:
+    """Networks that a method's predictions depend on."""
+    match method:
+        case "copied":
+            return []
+        case "fitvid":
+            return [fitvid_path(data_dir)]
+        case "paper":
+            return [weights_path(data_dir)]
+        case _:
+            return [network_path(data_dir)]
+
+
+def _circumstances(
+    draw: Draw, method: str, fields: FieldLibrary, assets: AssetLibrary, data_dir: Path
+) -> dict[str, Any]:
+    """What an episode begins with, and by which fields it is shown; shapes come from ours in any case."""
+    paths = {name: (fields.info(name).path, field_path(method, name, fields, data_dir)) for name in draw.names}
+    digests = {name: [file_sha256(path) for path in pair] for name, pair in paths.items()}
+    return {
+        "objects": {name: [assets.digest(name), *told] for name, told in digests.items()},
+        "arrangement": draw.seed,
+        "light": draw.light.direction.tolist(),
+    }
+
+
+def _first_episode(results: Mapping[str, Sequence[TaskResult]]) -> UInt8[np.ndarray, "H W 3"]:
+    """The first episode: a row for the truth and for each method; some of the steps."""
+    shown = {TITLES[method]: part[0].shown for method, part in results.items()}
+    first = next(iter(shown.values()))
+    rows = {"simulator": [one.truth for one in first], **{who: [one.ours for one in row] for who, row in shown.items()}}
+    return image_grid(rows, [one.label for one in first])

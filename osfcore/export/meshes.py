@@ -1,0 +1,320 @@
+"""Scenes and fields as binary glTF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+
+from osfcore.dynamics.shapes import field_mesh
+from osfcore.estimation.camera_response import linear_of_srgb
+from osfcore.fields.kiloosf import STEP_VOXELS, KiloOSF
+from osfcore.fields.kiloosf_query import KiloQuery
+from osfcore.fields.table import TableField
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
+from osfcore.geometry.poses import Pose, orthogonal_basis
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.io.image_file import to_uint8
+from osfcore.io.scene_file import Scene
+from osfcore.objects.asset import TexturedMesh, light_mesh
+from osfcore.objects.mesh import MAX_TEXTURE_SIDE
+from osfcore.render.reference import render_weights
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+# Binary glTF from scenes with z up, with what trimesh's exporter leaves out: several cameras, a light, materials.
+#
+# Axes: glTF has y up; all that is exported hangs below one node that turns z up to y up, so that viewers show the
+# table level and each node below keeps the coordinates that it has here [m].
+#
+# Colours: a texel of 200 here is shown as 200 by a screen, and stays so. glTF takes textures for sRGB and vertex
+# colours for linear: textures are kept as they are, vertex colours are decoded from sRGB.
+
+
+TABLE_FRAME = "z_up"  # the node under which everything hangs
+LIGHT_NODE = "light"
+LIGHTS_EXTENSION, UNLIT_EXTENSION = "KHR_lights_punctual", "KHR_materials_unlit"
+_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_OPENCV_TO_GLTF = np.diag([1.0, -1, -1, 1])  # glTF's cameras look along -z with y up
+_NEAR_M = 0.01
+_MATTE = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # glTF's default is polished metal
+
+
+def glb(
+    scene: trimesh.Scene, *, cameras: tuple[Camera, ...] = (), light: Light | None = None, is_unlit: bool = False
+) -> bytes:
+    """A scene with z up as binary glTF with y up.
+
+    The light is a directional one of KHR_lights_punctual, white, of intensity 0.75 pi: a white matte surface that
+    faces it then sends out 0.75, our diffuse share, in viewers that divide by pi as the extension says. glTF has no
+    ambient light; our share of 0.25 stands in the extras of the light's node.
+
+    Args:
+        scene: nodes are in metres, z up; it is changed.
+        cameras: with square pixels and the principal point in the middle as far as glTF can tell; the exact K, width
+            and height are in the extras of each camera.
+        light: None for none.
+        is_unlit: colours are shown as they are.
+    """
+    from trimesh.exchange.gltf import export_glb
+
+    graph, base = scene.graph, scene.graph.base_frame
+    placed = [(node, *graph.get(node)) for node in graph.nodes_geometry]
+    graph.update(frame_from=base, frame_to=TABLE_FRAME, matrix=_Y_UP)
+    for node, matrix, geometry in placed:
+        graph.update(frame_from=TABLE_FRAME, frame_to=node, matrix=matrix, geometry=geometry)
+    for camera in cameras:
+        matrix = camera.T_world_camera.matrix() @ _OPENCV_TO_GLTF
+        graph.update(frame_from=TABLE_FRAME, frame_to=camera_node(camera), matrix=matrix)
+    if light is not None:
+        _add_light(scene, light)
+
+    def complete(tree: dict[str, Any]) -> dict[str, Any]:
+        _add_cameras(tree, cameras)
+        _add_materials(tree, is_unlit=is_unlit)
+        return tree
+
+    return bytes(export_glb(scene, include_normals=True, tree_postprocessor=complete))
+
+
+def camera_node(camera: Camera) -> str:
+    """The name of a camera's node: that of an object may be the camera's own."""
+    return f"camera {camera.name}"
+
+
+def _add_light(scene: trimesh.Scene, light: Light) -> None:
+    right, up = orthogonal_basis(light.direction)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, up, light.direction, light.position], axis=1)  # it shines along -z of its node
+    extras = {"gltf_extensions": {LIGHTS_EXTENSION: {"light": 0}}, "ambient": AMBIENT, "diffuse": DIFFUSE}
+    scene.graph.update(frame_from=TABLE_FRAME, frame_to=LIGHT_NODE, matrix=matrix, metadata=extras)
+    sun = {"type": "directional", "name": LIGHT_NODE, "color": [1.0, 1.0, 1.0], "intensity": DIFFUSE * np.pi}
+    scene.metadata["gltf_extensions"] = {LIGHTS_EXTENSION: {"lights": [sun]}}
+
+
+def _add_cameras(tree: dict[str, Any], cameras: tuple[Camera, ...]) -> None:
+    if cameras:
+        tree["cameras"] = [_camera(camera) for camera in cameras]
+    numbers = {camera_node(camera): number for number, camera in enumerate(cameras)}
+    for node in tree["nodes"]:
+        if node["name"] in numbers:
+            node["camera"] = numbers[node["name"]]
+
+
+def _camera(camera: Camera) -> Mapping[str, Any]:
+    perspective = {"yfov": camera.fov_y_rad, "aspectRatio": camera.width / camera.height, "znear": _NEAR_M}
+    extras = {"K": camera.intrinsics.tolist(), "width": camera.width, "height": camera.height}
+    return {"type": "perspective", "name": camera.name, "perspective": perspective, "extras": extras}
+
+
+def _add_materials(tree: dict[str, Any], *, is_unlit: bool) -> None:
+    """Meshes with vertex colours come without a material, and would be polished metal."""
+    bare = [p for mesh in tree["meshes"] for p in mesh["primitives"] if "material" not in p]
+    if not bare:
+        return
+    materials = tree.setdefault("materials", [])
+    for primitive in bare:
+        primitive["material"] = len(materials)
+    material: dict[str, Any] = {"name": "vertex colours", "pbrMetallicRoughness": _MATTE}
+    if is_unlit:
+        material["extensions"] = {UNLIT_EXTENSION: {}}
+        tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), UNLIT_EXTENSION]
+    materials.append(material)
+
+
+# What is seen of a field's surface, one place and one colour per point, for formats without scattering functions.
+
+
+_BEFORE_VOXELS, _BEHIND_VOXELS = 2.0, 4.0  # from where to where the surface is looked for
+_LEAST_WEIGHT = 1e-6
+_AT_ONCE = 32768  # points
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Baked:
+    """Points of a surface as cameras see them that look straight at each.
+
+    Attributes:
+        points: at the expected depth, in the field's frame [m].
+        colours: linear radiance in [0, 1].
+    """
+
+    points: Float32[np.ndarray, "P 3"]
+    colours: Float32[np.ndarray, "P 3"]
+
+
+@torch.no_grad()
+def baked(
+    field: KiloOSF, points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], light: Light | None
+) -> Baked:
+    """Where along -n the surface is seen, and in which colour.
+
+        x = p - t n,   c = rho(x, l, -n),   t = sum_i w_i t_i / sum_i w_i,   t_i from -2 to 4 voxels    (eqs. 1, 3)
+
+    Args:
+        field: of the object.
+        points: p, on its surface, in its frame [m].
+        normals: n, unit, outward.
+        light: toward it, in the field's frame; None for one that falls along each point's own normal, under which
+            ambient + diffuse = 1: c is then the albedo, as in `osfcore.photo.pose_loss`.
+
+    A trained field holds its own shadows; those of others are not there.
+
+    Deviation from eq. 3: the radiance is taken at the expected depth, not integrated along the ray.
+    """
+    query = KiloQuery(field)
+    t = torch.arange(-_BEFORE_VOXELS, _BEHIND_VOXELS, STEP_VOXELS) * query.voxel
+    parts = [np.zeros((2, 0, 3), np.float32)]
+    for start in range(0, len(points), _AT_ONCE):
+        p, n = (torch.as_tensor(a[start : start + _AT_ONCE], dtype=torch.float32) for a in (points, normals))
+        x = p[:, None] - t[:, None] * n[:, None]
+        taus = query.density(x.reshape(-1, 3)).view(x.shape[:2]) * STEP_VOXELS * query.voxel
+        weights = render_weights(taus) + _LEAST_WEIGHT  # where nothing is dense, p is nearly the mean
+        depth = (weights * t).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
+        toward = n if light is None else torch.as_tensor(light.direction, dtype=torch.float32).expand_as(n)
+        seen = p - depth * n
+        scatter = query(seen, toward, -n)
+        parts.append(torch.stack([seen, (scatter.ambient + scatter.direct).clamp(0, 1)]).numpy())
+    return Baked(*np.concatenate(parts, axis=1))
+
+
+# The surface of a field as a mesh with a colour for each vertex.
+
+
+def coloured_mesh(field: KiloOSF, light: Light | None = None) -> trimesh.Trimesh:
+    """Where the density is that of a surface (marching cubes), in the field's frame [m].
+
+    Args:
+        field: of the object.
+        light: colours are the radiance under it, seen along the normal; None for the albedo.
+
+    Raises:
+        InvalidInput: if nothing in the field is solid.
+    """
+    import trimesh
+    from trimesh.visual import ColorVisuals
+
+    vertices, faces = field_mesh(field)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    colours = baked(field, vertices, np.array(mesh.vertex_normals), light).colours
+    mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(linear_of_srgb(colours)))
+    return mesh
+
+
+def field_meshes(field: KiloOSF, name: str, light: Light | None = None) -> trimesh.Scene:
+    """The coloured mesh, named, as exporters take it; arguments and errors as of `field_glb`."""
+    import trimesh
+
+    scene = trimesh.Scene()
+    scene.add_geometry(coloured_mesh(field, light), node_name=name, geom_name=name)
+    return scene
+
+
+def field_glb(field: KiloOSF, name: str, light: Light | None = None) -> bytes:
+    """A field as binary glTF with vertex colours (see `osfcore.export.meshes` for axes and colours).
+
+    Args:
+        field: of the object.
+        name: of the mesh.
+        light: toward it, in the field's frame: its radiance is baked in and the material unlit, so that no viewer
+            lights it a second time. None for the albedo, to be lit by whoever opens it.
+
+    Raises:
+        InvalidInput: if nothing in the field is solid.
+    """
+    return glb(field_meshes(field, name, light), is_unlit=light is not None)
+
+
+# A scene as meshes that other programs take: objects, table, pusher.
+
+
+TABLE_NODE, PUSHER_NODE = "table", "pusher"
+
+
+def scene_meshes(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> trimesh.Scene:
+    """Everything where it stands, z up [m].
+
+    Nodes bear the names of the objects; the others are "table" and "pusher", and an object of that name has "object "
+    before its own.
+
+    Args:
+        scene: its state.
+        shapes: of each object by name, a mesh, which keeps its texture, or a field, which becomes a mesh with its
+            albedo on the vertices.
+        table: whose albedo becomes the table's texture.
+
+    Raises:
+        InvalidInput: if nothing in a field is solid.
+    """
+    import trimesh
+
+    meshes = trimesh.Scene()
+    _add(meshes, TABLE_NODE, _table_mesh(table), Pose.identity())
+    if scene.state.pusher is not None:
+        upright = Pose(scene.state.pusher, Pose.identity().quaternion)
+        _add(meshes, PUSHER_NODE, _pusher_mesh(), upright)
+    for name in scene.state.names:
+        shape = shapes[name]
+        mesh = coloured_mesh(shape) if isinstance(shape, KiloOSF) else light_mesh(shape, MAX_TEXTURE_SIDE)
+        _add(meshes, object_node(name), mesh, scene.state.pose(name))
+    return meshes
+
+
+def object_node(name: str) -> str:
+    """The name of an object's node."""
+    return f"object {name}" if name in (TABLE_NODE, PUSHER_NODE) else name
+
+
+def _add(scene: trimesh.Scene, node: str, mesh: trimesh.Trimesh, pose: Pose) -> None:
+    scene.add_geometry(mesh, node_name=node, geom_name=node, transform=pose.matrix())
+
+
+def _table_mesh(table: TableField) -> trimesh.Trimesh:
+    """Two triangles; the albedo's outermost points lie on the table's edge, half a texel inside the texture."""
+    half, inset = table.half_side, 0.5 / len(table.albedo)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    vertices = np.column_stack([half * corners, np.zeros(4)]).astype(np.float32)
+    uv = (0.5 + (0.5 - inset) * corners).astype(np.float32)
+    colour = table.albedo * (table.ambient + table.direct(np.array([[0.0, 0.0, 1.0]])))  # fully lit, as of objects
+    texture = np.ascontiguousarray(to_uint8(colour.swapaxes(0, 1)[::-1]))  # rows of an image run against y
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
+    return light_mesh(TexturedMesh(vertices, normals, faces, uv, texture), MAX_TEXTURE_SIDE)
+
+
+def _pusher_mesh() -> trimesh.Trimesh:
+    import trimesh
+    from trimesh.visual import ColorVisuals
+
+    mesh = trimesh.creation.cylinder(PUSHER_RADIUS_M, PUSHER_HEIGHT_M, sections=48)
+    mesh.unmerge_vertices()  # its edges are sharp
+    colours = np.tile(to_uint8(linear_of_srgb(np.array(PUSHER_ALBEDO))), (len(mesh.vertices), 1))
+    mesh.visual = ColorVisuals(mesh, vertex_colors=colours)
+    return mesh
+
+
+# A scene as binary glTF: objects, table, pusher, cameras and the light, for Blender, game engines and browsers.
+
+
+def scene_glb(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> bytes:
+    """The scene under its light; see `osfcore.export.meshes` for axes, colours, light and cameras.
+
+    Nodes bear the names that `scene_meshes` gives, "light", and "camera NAME".
+
+    Args:
+        scene: its state and cameras.
+        shapes: of each object by name, a mesh, which keeps its texture, or a field, which becomes a mesh with its
+            albedo on the vertices.
+        table: whose albedo becomes the table's texture.
+
+    Raises:
+        InvalidInput: if nothing in a field is solid.
+    """
+    return glb(scene_meshes(scene, shapes, table), cameras=scene.cameras, light=scene.state.light)

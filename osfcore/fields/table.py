@@ -1,0 +1,107 @@
+"""The table as a field: the radiance of the plane z = 0 under a distant light, learned from images.
+
+    radiance(x, y, l) = albedo(x, y) * (ambient + l_z * network(l))
+
+The direct part carries the factor l_z, so that it vanishes as the light sinks to the table's plane: that is what tells
+it from the ambient part, although no training image shows a shadow. Shadows remove the direct part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+from safetensors.numpy import save
+
+from osfcore.errors import CorruptFile, shown
+from osfcore.fields.kiloosf import Tensors, read_tensors, tensors_from_bytes
+from osfcore.io.files import write_atomically
+
+TABLE_FORMAT = "table-1"
+_ARRAYS = ("albedo", "ambient", "background", "w1", "b1", "w2", "b2")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TableField:
+    """The bare table.
+
+    Attributes:
+        half_side: the table covers |x|, |y| <= half_side [m].
+        albedo: reflectance on a regular grid over the table, x by y, interpolated.
+        ambient: what an unlit white point sends out.
+        background: radiance beyond the table's edge.
+        w1, b1, w2, b2: the network from the light's direction to the direct light per unit of l_z.
+    """
+
+    half_side: float
+    albedo: Float32[np.ndarray, "g g 3"]
+    ambient: Float32[np.ndarray, "3"]
+    background: Float32[np.ndarray, "3"]
+    w1: Float32[np.ndarray, "3 H"]
+    b1: Float32[np.ndarray, "H"]
+    w2: Float32[np.ndarray, "H 3"]
+    b2: Float32[np.ndarray, "3"]
+
+    def direct(self, lights: Float[np.ndarray, "B 3"]) -> Float32[np.ndarray, "B 3"]:
+        """What a white point of the table adds under each light, where nothing shades it."""
+        hidden = np.maximum(lights.astype(np.float32) @ self.w1 + self.b1, 0)
+        return np.maximum(hidden @ self.w2 + self.b2, 0) * np.maximum(lights[:, 2:], 0).astype(np.float32)
+
+
+def write_table(path: Path, table: TableField) -> int:
+    """Write a table; returns the size of the file [bytes].
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    data = table_bytes(table)
+    write_atomically(path, data)
+    return len(data)
+
+
+def table_bytes(table: TableField) -> bytes:
+    """A table as the contents of a file."""
+    tensors = {name: getattr(table, name) for name in _ARRAYS}
+    return save({**tensors, "half_side": np.array([table.half_side])}, metadata={"format": TABLE_FORMAT})
+
+
+def read_table(path: Path) -> TableField:
+    """Read a table.
+
+    Raises:
+        CorruptFile: if the file is missing, cut short, of another version or not a table.
+    """
+    return _table(read_tensors(path, TABLE_FORMAT), path)
+
+
+def table_from_bytes(data: bytes, where: Path | str) -> TableField:
+    """A table from the contents of a file.
+
+    Args:
+        data: as `table_bytes` makes them.
+        where: what messages name.
+
+    Raises:
+        CorruptFile: if they are cut short, of another version or not a table.
+    """
+    return _table(tensors_from_bytes(data, TABLE_FORMAT, where), where)
+
+
+def _table(content: Tensors, path: Path | str) -> TableField:
+    _, tensors = content
+    try:
+        arrays = {name: tensors[name].astype(np.float32) for name in _ARRAYS}
+        half_side = float(tensors["half_side"].reshape(-1)[0])
+        hidden, side = arrays["b1"].size, len(arrays["albedo"])
+    except (KeyError, IndexError, TypeError) as error:
+        raise CorruptFile(path, f"it is not a sound table ({shown(error)})") from error
+    shapes = {"ambient": (3,), "background": (3,), "w1": (3, hidden), "b1": (hidden,), "w2": (hidden, 3), "b2": (3,)}
+    shapes["albedo"] = (max(side, 2), max(side, 2), 3)
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or not np.all(np.isfinite(arrays[name])):
+            raise CorruptFile(path, f"{name} has shape {arrays[name].shape} or values that are not finite")
+    if not 0 < half_side < 1e6:
+        raise CorruptFile(path, f"half_side is {half_side}")
+    return TableField(half_side=half_side, **arrays)

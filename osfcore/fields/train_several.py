@@ -1,0 +1,184 @@
+"""Fields of several objects, each learned by itself, here or by any `concurrent.futures.Executor`.
+
+Whatever trains them, weights and metrics are written by the process that asked for them: workers may be on other
+machines, which share nothing but the image sets. An object whose worker dies is trained again by an executor that can
+(Dask's does), or by the next run, which leaves alone what is finished: the metrics tell what it was made of.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import Field, asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, Protocol
+
+from osfcore.errors import OsfError, WorkerDied
+from osfcore.fields.devices import computing_threads
+from osfcore.fields.train_kiloosf import FieldStep
+from osfcore.io.files import write_atomically, write_json
+from osfcore.io.image_set import read_splits
+from osfcore.progress import Progress
+
+_MADE_OF = "made_of"  # key of the metrics by which a finished training is known
+TrainOne = Callable[[Any], Iterator[FieldStep]]
+
+
+class FieldSettings(Protocol):
+    """What one training is told: a dataclass, such as `TrainField`, with a device besides."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def data(self) -> Path:
+        """The image set."""
+        ...
+
+    @property
+    def out(self) -> Path:
+        """FILE.safetensors; metrics go beside it to FILE.json."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Training:
+    settings: FieldSettings
+    made_of: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        return self.settings.out.stem
+
+
+@dataclass(frozen=True, slots=True)
+class _Trained:
+    weights: bytes
+    metrics: dict[str, Any]
+
+
+def train_several(
+    settings: Sequence[FieldSettings],
+    train: TrainOne,
+    executor: Executor | None = None,
+    *,
+    threads: int = 1,
+    shares_disk: bool = True,
+) -> Iterator[Progress]:
+    """Train fields and write each when it is done; what an earlier run has made of the same is left as it is.
+
+    Args:
+        settings: of each training; no two write to one place.
+        train: the method, such as `train_field`; can be sent to other processes.
+        executor: trains them side by side, if given; else this process does, one after the other, in all its threads.
+        threads: of each training by the executor.
+        shares_disk: whether the executor's workers reach the outputs. Then checkpoints lie beside these, and what a
+            worker had begun when it died is gone on with.
+
+    Yields:
+        Finished objects of all; in this process, with the seconds (or steps) of the one that is being trained.
+
+    Raises:
+        InvalidInput: if settings are out of range, which is told before anything is trained.
+        CorruptFile: if a set is not sound, which is told in the same way, or nothing could be learned from it: by an
+            executor, told when the others are done.
+        CannotWrite: if an output cannot be written, which is tried first.
+        WorkerDied: if a worker process ended; what was done until then is kept.
+    """
+    missing = []
+    for one in settings:
+        yield Progress(0, len(settings), f"Reading the images of {one.out.stem}")
+        next(train(replace(one, device="cpu")))  # refuses what cannot work; of devices, the worker knows
+        training = _Training(one, _made_of(one))
+        if not _is_finished(training):
+            missing.append(training)
+    done, total = len(settings) - len(missing), len(settings)
+    yield Progress(done, total, f"{done} of {total} trained")
+    if executor is None:
+        yield from _one_by_one(missing, train, done, total)
+        return
+    for trained, last in enumerate(_side_by_side(missing, train, executor, threads, shares_disk), start=done + 1):
+        yield Progress(trained, total, f"{trained} of {total} trained, {last}")
+
+
+def _made_of(settings: FieldSettings) -> dict[str, Any]:
+    """Plain JSON of everything a field depends on, wherever set and output lie."""
+    plain = {key: value for key, value in asdict(settings).items() if key not in ("data", "out")}
+    return {"settings": plain, "images": [images.digest() for images in read_splits(settings.data)]}
+
+
+def _is_finished(training: _Training) -> bool:
+    try:
+        there = _read(training.settings.out)
+    except (OSError, ValueError):
+        return False
+    return there.metrics.get(_MADE_OF) == _record(training, there.weights)
+
+
+def _record(training: _Training, weights: bytes) -> dict[str, Any]:
+    return {**training.made_of, "weights_sha256": hashlib.sha256(weights).hexdigest()}
+
+
+def _read(out: Path) -> _Trained:
+    return _Trained(out.read_bytes(), json.loads(out.with_suffix(".json").read_text(encoding="utf-8")))
+
+
+def _keep(training: _Training, trained: _Trained) -> None:
+    out = training.settings.out
+    write_atomically(out, trained.weights)
+    write_json(out.with_suffix(".json"), {**trained.metrics, _MADE_OF: _record(training, trained.weights)})
+
+
+def _one_by_one(missing: Sequence[_Training], train: TrainOne, done: int, total: int) -> Iterator[Progress]:
+    for number, training in enumerate(missing, start=done):
+        for step in train(training.settings):
+            own = step.progress
+            yield Progress(number * own.total + own.done, total * own.total, f"{training.name}: {own.note}")
+        _keep(training, _read(training.settings.out))
+
+
+def _side_by_side(
+    missing: Sequence[_Training], train: TrainOne, executor: Executor, threads: int, shares_disk: bool
+) -> Iterator[str]:
+    """What was reached, in words, of each object when it is finished and kept."""
+    running: dict[Future[_Trained], _Training] = {}
+    failed: list[OsfError] = []
+    try:
+        for training in missing:
+            settings = replace(training.settings, data=training.settings.data.absolute())
+            work = _trained_beside if shares_disk else _trained_elsewhere
+            running[executor.submit(work, settings, train, threads)] = training
+        while running:
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                training = running.pop(future)
+                if isinstance(error := future.exception(), OsfError):  # hours of the others shall not be lost
+                    failed.append(error)
+                    continue
+                trained = future.result()
+                _keep(training, trained)
+                yield f"{training.name} with {trained.metrics['psnr_full']:.1f} dB held out"
+    except BrokenProcessPool as error:
+        raise WorkerDied("training a field") from error
+    finally:
+        for future in running:
+            future.cancel()
+    if failed:
+        raise failed[0]
+
+
+def _trained_beside(settings: FieldSettings, train: TrainOne, threads: int) -> _Trained:
+    """Train in a worker, with its checkpoints beside the output."""
+    with computing_threads(threads):
+        for _ in train(settings):
+            pass
+    return _read(settings.out)
+
+
+def _trained_elsewhere(settings: FieldSettings, train: TrainOne, threads: int) -> _Trained:
+    """Train in a worker that may not see the output."""
+    with TemporaryDirectory() as folder:
+        return _trained_beside(replace(settings, out=Path(folder) / settings.out.name), train, threads)

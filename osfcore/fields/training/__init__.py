@@ -1,1 +1,0 @@
-"""Training of fields from image sets."""

@@ -1,0 +1,135 @@
+"""Checkpoints of trainings in PyTorch, and parameters of networks in safetensors files; both checked when read."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from osfcore.errors import CorruptFile, shown
+from osfcore.io.files import write_atomically
+
+# Checkpoints of trainings in PyTorch: written whole, and gone on from by the same run alone.
+#
+# A checkpoint that is missing, cut short or of another run lets a training start over. One of this run that cannot
+# be taken over ends it: a run restored by half would learn something else, and starting over would lose the work
+# unasked.
+
+
+_MOST_CHARACTERS = 100  # of what PyTorch says
+
+
+def write_checkpoint(path: Path, fingerprint: object, content: Mapping[str, Any]) -> None:
+    """Write what a run needs to go on; the former checkpoint stays until this one is whole.
+
+    Args:
+        path: of the file.
+        fingerprint: settings and data of the run.
+        content: tensors, numbers, words, and lists and dicts of them.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    buffer = io.BytesIO()
+    torch.save({**content, "fingerprint": fingerprint}, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def read_content(path: Path, fingerprint: object) -> dict[str, Any] | None:
+    """What a run has written to go on, in main memory; None if it is missing, cut short or of another run.
+
+    Raises:
+        CorruptFile: if there is a file, but it cannot be read at all.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise CorruptFile(path, f"it cannot be read ({error.strerror or error})") from error
+    try:
+        content = torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")
+        return content if content["fingerprint"] == fingerprint else None
+    except MemoryError:
+        raise
+    except Exception:  # PyTorch has no error of its own for what is no checkpoint
+        return None
+
+
+@contextlib.contextmanager
+def going_on_from(path: Path) -> Iterator[None]:
+    """Tell in one sentence that a checkpoint of this run cannot be taken over.
+
+    Raises:
+        CorruptFile: for whatever is raised while that is tried, other than a lack of memory.
+    """
+    try:
+        yield
+    except (MemoryError, torch.OutOfMemoryError):
+        raise
+    except Exception as error:
+        told = f"{type(error).__name__}: {error}".splitlines()[0][:_MOST_CHARACTERS]
+        reason = f"the training cannot go on from it ({told}); delete it to start over, or write to another file"
+        raise CorruptFile(path, reason) from error
+
+
+def resume_from(path: Path, fingerprint: object, restore: Callable[[dict[str, Any]], None]) -> None:
+    """Go on from a checkpoint of the same run; a run whose checkpoint is missing, cut short or old starts over.
+
+    Args:
+        path: of the file.
+        fingerprint: must be that of the checkpoint.
+        restore: takes over the content, which lies in main memory.
+
+    Raises:
+        CorruptFile: if the checkpoint cannot be read, or taken over; what `restore` was to change is then of no use.
+    """
+    content = read_content(path, fingerprint)
+    if content is not None:
+        with going_on_from(path):
+            restore(content)
+
+
+# Parameters of networks in safetensors files, checked when read.
+
+
+def read_parameters(path: Path, expected: str, what: str) -> tuple[Mapping[str, str], dict[str, Tensor]]:
+    """Metadata and finite parameters of a file of the expected format.
+
+    Args:
+        path: of the file.
+        expected: format that the metadata must name.
+        what: kind of network, for messages.
+
+    Raises:
+        CorruptFile: if the file is missing, cut short, of another format, or holds what is not finite.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            values = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, OSError) as error:
+        raise CorruptFile(path, f"it holds no {what} ({shown(error)})") from error
+    if metadata.get("format") != expected:
+        raise CorruptFile(path, f"it is not of the format {expected}")
+    if not all(bool(torch.isfinite(value).all()) for value in values.values()):
+        raise CorruptFile(path, "its parameters are not all finite")
+    return metadata, values
+
+
+def load_parameters(network: nn.Module, values: Mapping[str, Tensor], path: Path) -> None:
+    """Give a network the parameters of a file.
+
+    Raises:
+        CorruptFile: if they are not those of such a network.
+    """
+    try:
+        network.load_state_dict(values)
+    except RuntimeError as error:
+        raise CorruptFile(path, "its parameters do not fit its description") from error

@@ -1,1 +1,0 @@
-"""Compositional rendering of KiloOSFs as published: paper eq. 3 with shadow mapping."""

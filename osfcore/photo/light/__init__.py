@@ -1,1 +1,0 @@
-"""The light of photographs."""

@@ -1,1 +1,0 @@
-"""Poses and masks that other programs found: files of BOP, PoseCNN and plain JSON."""

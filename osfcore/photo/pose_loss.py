@@ -1,0 +1,674 @@
+"""How well an object in a pose explains photographs: its outline, shading and texture, compared by surfels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int32
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+
+from osfcore.errors import InvalidInput
+from osfcore.estimation.objective import RestingOrientations, fibonacci_sphere
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.fields.kiloosf_query import KiloQuery
+from osfcore.fields.rays import ONE_AT_A_TIME, march
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose, orthogonal_basis, quaternion_conjugate, quaternion_to_matrix, rotate
+from osfcore.photo.photograph import Photograph
+
+# Compiled comparison of an object's surfels in many poses with one photograph. Only `pose_objective.py` calls it.
+
+
+# ruff: noqa: ANN001, D417 - compiled code; types are given by its caller
+
+
+NOTHING = -1
+TERMS = 4  # of what `compare_poses` writes: IoU, relative residual, correlation, share of the mask that was compared
+_LIGHTS = 4  # ambient and first-order harmonics
+_NEAREST_M = np.float32(0.02)
+_OPTIONS = {"fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
+_SMALL, _LARGE = 1, 5  # half sides of the band-pass's windows [px]
+_CONTRAST_FLOOR = 0.02  # of the mean luminance: contrast below it counts as noise
+_AMBIENT_RIDGE, _HARMONIC_RIDGE = 1e-4, 2e-2  # of the ambient term's weight
+
+
+@numba.njit(**_OPTIONS)
+def _close_gaps(nearest, index) -> None:
+    """Fill pixels between two drawn ones: slanted surfaces are sampled with gaps."""
+    height, width = index.shape
+    for row in range(height):
+        for column in range(width):
+            if index[row, column] >= 0:
+                continue
+            if 0 < column < width - 1 and index[row, column - 1] >= 0 and index[row, column + 1] >= 0:
+                index[row, column], nearest[row, column] = index[row, column - 1], nearest[row, column - 1]
+            elif 0 < row < height - 1 and index[row - 1, column] >= 0 and index[row + 1, column] >= 0:
+                index[row, column], nearest[row, column] = index[row - 1, column], nearest[row - 1, column]
+
+
+@numba.njit(**_OPTIONS)
+def draw_surfels(points, normals, half, r, t, lens, nearest, index) -> None:
+    """Draw surfels by z-buffer.
+
+    Args:
+        points, normals: S x 3, in the object's frame [m].
+        half: half the side of a surfel's square [m].
+        r, t: 3 x 3 and 3, from the object's frame to the camera's.
+        lens: focal lengths and principal point (fx, fy, cx, cy) [px].
+        nearest, index: h x w, results: depth along z [m] and number of the surfel, -1 where there is none.
+    """
+    height, width = index.shape
+    nearest[:] = np.float32(1e9)
+    index[:] = NOTHING
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    for s in range(len(points)):
+        px, py, pz = points[s, 0], points[s, 1], points[s, 2]
+        x = r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + t[0]
+        y = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + t[1]
+        z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + t[2]
+        if z < _NEAREST_M:
+            continue
+        qx, qy, qz = normals[s, 0], normals[s, 1], normals[s, 2]
+        nx = r[0, 0] * qx + r[0, 1] * qy + r[0, 2] * qz
+        ny = r[1, 0] * qx + r[1, 1] * qy + r[1, 2] * qz
+        nz = r[2, 0] * qx + r[2, 1] * qy + r[2, 2] * qz
+        if nx * x + ny * y + nz * z > np.float32(0):  # it looks away
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        # A disc of normal n extends by half * sqrt(1 - n_x^2) along x: edge-on ones do not widen outlines.
+        side_x = half * np.sqrt(max(np.float32(1) - nx * nx, np.float32(0))) * fx / z
+        side_y = half * np.sqrt(max(np.float32(1) - ny * ny, np.float32(0))) * fy / z
+        x0, x1 = int(np.ceil(u - side_x - np.float32(0.5))), int(np.floor(u + side_x - np.float32(0.5)))
+        y0, y1 = int(np.ceil(v - side_y - np.float32(0.5))), int(np.floor(v + side_y - np.float32(0.5)))
+        for row in range(max(y0, 0), min(y1, height - 1) + 1):
+            for column in range(max(x0, 0), min(x1, width - 1) + 1):
+                if z < nearest[row, column]:
+                    nearest[row, column] = z
+                    index[row, column] = s
+    _close_gaps(nearest, index)
+
+
+@numba.njit(**_OPTIONS)
+def _fit_light(albedo, normals, r, index, compared, image, fitted) -> float:
+    """Least squares of I = albedo * (a + b . n) for each colour on compared pixels; returns the squared residual."""
+    height, width = index.shape
+    count = 0
+    for row in range(height):
+        for column in range(width):
+            count += compared[row, column]
+    where, basis = np.empty((count, 2), np.int64), np.ones((count, _LIGHTS))
+    k = 0
+    for row in range(height):
+        for column in range(width):
+            if compared[row, column]:
+                s = index[row, column]
+                for c in range(3):
+                    basis[k, c + 1] = r[c, 0] * normals[s, 0] + r[c, 1] * normals[s, 1] + r[c, 2] * normals[s, 2]
+                where[k, 0], where[k, 1] = row, column
+                k += 1
+    fitted[:] = 0
+    residual = 0.0
+    normal, right = np.zeros((_LIGHTS, _LIGHTS)), np.zeros(_LIGHTS)
+    for colour in range(3):
+        normal[:], right[:] = 0.0, 0.0
+        for k in range(count):
+            a = albedo[index[where[k, 0], where[k, 1]], colour]
+            y = image[where[k, 0], where[k, 1], colour]
+            for i in range(_LIGHTS):
+                right[i] += a * basis[k, i] * y
+                for j in range(i + 1):
+                    normal[i, j] += a * a * basis[k, i] * basis[k, j]
+        whole = normal[0, 0] + 1e-6
+        for i in range(_LIGHTS):
+            for j in range(i):
+                normal[j, i] = normal[i, j]
+            normal[i, i] += (_HARMONIC_RIDGE if i else _AMBIENT_RIDGE) * whole
+        light = np.linalg.solve(normal, right)
+        for k in range(count):
+            row, column = where[k, 0], where[k, 1]
+            value = 0.0
+            for i in range(_LIGHTS):
+                value += light[i] * basis[k, i]
+            value *= albedo[index[row, column], colour]
+            residual += (value - image[row, column, colour]) ** 2
+            fitted[row, column] += value / 3
+    return residual
+
+
+@numba.njit(**_OPTIONS)
+def _summed(values, weights, table) -> None:
+    """Summed-area table of values * weights."""
+    height, width = weights.shape
+    table[0, :] = 0.0
+    for row in range(height):
+        line = 0.0
+        table[row + 1, 0] = 0.0
+        for column in range(width):
+            if weights[row, column]:
+                line += values[row, column]
+            table[row + 1, column + 1] = table[row, column + 1] + line
+
+
+@numba.njit(**_OPTIONS)
+def _window_sum(table, row, column, half) -> float:
+    """Sum of a square window."""
+    r0, c0 = max(row - half, 0), max(column - half, 0)
+    r1, c1 = min(row + half + 1, table.shape[0] - 1), min(column + half + 1, table.shape[1] - 1)
+    return table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0]
+
+
+@numba.njit(**_OPTIONS)
+def _correlation(fitted, luminance, compared, tables) -> float:
+    """Correlation of two band-passed images on compared pixels."""
+    ones = np.ones_like(fitted)
+    _summed(ones, compared, tables[0])
+    _summed(fitted, compared, tables[1])
+    _summed(luminance, compared, tables[2])
+    a2 = b2 = ab = level = 0.0
+    count = 0
+    for row in range(compared.shape[0]):
+        for column in range(compared.shape[1]):
+            if compared[row, column]:
+                near = _window_sum(tables[0], row, column, _SMALL)
+                wide = _window_sum(tables[0], row, column, _LARGE)
+                a = (
+                    _window_sum(tables[1], row, column, _SMALL) / near
+                    - _window_sum(tables[1], row, column, _LARGE) / wide
+                )
+                b = (
+                    _window_sum(tables[2], row, column, _SMALL) / near
+                    - _window_sum(tables[2], row, column, _LARGE) / wide
+                )
+                a2 += a * a
+                b2 += b * b
+                ab += a * b
+                level += luminance[row, column]
+                count += 1
+    floor = (_CONTRAST_FLOOR * level / max(count, 1)) ** 2 * count
+    return ab / np.sqrt((a2 + floor) * (b2 + floor) + 1e-12)
+
+
+@numba.njit(parallel=True, **_OPTIONS)
+def compare_poses(
+    points, normals, albedo, half, rotations, positions, lens, image, luminance, mask, known, plain, terms
+) -> None:
+    """Compare B poses with one window of a photograph.
+
+    Args:
+        points, normals, albedo, half: surfels, see `draw_surfels`.
+        rotations, positions: B x 3 x 3 and B x 3, from the object's frame to the camera's.
+        lens: of the window.
+        image, luminance: linear radiance, h x w x 3, and its mean over colours.
+        mask, known, plain: pixels of the object; pixels where that is known; well exposed pixels within the mask.
+        terms: B x 4, results.
+    """
+    height, width = mask.shape
+    for b in numba.prange(len(positions)):
+        nearest, index = np.empty((height, width), np.float32), np.empty((height, width), np.int32)
+        draw_surfels(points, normals, half, rotations[b], positions[b], lens, nearest, index)
+        compared = np.zeros((height, width), np.uint8)
+        common = either = count = own = 0
+        energy = missing = 0.0
+        for row in range(height):
+            for column in range(width):
+                shown = index[row, column] >= 0
+                if known[row, column]:
+                    common += shown and mask[row, column]
+                    either += shown or mask[row, column]
+                if plain[row, column]:
+                    own += 1
+                    bright = 0.0
+                    for c in range(3):
+                        bright += image[row, column, c] ** 2
+                    energy += bright
+                    if shown:
+                        compared[row, column] = 1
+                        count += 1
+                    else:  # a smaller outline must not leave out what fits worst
+                        missing += bright
+        terms[b, 0], terms[b, 1], terms[b, 2] = common / max(either, 1), 1.0, 0.0
+        terms[b, 3] = count / max(own, 1)
+        if count < 12 or energy <= 0:
+            continue
+        fitted = np.empty((height, width))
+        residual = _fit_light(albedo, normals, rotations[b], index, compared, image, fitted)
+        terms[b, 1] = min(np.sqrt((residual + missing) / energy), 1.0)
+        terms[b, 2] = _correlation(fitted, luminance, compared, np.empty((3, height + 1, width + 1)))
+
+
+@numba.njit(parallel=True, **_OPTIONS)
+def draw_poses(points, normals, half, rotations, positions, lens, nearest, index) -> None:
+    """`draw_surfels` for B poses; nearest and index are B x h x w."""
+    for b in numba.prange(len(positions)):
+        draw_surfels(points, normals, half, rotations[b], positions[b], lens, nearest[b], index[b])
+
+
+# Surfels of a field: points of its surface with normal and albedo, a stand-in for it that draws in a millisecond.
+#
+# The surface is where rays from outside have lost half of their light (transmittance 1/2). The normal is the
+# direction of the field's dipole; the albedo is the field's radiance where light and view both fall along the
+# normal, where ambient + diffuse = 1.
+
+
+_DIRECTIONS = 64  # views from all sides
+_AVERAGED = 6  # points of a cell whose albedo is averaged
+_NEIGHBOURS = 6  # whose normals are averaged
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Surfels:
+    """Points of an object's surface, in its frame.
+
+    Attributes:
+        points: [m].
+        normals: outward, unit.
+        albedo: linear reflectance per colour.
+        spacing: distance between neighbours [m].
+    """
+
+    points: Float32[np.ndarray, "S 3"]
+    normals: Float32[np.ndarray, "S 3"]
+    albedo: Float32[np.ndarray, "S 3"]
+    spacing: float
+
+    @property
+    def radius(self) -> float:
+        """Distance of the farthest point from the origin [m]."""
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+
+def surfels_of(field: KiloOSF, spacing: float) -> Surfels:
+    """Sample the surface of a field.
+
+    Args:
+        field: of the object.
+        spacing: wanted distance between points [m].
+    """
+    low, high = field.extent
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    points = np.concatenate([_seen_from(field, d, centre, radius, spacing) for d in fibonacci_sphere(_DIRECTIONS)])
+    cells = np.floor(points / spacing).astype(np.int64)
+    _, number, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    number = number.reshape(-1)
+    order = np.argsort(number, kind="stable")
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)  # within the cell
+    used = order[rank < _AVERAGED]
+    normals, albedo = _appearance(field, points[used])
+    mean, normal, colour = (_means(a, number[used], len(counts)) for a in (points[used], normals, albedo))
+    return Surfels(mean, _smoothed(mean, normal), colour, spacing)
+
+
+def _means(values: np.ndarray, number: np.ndarray, count: int) -> Float32[np.ndarray, "S 3"]:
+    """Mean of the values of each cell."""
+    sums = np.stack([np.bincount(number, column, count) for column in values.T], axis=1)
+    return (sums / np.bincount(number, minlength=count)[:, None]).astype(np.float32)
+
+
+def _seen_from(field: KiloOSF, direction: np.ndarray, centre: np.ndarray, radius: float, step: float) -> np.ndarray:
+    """Points where parallel rays along -direction have lost half of their light [m]."""
+    right, up = orthogonal_basis(direction)
+    line = np.arange(-radius, radius, step)
+    a, b = np.meshgrid(line, line, indexing="ij")
+    origins = centre + 1.5 * radius * direction + a.reshape(-1, 1) * right + b.reshape(-1, 1) * up
+    rays = np.tile(-direction, (len(origins), 1))
+    delta = field.voxel / 2
+    ts, used = march(field, origins, rays, step=delta, min_weight=1e-4, min_transmittance=0.3, most=48)
+    points = (origins[:, None] + ts[..., None] * rays[:, None]).astype(np.float32)
+    taus = np.zeros(used.shape)
+    with torch.no_grad():
+        taus[used] = KiloQuery(field).density(torch.as_tensor(points[used])).numpy() * delta
+    passed_half = np.cumsum(taus, axis=1) > np.log(2)
+    return points[np.arange(len(points)), np.argmax(passed_half, axis=1)][passed_half.any(axis=1)]
+
+
+def _appearance(field: KiloOSF, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals and albedos at points."""
+    query = KiloQuery(field)
+    with torch.no_grad():
+        x = torch.as_tensor(points)
+        normals = torch.nn.functional.normalize(query.features(x)[:, 4:7], dim=-1)
+        scatter = query(x, normals, -normals)
+        albedo = scatter.ambient + scatter.direct
+    return normals.numpy(), albedo.numpy()
+
+
+def _smoothed(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Unit normals, each the mean of those of its nearest neighbours."""
+    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    _, near = KDTree(points).query(points, k=_NEIGHBOURS)
+    mean = unit[near].mean(axis=1)
+    return (mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+
+
+# The part of a photograph around one object's mask, at the resolution that a search asks for.
+
+
+_MARGIN = 0.4  # of the mask's longest side, on each side
+_MIN_PIXELS = 30  # of a mask in the photograph
+
+
+@dataclass(frozen=True, slots=True)
+class WindowFrame:
+    """Which part of a photograph a window shows, and its size; it may reach beyond the photograph.
+
+    Attributes:
+        left, top, right, bottom: of the part, the last two not included [px of the photograph].
+        width, height: of the window [px].
+    """
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    width: int
+    height: int
+
+    def cut(self, array: Float32[np.ndarray, "h w *colours"], outside: float = 0.0) -> Float32[np.ndarray, "*window"]:
+        """That part of an image, averaged over areas; `outside` beyond the photograph."""
+        high, wide = array.shape[:2]
+        inner = array[max(self.top, 0) : self.bottom, max(self.left, 0) : self.right]
+        border = max(-self.top, 0), max(self.bottom - high, 0), max(-self.left, 0), max(self.right - wide, 0)
+        whole = cv2.copyMakeBorder(inner, *border, cv2.BORDER_CONSTANT, value=(outside,) * 4)
+        return cv2.resize(whole, (self.width, self.height), interpolation=cv2.INTER_AREA)
+
+    def intrinsics(self, photo: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+        """Of the window's camera, from the photograph's [px]."""
+        moved = photo.copy()
+        moved[:2, 2] -= self.left, self.top
+        scale = [[self.width / (self.right - self.left)], [self.height / (self.bottom - self.top)], [1.0]]
+        return moved * np.array(scale)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectWindow:
+    """A window of a photograph.
+
+    Attributes:
+        image: linear radiance.
+        luminance: its mean over colours.
+        mask: pixels of the object.
+        known: pixels of which the mask tells whether they show the object: none that another object may hide, and none
+            outside the photograph.
+        plain: well exposed pixels within the mask, one pixel away from its border.
+        signed_distance: to the mask's border, positive inside [px].
+        intrinsics: of the window [px].
+        T_camera_world: the inverse of the camera's pose.
+        cut: share of the mask's border that lies on the photograph's edge.
+        frame: which part of the photograph it is.
+    """
+
+    image: Float32[np.ndarray, "h w 3"]
+    luminance: Float32[np.ndarray, "h w"]
+    mask: Bool[np.ndarray, "h w"]
+    known: Bool[np.ndarray, "h w"]
+    plain: Bool[np.ndarray, "h w"]
+    signed_distance: Float32[np.ndarray, "h w"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    T_camera_world: Pose
+    cut: float
+    frame: WindowFrame
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width [px]."""
+        height, width = self.mask.shape
+        return height, width
+
+    @property
+    def centroid(self) -> Float[np.ndarray, "2"]:
+        """Of the mask (x, y) [px]."""
+        rows, columns = np.nonzero(self.mask)
+        return np.array([columns.mean(), rows.mean()]) + 0.5
+
+    def camera(self, name: str) -> Camera:
+        """The window's camera, for renderers."""
+        height, width = self.size
+        return Camera(name, self.T_camera_world.inverse(), self.intrinsics, width, height)
+
+
+def object_windows(photos: Sequence[Photograph], name: str, side: int) -> tuple[ObjectWindow, ...]:
+    """A window of each photograph with a mask of the object.
+
+    Args:
+        photos: of one scene.
+        name: of the object.
+        side: longest side that the mask shall have [px]; smaller masks are not enlarged.
+
+    Raises:
+        InvalidInput: if no photograph has a mask of the object, or it has too few pixels.
+    """
+    windows = tuple(_window(photo, name, side) for photo in photos if name in photo.masks)
+    if not windows:
+        raise InvalidInput(f"mask of {name}", "missing", "given in at least one photo; draw a box around the object")
+    return windows
+
+
+def _window(photo: Photograph, name: str, side: int) -> ObjectWindow:
+    mask = photo.masks[name]
+    if mask.sum() < _MIN_PIXELS:
+        allowed = f"{_MIN_PIXELS} pixels or more; come closer or take a larger photo"
+        raise InvalidInput(f"size of the mask of {name}", f"{int(mask.sum())} pixels", allowed)
+    others = np.zeros_like(mask)
+    for other, its in photo.masks.items():
+        if other != name:
+            others |= its
+    frame = _frame(mask, side)
+    own = frame.cut(mask.astype(np.float32)) > 0.5
+    hidden = frame.cut((others & ~mask).astype(np.float32)) > 0.5
+    beyond = frame.cut(np.zeros(mask.shape, np.float32), 1.0) > 0.5
+    exposed = frame.cut(photo.well_exposed.astype(np.float32)) > 0.99
+    core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    image = np.ascontiguousarray(frame.cut(photo.image), np.float32)
+    return ObjectWindow(
+        image,
+        image.mean(axis=-1),
+        own,
+        ~(hidden | beyond),
+        core & exposed,
+        signed_distance(own),
+        frame.intrinsics(photo.intrinsics),
+        photo.T_world_camera.inverse(),
+        _share_cut(mask),
+        frame,
+    )
+
+
+def _frame(mask: Bool[np.ndarray, "h w"], side: int) -> WindowFrame:
+    rows, columns = np.nonzero(mask)
+    longest = int(max(np.ptp(rows), np.ptp(columns))) + 1
+    margin = int(_MARGIN * longest)
+    left, top = int(columns.min()) - margin, int(rows.min()) - margin
+    right, bottom = int(columns.max()) + 1 + margin, int(rows.max()) + 1 + margin
+    scale = min(1.0, side / longest)
+    width, height = max(round((right - left) * scale), 1), max(round((bottom - top) * scale), 1)
+    return WindowFrame(left, top, right, bottom, width, height)
+
+
+def _share_cut(mask: Bool[np.ndarray, "h w"]) -> float:
+    at_edge = int(mask[[0, -1]].sum() + mask[:, [0, -1]].sum())
+    border = int((mask & ~(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)).sum())
+    return at_edge / max(border + at_edge, 1)
+
+
+def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Distance from each pixel's centre to the border of a mask, positive inside [px]."""
+    inside, outside = np.asarray(distance_transform_edt(mask)), np.asarray(distance_transform_edt(~mask))
+    return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
+
+
+# What a known table tells of an object's pose: it probably stands on it, in one of its stable orientations.
+
+
+_HEIGHT_STD_M = 2e-3
+_TILT_STD_RAD = np.deg2rad(1.5)
+_FARTHEST = 20.0  # deviations, beyond which a refined object may as well lean or lie on another one
+_MOST_PENALTY = 10.0  # deviations that count at most while orientations are compared
+_DOWN = np.array([0.0, 0.0, -1.0])
+
+
+class TablePrior:
+    """Height of the lowest point above z = 0 and tilt from the nearest stable orientation, both normally distributed.
+
+    Beyond ten standard deviations the penalty is constant: objects may lie on objects.
+
+    Args:
+        resting: how the object can lie.
+    """
+
+    def __init__(self, resting: RestingOrientations) -> None:
+        self._hull = resting.hull
+        self._stable = np.unique(np.round(rotate(quaternion_conjugate(resting.quaternions), _DOWN), 6), axis=0)
+
+    def downs(self, pose: Pose) -> Float[np.ndarray, "K 3"]:
+        """Directions, in the pose's outer frame, one of which is down if the object stands in a stable orientation."""
+        return rotate(pose.quaternion, self._stable)
+
+    def extent(self, pose: Pose, direction: Float[np.ndarray, "3"]) -> float:
+        """How far the object reaches along a direction, from the outer frame's origin [m]."""
+        return float((pose.apply(self._hull) @ direction).max())
+
+    def penalties(self, poses: Pose) -> Float[np.ndarray, "B"]:
+        """Squared deviations of B poses, each of the two at most 100."""
+        lowest = rotate(poses.quaternion[:, None], self._hull)[..., 2].min(axis=1) + poses.position[:, 2]
+        cosines = (rotate(poses.quaternion[:, None], self._stable) @ _DOWN).max(axis=1)
+        heights = np.abs(lowest) / _HEIGHT_STD_M
+        tilts = np.arccos(np.clip(cosines, -1, 1)) / _TILT_STD_RAD
+        return np.minimum(heights, _MOST_PENALTY) ** 2 + np.minimum(tilts, _MOST_PENALTY) ** 2
+
+    def normal_equations(self, pose: Pose) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
+        """J^T J and -J^T r of one pose's deviations, for a shift [m] and a turn about its origin [rad] in the world."""
+        points = rotate(pose.quaternion, self._hull)
+        low = points[np.argmin(points[:, 2])]
+        height = low[2] + pose.position[2]
+        rows, residuals = [], []
+        if abs(height) < _FARTHEST * _HEIGHT_STD_M:
+            rows.append(np.concatenate([[0.0, 0.0, 1.0], np.cross(low, [0.0, 0.0, 1.0])]) / _HEIGHT_STD_M)
+            residuals.append(height / _HEIGHT_STD_M)
+        down = self.downs(pose)
+        nearest = down[np.argmax(down @ _DOWN)]
+        if np.arccos(np.clip(nearest @ _DOWN, -1, 1)) < _FARTHEST * _TILT_STD_RAD:
+            for axis in range(2):  # a turn by nearest x down brings it there
+                row = np.zeros(6)
+                row[3 + axis] = 1 / _TILT_STD_RAD
+                rows.append(row)
+                residuals.append(-np.cross(nearest, _DOWN)[axis] / _TILT_STD_RAD)
+        if not rows:
+            return np.zeros((6, 6)), np.zeros(6)
+        jacobian = np.array(rows)
+        return jacobian.T @ jacobian, -jacobian.T @ np.array(residuals)
+
+
+# How well an object in a pose explains photographs: outline, shading and texture.
+#
+#     L = (1 - IoU) + w_r * residual + w_c * (1 - correlation) [+ w_p * penalty of the table]
+#
+# IoU compares the drawn outline with the mask, where that is known (the paper's loss for real photographs).
+# Residual is the relative error sqrt(sum (I - I')^2 / sum I^2) on the mask where I' = albedo * (a + b . n): ambient
+# light and first-order harmonics for each colour and view, by least squares, so that exposure, white balance and
+# the lamp need not be known. Correlation is that of both images after a band pass: it sees labels and edges, and no
+# shading.
+
+
+LossKind = Literal["all", "iou"]
+_RESIDUAL, _CORRELATION, _TABLE = 1.0, 0.5, 1e-3  # weights
+_LEAST_COMPARED = 0.3  # of the mask's plain pixels must be drawn for colours to count
+_HALF_SIDE = 0.7  # of a surfel, in spacings
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PoseTerms:
+    """Parts of the loss of B poses, means over the photographs.
+
+    Attributes:
+        iou: intersection over union of drawn outline and mask.
+        residual: relative error of the colours.
+        correlation: of the band-passed images.
+        losses: the whole.
+    """
+
+    iou: Float[np.ndarray, "B"]
+    residual: Float[np.ndarray, "B"]
+    correlation: Float[np.ndarray, "B"]
+    losses: Float[np.ndarray, "B"]
+
+
+class PoseLoss:
+    """The loss of one object's poses in the world.
+
+    Args:
+        windows: of the photographs.
+        surfels: of the object.
+        table: what a known table tells; None where it is not known.
+        kind: "all", or "iou" for the outline alone, as in the paper.
+    """
+
+    def __init__(
+        self,
+        windows: Sequence[ObjectWindow],
+        surfels: Surfels,
+        *,
+        table: TablePrior | None = None,
+        kind: LossKind = "all",
+    ) -> None:
+        self.windows, self.surfels, self.table, self.kind = tuple(windows), surfels, table, kind
+
+    def __call__(self, poses: Pose) -> Float[np.ndarray, "B"]:
+        """Losses of B poses."""
+        return self.terms(poses).losses
+
+    def terms(self, poses: Pose) -> PoseTerms:
+        """Losses of B poses and what they consist of."""
+        found = np.mean([_compare(self.surfels, window, poses) for window in self.windows], axis=0)
+        few = found[:, 3] < _LEAST_COMPARED
+        residual, correlation = np.where(few, 1.0, found[:, 1]), np.where(few, 0.0, found[:, 2])
+        losses = 1 - found[:, 0]
+        if self.kind == "all":
+            losses = losses + _RESIDUAL * residual + _CORRELATION * (1 - correlation)
+        if self.table is not None:
+            losses = losses + _TABLE * self.table.penalties(poses)
+        return PoseTerms(found[:, 0], residual, correlation, losses)
+
+
+def draw(
+    surfels: Surfels, window: ObjectWindow, poses: Pose
+) -> tuple[Int32[np.ndarray, "B h w"], Float32[np.ndarray, "B h w"]]:
+    """The number of the surfel that each pixel of a window shows, -1 where none, and its depth along z [m]."""
+    local = window.T_camera_world @ poses
+    index = np.empty((len(poses.position), *window.size), np.int32)
+    depth = np.empty(index.shape, np.float32)
+    with ONE_AT_A_TIME:
+        draw_poses(
+            surfels.points, surfels.normals, _half(surfels), *_numbers(local), lens(window.intrinsics), depth, index
+        )
+    return index, depth
+
+
+def lens(intrinsics: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "4"]:
+    """Focal lengths and principal point for compiled code."""
+    return intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
+
+
+def _compare(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Float[np.ndarray, "B 4"]:
+    terms = np.empty((len(poses.position), TERMS))
+    mask, known, plain = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.plain))
+    rotations, positions = _numbers(window.T_camera_world @ poses)
+    with ONE_AT_A_TIME:
+        compare_poses(surfels.points, surfels.normals, surfels.albedo, _half(surfels), rotations, positions,
+                      lens(window.intrinsics), window.image, window.luminance, mask, known, plain, terms)  # fmt: skip
+    return terms
+
+
+def _numbers(local: Pose) -> tuple[np.ndarray, np.ndarray]:
+    rotations = np.ascontiguousarray(quaternion_to_matrix(local.quaternion), np.float32)
+    return rotations, np.ascontiguousarray(local.position, np.float32)
+
+
+def _half(surfels: Surfels) -> np.float32:
+    return np.float32(_HALF_SIDE * surfels.spacing)

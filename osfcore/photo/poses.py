@@ -1,0 +1,828 @@
+"""Poses of objects in photographs, from masks: search, alignment of surfels, doubts, and the objects' table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.estimation.objective import resting_orientations
+from osfcore.estimation.search import CMAES
+from osfcore.fields.kiloosf import KiloOSF
+from osfcore.geometry.poses import (
+    Pose,
+    orthogonal_basis,
+    quaternion_exp,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    rotate,
+    rotation_angle,
+)
+from osfcore.photo.photograph import Photograph
+from osfcore.photo.pose_loss import (
+    LossKind,
+    ObjectWindow,
+    PoseLoss,
+    Surfels,
+    TablePrior,
+    WindowFrame,
+    draw,
+    object_windows,
+    signed_distance,
+    surfels_of,
+)
+from osfcore.progress import Progress
+
+# Gauss-Newton on the pose of one object: direct image alignment of its visible surfels, and its outline on the
+# mask's.
+#
+# For visible surfels X_s with projections u_s, in each photograph and colour,
+#
+#     r_s = I(u_s) - albedo_s * (a + b . n_s),          d r_s / d xi = grad I(u_s) . d u_s / d xi,
+#
+# with the light a, b by robust least squares (Tukey) at every step; for surfels on the drawn outline
+#
+#     r_c = phi(u_c) - phi_drawn(u_c),                  d r_c / d xi = grad phi(u_c) . d u_c / d xi,
+#
+# phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. A mask whose border is
+# off by a constant is marginalised where the table tells how large an object appears. xi is a shift in the world
+# and a turn about the object's origin. Which surfels are visible is found anew at each step and frozen within it.
+
+
+_ITERATIONS = 40
+_DAMPING = 1e-4
+_MOST_TURN_RAD, _MOST_SHIFT = 0.1, 0.05  # of a step; the shift as a share of the distance
+_LEAST_TURN_RAD, _LEAST_SHIFT = 2e-4, 2e-5
+_COLOUR_WEIGHT = 0.1  # of a surfel's colour: neighbours err together
+_FARTHEST_PX, _OUTLINE_STD_PX = 8.0, 1.0
+_HUBER, _TUKEY = 1.5, 4.0  # deviations at which residuals begin to count less, and nothing
+_LEAST_STD = 0.004  # of colours [radiance]
+_FEWEST = 30  # surfels for colours to count
+_REWEIGHTINGS = 2
+_WORSE = 0.15  # a loss that much above the first: it went astray
+_BORDER_STD_PX, _BORDER_STD_ON_TABLE_PX = 0.1, 2.0  # of a constant error of the mask's border
+_CORRELATED = 0.03  # share of independent residuals: what the table says counts against them
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+_RIDGE = np.diag([1e-4, 2e-2, 2e-2, 2e-2])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Prepared:
+    """A window, its image blurred to the surfels' spacing, gradients, and where no other object is near."""
+
+    window: ObjectWindow
+    blurred: Float[np.ndarray, "h w 3"]
+    gradient: tuple[np.ndarray, np.ndarray]  # along x and y
+    distance_gradient: tuple[np.ndarray, np.ndarray]
+    clear: Bool[np.ndarray, "h w"]
+
+
+def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
+    """Refine one pose.
+
+    Args:
+        loss: whose windows, surfels and table are used. It decides in the end: a result that is clearly worse than the
+            best pose on the way gives way to that one.
+        start: near the solution: about a centimetre and ten degrees.
+
+    Returns:
+        The pose and its loss.
+    """
+    prepared = [_prepare(window, loss.surfels, start) for window in loss.windows]
+    first = float(loss(_batch(start))[0])
+    pose, best, least, value = start, start, first, first
+    for _ in range(_ITERATIONS):
+        normal, right = _normal_equations(prepared, loss, pose)
+        step = np.linalg.solve(normal + np.diag(_DAMPING * np.diag(normal) + 1e-9), right)
+        depth = float(np.linalg.norm((loss.windows[0].T_camera_world @ pose).position))
+        shift, turn = step[:3], step[3:]
+        shift *= min(1.0, _MOST_SHIFT * depth / max(float(np.linalg.norm(shift)), 1e-12))
+        turn *= min(1.0, _MOST_TURN_RAD / max(float(np.linalg.norm(turn)), 1e-12))
+        pose = Pose(pose.position + shift, quaternion_multiply(quaternion_exp(turn), pose.quaternion))
+        value = float(loss(_batch(pose))[0])
+        if value < least:
+            best, least = pose, value
+        if np.linalg.norm(shift) < _LEAST_SHIFT * depth and np.linalg.norm(turn) < _LEAST_TURN_RAD:
+            break
+    return (pose, value) if value < first + _WORSE else (best, least)
+
+
+def _batch(pose: Pose) -> Pose:
+    return Pose(pose.position[None], pose.quaternion[None])
+
+
+def _prepare(window: ObjectWindow, surfels: Surfels, start: Pose) -> _Prepared:
+    depth = (window.T_camera_world @ start).position[2]
+    sigma = max(0.5 * surfels.spacing * window.intrinsics[0, 0] / depth, 0.7)
+    blurred = gaussian_filter(window.image, (sigma, sigma, 0))
+    phi = gaussian_filter(window.signed_distance, 1.0)
+    unknown = (~window.known).astype(np.uint8)
+    clear = cv2.dilate(unknown, np.ones((5, 5), np.uint8)) == 0
+    return _Prepared(window, blurred, _gradient(blurred), _gradient(phi), clear)
+
+
+def _gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Along x and y [per px]."""
+    return np.asarray(np.gradient(image, axis=1)), np.asarray(np.gradient(image, axis=0))
+
+
+def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    for part in prepared:
+        index, _ = draw(loss.surfels, part.window, _batch(pose))
+        std = _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
+        terms = [_outline_terms(part, loss.surfels, pose, index[0], std)]
+        if loss.kind == "all":
+            terms.append(_colour_terms(part, loss.surfels, pose, index[0]))
+        for more_normal, more_right in terms:
+            normal += _CORRELATED * more_normal
+            right += _CORRELATED * more_right
+    if loss.table is not None:
+        more_normal, more_right = loss.table.normal_equations(pose)
+        normal += more_normal
+        right += more_right
+    return normal, right
+
+
+def _colour_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    seen = np.unique(index[(index >= 0) & part.window.plain])
+    pixels, jacobian = _project(part.window, pose, surfels.points[seen])
+    within = _sample(part.window.plain.astype(np.float32), pixels) > 0.6
+    seen, pixels, jacobian = seen[within], pixels[within], jacobian[within]
+    if len(seen) < _FEWEST:
+        return normal, right
+    rotation = quaternion_to_matrix((part.window.T_camera_world @ pose).quaternion)
+    basis = np.concatenate([np.ones((len(seen), 1)), surfels.normals[seen] @ rotation.T], axis=1)
+    for colour in range(3):
+        shades = basis * surfels.albedo[seen, colour, None]
+        residual, weights = _robust_fit(shades, _sample(part.blurred[..., colour], pixels))
+        x, y = (_sample(g[..., colour], pixels) for g in part.gradient)
+        slope = x[:, None] * jacobian[:, 0] + y[:, None] * jacobian[:, 1]
+        weighted = slope * (_COLOUR_WEIGHT * weights)[:, None]
+        normal += weighted.T @ slope
+        right -= weighted.T @ residual
+    return normal, right
+
+
+def _robust_fit(shades: np.ndarray, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of the least-squares light, and their weights over variance by Tukey's biweight."""
+    residual, std = _light_residual(shades, observed, np.ones(len(observed)))
+    for _ in range(_REWEIGHTINGS):
+        residual, std = _light_residual(shades, observed, _tukey(residual, std))
+    return residual, _tukey(residual, std) / std**2
+
+
+def _light_residual(shades: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Residuals under the light of weighted least squares, and their standard deviation by their median."""
+    normal = (shades * weights[:, None]).T @ shades
+    normal += _RIDGE * normal[0, 0] + 1e-9 * np.eye(len(normal))
+    residual = observed - shades @ np.linalg.solve(normal, (shades * weights[:, None]).T @ observed)
+    return residual, max(1.4826 * float(np.median(np.abs(residual))), _LEAST_STD)
+
+
+def _tukey(residual: np.ndarray, std: float) -> np.ndarray:
+    return (1 - np.minimum(np.abs(residual) / (_TUKEY * std), 1) ** 2) ** 2
+
+
+def _outline_terms(
+    part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray, border_std_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the outline; a border of the mask that is off by a constant is marginalised."""
+    shown = index >= 0
+    border = shown & (cv2.erode(shown.astype(np.uint8), _CROSS) == 0) & part.clear
+    pixels, jacobian = _project(part.window, pose, surfels.points[index[border]])
+    residual = _sample(part.window.signed_distance, pixels) - _sample(signed_distance(shown), pixels)
+    x, y = (_sample(g, pixels) for g in part.distance_gradient)
+    slope = x[:, None] * jacobian[:, 0] + y[:, None] * jacobian[:, 1]
+    sizes = np.abs(residual) / _OUTLINE_STD_PX
+    weights = np.where(np.abs(residual) < _FARTHEST_PX, np.minimum(1, _HUBER / np.maximum(sizes, 1e-9)), 0)
+    weights /= _OUTLINE_STD_PX**2
+    normal, right = (slope * weights[:, None]).T @ slope, -(slope * weights[:, None]).T @ residual
+    coupling, shift = slope.T @ weights, -float(weights @ residual)
+    own = float(weights.sum()) + 1 / (_CORRELATED * border_std_px**2)
+    return normal - np.outer(coupling, coupling) / own, right - coupling * shift / own
+
+
+def _project(
+    window: ObjectWindow, pose: Pose, points: Float[np.ndarray, "S 3"]
+) -> tuple[Float[np.ndarray, "S 2"], Float[np.ndarray, "S 2 6"]]:
+    """Pixels of an object's points, and their derivatives by a shift in the world and a turn about its origin."""
+    arms = points @ quaternion_to_matrix(pose.quaternion).T
+    local = window.T_camera_world.apply(arms + pose.position)
+    x, y, z = local.T
+    fx, fy = window.intrinsics[0, 0], window.intrinsics[1, 1]
+    pixels = local @ window.intrinsics.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    zero = np.zeros_like(z)
+    slope = np.stack([np.stack([fx / z, zero, -fx * x / z**2], -1), np.stack([zero, fy / z, -fy * y / z**2], -1)], 1)
+    slope = slope @ quaternion_to_matrix(window.T_camera_world.quaternion)
+    cross = np.zeros((len(points), 3, 3))  # of -[arm]x: a turn w moves a point by w x arm
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = arms[:, 2], -arms[:, 1], arms[:, 0]
+    cross -= np.swapaxes(cross, 1, 2)
+    return pixels, np.concatenate([slope, slope @ cross], axis=2)
+
+
+def _sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Bilinear values at pixel coordinates, whose centres are at +0.5."""
+    return map_coordinates(image, [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], order=1, mode="nearest")
+
+
+# Search for an object's pose: over all rotations from the mask, around a given pose, and by CMA-ES from the best.
+
+
+_CENTRING_ROUNDS = 3
+_MOST_CHANGE = 0.6  # of depth in one round
+_PSI = 1.533751168755204288118041413  # the positive root of psi^4 = psi + 4
+_LATERAL_PX, _DEPTH_SHARE, _TURN_RAD = 2.0, 0.03, 0.15  # CMA's first spread
+_AROUND_LATERAL_M, _AROUND_DEPTH_SHARE, _AROUND_TURN_RAD = 0.015, 0.04, 0.25
+
+
+def super_fibonacci(count: int) -> Float[np.ndarray, "count 4"]:
+    """Unit quaternions spread evenly over all rotations (super-Fibonacci spirals; Alexa, CVPR 2022)."""
+    s = np.arange(count) + 0.5
+    t = s / count
+    alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / _PSI
+    r, big = np.sqrt(t), np.sqrt(1 - t)
+    return np.stack([r * np.sin(alpha), r * np.cos(alpha), big * np.sin(beta), big * np.cos(beta)], axis=1)
+
+
+def poses_from_mask(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Pose:
+    """For each rotation the position at which the drawn outline has the centroid and the area of the mask.
+
+    The photograph with the largest mask decides.
+
+    Args:
+        loss: whose windows and surfels are used.
+        quaternions: rotations from the object's frame to the world, unit.
+    """
+    window = max(loss.windows, key=lambda w: int(w.mask.sum()))
+    K, centroid, area = window.intrinsics, window.centroid, float(window.mask.sum())
+    ray = np.linalg.solve(K, [*centroid, 1.0])
+    depth = K[0, 0] * loss.surfels.radius / np.sqrt(area / np.pi)
+    local = np.tile(ray * depth, (len(quaternions), 1))
+    camera = window.T_camera_world.inverse()
+    rows, columns = np.mgrid[: window.size[0], : window.size[1]] + 0.5
+    for _ in range(_CENTRING_ROUNDS):
+        index, _ = draw(loss.surfels, window, Pose(camera.apply(local), quaternions))
+        shown = index >= 0
+        found = np.maximum(shown.sum(axis=(1, 2)), 1)
+        x, y = (shown * columns).sum(axis=(1, 2)) / found, (shown * rows).sum(axis=(1, 2)) / found
+        shift = (centroid - np.stack([x, y], axis=1)) / K[[0, 1], [0, 1]] * local[:, 2:]
+        share = np.clip(np.sqrt(found / area), _MOST_CHANGE, 1 / _MOST_CHANGE)
+        shift[found <= 1] = 0
+        local = np.concatenate([local[:, :2] + shift, local[:, 2:]], axis=1) * share[:, None]
+    return Pose(camera.apply(local), quaternions)
+
+
+def poses_around(pose: Pose, window: ObjectWindow, count: int, rng: np.random.Generator) -> Pose:
+    """The given pose and random ones around it: about 1.5 cm sideways, 4 % nearer or farther, 15 degrees turned.
+
+    Args:
+        pose: of one object in the world.
+        window: of a photograph: it tells what is sideways.
+        count: of poses.
+        rng: of the draws.
+    """
+    depth = (window.T_camera_world @ pose).position[2]
+    scales = np.array([_AROUND_LATERAL_M, _AROUND_LATERAL_M, _AROUND_DEPTH_SHARE * depth, *[_AROUND_TURN_RAD] * 3])
+    steps = rng.standard_normal((count, 6)) * scales
+    steps[0] = 0
+    return moved(pose, window, steps)
+
+
+def moved(poses: Pose, window: ObjectWindow, steps: Float[np.ndarray, "B 6"]) -> Pose:
+    """Poses shifted along a camera's axes [m] and turned about their origins by rotation vectors in its frame [rad]."""
+    camera = window.T_camera_world.inverse()
+    turns = quaternion_exp(rotate(camera.quaternion, steps[:, 3:]))
+    quaternions = quaternion_multiply(turns, np.broadcast_to(poses.quaternion, (len(steps), 4)))
+    return Pose(poses.position + rotate(camera.quaternion, steps[:, :3]), quaternions)
+
+
+def distinct(poses: Pose, losses: Float[np.ndarray, "K"], count: int, least_deg: float) -> list[int]:
+    """Numbers of the best poses whose rotations differ from those of better ones by `least_deg` or more."""
+    kept: list[int] = []
+    for k in np.argsort(losses):
+        if not kept or rotation_angle(poses.quaternion[kept], poses.quaternion[k]).min() > np.deg2rad(least_deg):
+            kept.append(int(k))
+        if len(kept) == count:
+            break
+    return kept
+
+
+def cma_search(
+    loss: PoseLoss, starts: Pose, *, generations: int, population: int, spread: float, rng: np.random.Generator
+) -> tuple[Pose, Float[np.ndarray, "K"]]:
+    """One CMA-ES from each start; a generation of all is drawn as one batch.
+
+    Args:
+        loss: what is minimised.
+        starts: K poses.
+        generations: of each search.
+        population: of each search.
+        spread: first standard deviation, as a multiple of 2 pixels sideways, 3 % of the depth and 0.15 rad.
+        rng: of the searches.
+
+    Returns:
+        The best pose of each search and its loss.
+    """
+    window = max(loss.windows, key=lambda w: int(w.mask.sum()))
+    depths = (window.T_camera_world @ starts).position[:, 2]
+    lateral = _LATERAL_PX * depths / window.intrinsics[0, 0]
+    scales = spread * np.stack(
+        [lateral, lateral, _DEPTH_SHARE * depths, *[np.full(len(depths), _TURN_RAD)] * 3], axis=1
+    )
+    searches = [CMAES(np.ones(6), population, rng) for _ in depths]
+    position, quaternion = starts.position.copy(), starts.quaternion.copy()
+    least = loss(starts)
+    for _ in range(generations):
+        asked = [search.ask() for search in searches]
+        tried = Pose.joined(*(moved(starts[k], window, a * scales[k]) for k, a in enumerate(asked)))
+        losses = loss(tried).reshape(len(searches), population)
+        for k, search in enumerate(searches):
+            search.tell(losses[k])
+            best = int(np.argmin(losses[k]))
+            if losses[k, best] < least[k]:
+                least[k], number = losses[k, best], k * population + best
+                position[k], quaternion[k] = tried.position[number], tried.quaternion[number]
+    return Pose(position, quaternion), least
+
+
+# The table's plane from how objects lie: most stand in a stable orientation, on one plane.
+
+
+_AGREE_DEG = 12.0
+_AGREE_M = 0.02
+_FEWEST_OBJECTS = 2  # objects; one alone does not tell which of its sides is down
+_DOWNWARD = np.array([0.0, 1.0, 0.5])  # in a camera's frame: it looks ahead and down
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TableGuess:
+    """A table that objects lie on.
+
+    Attributes:
+        T_world_camera: such that it is z = 0, its origin below the objects' mean.
+        spread_deg: of the objects' verticals around their mean, root mean square.
+        supported: numbers of the objects that lie on it.
+    """
+
+    T_world_camera: Pose
+    spread_deg: float
+    supported: tuple[int, ...]
+
+
+def table_from_objects(priors: Sequence[TablePrior], poses: Sequence[Pose]) -> TableGuess | None:
+    """The plane that most objects stand on; None if fewer than two agree.
+
+    The vertical is the direction that a stable orientation of most objects agrees with within 12 degrees; the plane is
+    at the median of their lowest points, of which those within 2 cm count.
+
+    Args:
+        priors: of each object.
+        poses: of each object in the camera's frame.
+    """
+    options = [prior.downs(pose) for prior, pose in zip(priors, poses, strict=True)]
+    options = [o[o @ _DOWNWARD > 0] for o in options]
+    best: tuple[float, list[tuple[int, np.ndarray]]] = 0.0, []
+    for candidate in np.concatenate([np.zeros((0, 3)), *options]):
+        agreeing = []
+        for number, directions in enumerate(options):
+            if len(directions) and (directions @ candidate).max() > np.cos(np.deg2rad(_AGREE_DEG)):
+                agreeing.append((number, directions[np.argmax(directions @ candidate)]))
+        score = len(agreeing) + float(np.mean([d @ candidate for _, d in agreeing]))
+        if score > best[0]:
+            best = score, agreeing
+    down = np.sum([d for _, d in best[1]], axis=0)
+    if len(best[1]) < _FEWEST_OBJECTS or np.linalg.norm(down) == 0:
+        return None
+    down /= np.linalg.norm(down)
+    reach = {number: priors[number].extent(poses[number], down) for number, _ in best[1]}
+    level = float(np.median(list(reach.values())))
+    supported = tuple(number for number, height in reach.items() if abs(height - level) < _AGREE_M)
+    if len(supported) < _FEWEST_OBJECTS:
+        return None
+    level = float(np.mean([reach[number] for number in supported]))
+    angles = [np.arccos(np.clip(d @ down, -1, 1)) for number, d in best[1] if number in supported]
+    spread = float(np.rad2deg(np.sqrt(np.mean(np.square(angles)))))
+    return TableGuess(_frame(poses, supported, down, level), spread, supported)
+
+
+def _frame(poses: Sequence[Pose], supported: tuple[int, ...], down: np.ndarray, level: float) -> Pose:
+    """`T_world_camera` with z up, opposite to `down`, and z = 0 at `level` along it."""
+    middle = np.mean([poses[number].position for number in supported], axis=0)
+    origin = middle + (level - middle @ down) * down
+    right, _ = orthogonal_basis(-down)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(-down, right), -down], axis=1)
+    matrix[:3, 3] = origin
+    return Pose.from_matrix(matrix).inverse()
+
+
+# The table's plane in a camera's frame, from points on it.
+
+
+_TRIES = 400
+_TOLERANCE_M = 6e-3
+_LEAST_SHARE = 0.3  # of the points on the plane
+_FEWEST_INLIERS = 50
+
+
+def table_from_points(points_camera: Float[np.ndarray, "P 3"], rng: np.random.Generator) -> Pose:
+    """`T_world_camera` such that most points lie at z = 0, by RANSAC and a least-squares plane through its inliers.
+
+    The world's origin is the inliers' mean; z points from the plane to the camera's side.
+
+    Args:
+        points_camera: most of them on the table, in the camera's frame [m].
+        rng: of the draws.
+
+    Raises:
+        InvalidInput: if there are fewer than 50 points, or less than 30 % lie on one plane.
+    """
+    if len(points_camera) < _FEWEST_INLIERS:
+        raise InvalidInput("number of points on the table", len(points_camera), f"{_FEWEST_INLIERS} or more")
+    best = np.zeros(len(points_camera), bool)
+    for _ in range(_TRIES):
+        a, b, c = points_camera[rng.choice(len(points_camera), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length > 0:
+            near = np.abs((points_camera - a) @ normal) < _TOLERANCE_M * length
+            best = near if near.sum() > best.sum() else best
+    if best.mean() < _LEAST_SHARE:
+        raise InvalidInput("points on one plane", f"{100 * best.mean():.0f} %", f"{100 * _LEAST_SHARE:.0f} % or more")
+    inliers = points_camera[best]
+    centre = inliers.mean(axis=0)
+    normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]
+    normal = -normal if normal @ centre > 0 else normal
+    right, ahead = orthogonal_basis(normal)
+    if np.cross(right, ahead) @ normal < 0:
+        ahead = -ahead
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = np.stack([right, ahead, normal], axis=1), centre
+    return Pose.from_matrix(matrix).inverse()
+
+
+# What the estimation of a photographed scene yields, and its result.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PhotoPose:
+    """One pose of an object, with how well it explains the photographs.
+
+    Attributes:
+        pose: `T_world_object`.
+        loss: of `PoseLoss`.
+        iou: of drawn outline and mask.
+        residual: relative error of the colours.
+        correlation: of the band-passed images.
+    """
+
+    pose: Pose
+    loss: float
+    iou: float
+    residual: float
+    correlation: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PhotoObject:
+    """What was found of one object.
+
+    Attributes:
+        name: of the object.
+        best: the most likely pose.
+        rivals: other orientations, the best first; a person may choose one.
+        doubt: why it should not be trusted, in a sentence; "" where it may be.
+        seconds: that the search over rotations and the refinement took.
+    """
+
+    name: str
+    best: PhotoPose
+    rivals: tuple[PhotoPose, ...]
+    doubt: str
+    coarse_s: float
+    refine_s: float
+
+    @property
+    def ratio(self) -> float:
+        """Loss of the best rival over that of the pose; infinite without rivals."""
+        return self.rivals[0].loss / max(self.best.loss, 1e-9) if self.rivals else float("inf")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PhotoStep:
+    """One step of the estimation.
+
+    Attributes:
+        progress: how far the work is.
+        found: objects so far, in the photographs' world.
+        table: what objects were found to lie on, where no photograph tells; with the last step only.
+    """
+
+    progress: Progress
+    found: tuple[PhotoObject, ...]
+    table: TableGuess | None = None
+
+
+# Why a pose in a photograph should not be trusted, in a sentence.
+
+
+LEAST_RATIO = 1.15  # loss of another orientation over that of the best
+_LEAST_IOU = 0.85
+_MOST_RESIDUAL = 0.55
+_MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
+
+
+def fits_outline(best: PhotoPose) -> bool:
+    """Whether the drawn outline is that of the mask."""
+    return best.iou >= _LEAST_IOU
+
+
+def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: PoseLoss) -> str:
+    """The first reason that applies; "" if none does.
+
+    Args:
+        name: of the object.
+        best: its pose.
+        rivals: other orientations, the best first.
+        loss: whose windows the pose was found in.
+    """
+    if not fits_outline(best):
+        return (
+            f"The outline of {name} does not fit its mask (they share {100 * best.iou:.0f} %); "
+            "check the name, the mask and the camera."
+        )
+    if best.residual > _MOST_RESIDUAL:
+        return f"{name} does not look like what the photo shows there; check the name and the mask."
+    if rivals and rivals[0].loss < LEAST_RATIO * best.loss:
+        return f"{name} looks nearly the same in another orientation; choose between the two pictures."
+    if min(window.cut for window in loss.windows) > _MOST_CUT:
+        return f"{name} is cut off by the edge of the photo, so that its distance is uncertain."
+    return ""
+
+
+# Masks of an object once the others are found: what lies in front of it spoils a mask that was proposed from a box.
+
+
+_SIDE = 240  # of a mask whose object is drawn [px]
+
+
+def without_others(
+    photos: Sequence[Photograph], name: str, found: Sequence[PhotoObject], surfels: Mapping[str, Surfels]
+) -> list[Photograph]:
+    """Photographs in which the others' masks hold whatever may hide an object, and its own mask none of it.
+
+    An outline drawn in the pose that was found is added to each other's mask. What such an outline and a mask that it
+    fits both claim is taken from the object's own.
+
+    Args:
+        photos: with masks.
+        name: of the object; photographs without a mask of it are left as they are.
+        found: all objects.
+        surfels: of each object, by name.
+    """
+    return [_without_others(photo, name, found, surfels) if name in photo.masks else photo for photo in photos]
+
+
+def _without_others(
+    photo: Photograph, name: str, found: Sequence[PhotoObject], surfels: Mapping[str, Surfels]
+) -> Photograph:
+    masks, own = dict(photo.masks), photo.masks[name].copy()
+    for other in found:
+        if other.name == name or other.name not in masks:
+            continue
+        drawn = _outline(photo, other, surfels[other.name])
+        if fits_outline(other.best):
+            own &= ~(drawn & masks[other.name])
+        masks[other.name] = masks[other.name] | drawn
+    return replace(photo, masks={**masks, name: own})
+
+
+def _outline(photo: Photograph, found: PhotoObject, surfels: Surfels) -> Bool[np.ndarray, "h w"]:
+    """The pixels of a photograph that an object covers, as far as its window reaches."""
+    window = object_windows([photo], found.name, _SIDE)[0]
+    index, _ = draw(surfels, window, found.best.pose[None])
+    return _placed(index[0] >= 0, window.frame, photo.masks[found.name].shape)
+
+
+def _placed(drawn: Bool[np.ndarray, "a b"], frame: WindowFrame, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+    """A window's pixels in the whole photograph."""
+    high, wide = shape
+    whole = cv2.resize(drawn.astype(np.float32), (frame.right - frame.left, frame.bottom - frame.top)) > 0.5
+    top, left, bottom, right = max(frame.top, 0), max(frame.left, 0), min(frame.bottom, high), min(frame.right, wide)
+    placed = np.zeros((high, wide), bool)
+    placed[top:bottom, left:right] = whole[top - frame.top : bottom - frame.top, left - frame.left : right - frame.left]
+    return placed
+
+
+# Poses of known objects in photographs: from masks and fields alone, or from poses that another program gives.
+#
+# For each object: candidates (all rotations, put where the mask is, or poses around a given one) are ranked in a
+# small window by outline, shading and texture (`PoseLoss`); CMA-ES refines the best that differ, in the small
+# window and then in a finer one; Gauss-Newton aligns the best of these (`pose_alignment`). Cameras and masks are
+# given, the light need not be known.
+
+
+_COARSE_SIDE, _FINE_SIDE, _SHARP_SIDE = 44, 130, 240  # of a mask [px]
+COARSE_ACROSS, FINE_ACROSS = 36, 110  # surfels along an object's diameter
+_LEAST_SPACING_M = 1.2e-3
+_ROTATIONS = 3000
+_AROUND = 400
+_RANKED, _ALIKE_DEG = 40, 12.0
+_KEPT, _APART_DEG = 8, 15.0
+_NEAR_DEG = 6.0  # between candidates around a given pose
+_GENERATIONS, _POPULATION = 14, 14
+_ALIGNED = 4
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PhotoConfig:
+    """How objects are looked for.
+
+    Attributes:
+        starts: poses in the world to begin with, by object name; objects without one are looked for in all rotations.
+        loss: "all", or "iou" for the outline alone, as in the paper.
+    """
+
+    starts: Mapping[str, Pose] = field(default_factory=dict)
+    loss: LossKind = "all"
+
+
+class PhotoModels:
+    """Surfels and stable orientations of fields, made when first asked for.
+
+    Args:
+        fields: by name of the object.
+    """
+
+    def __init__(self, fields: Mapping[str, KiloOSF]) -> None:
+        self._fields = dict(fields)
+        self._surfels: dict[tuple[str, int], Surfels] = {}
+        self._priors: dict[str, TablePrior] = {}
+
+    def check(self, name: str) -> None:
+        """Refuse an object without a field.
+
+        Raises:
+            UnknownName: if it has none.
+        """
+        if name not in self._fields:
+            raise UnknownName("field", name, sorted(self._fields))
+
+    def surfels(self, name: str, across: int) -> Surfels:
+        """Of an object, about `across` of them along its diameter."""
+        key = name, across
+        if key not in self._surfels:
+            self.check(name)
+            box = self._fields[name].extent
+            diameter = float(np.linalg.norm(box[1] - box[0]))
+            self._surfels[key] = surfels_of(self._fields[name], max(diameter / across, _LEAST_SPACING_M))
+        return self._surfels[key]
+
+    def table_prior(self, name: str) -> TablePrior:
+        """What a table tells of an object's pose."""
+        if name not in self._priors:
+            self.check(name)
+            self._priors[name] = TablePrior(resting_orientations(self._fields[name]))
+        return self._priors[name]
+
+
+def estimate_photo(
+    models: PhotoModels,
+    photos: Sequence[Photograph],
+    names: Sequence[str],
+    rng: np.random.Generator,
+    config: PhotoConfig | None = None,
+) -> Iterator[PhotoStep]:
+    """Find objects one after the other; the last step holds all.
+
+    Args:
+        models: of the objects.
+        photos: of one scene; each object has a mask in at least one.
+        names: of the objects.
+        rng: of the searches.
+        config: how to look.
+
+    Raises:
+        UnknownName: if an object has no field.
+        InvalidInput: without photographs or masks, or with several photographs that do not share a table.
+    """
+    config = config or PhotoConfig()
+    on_table = [photo.on_table for photo in photos]
+    if not photos or not (all(on_table) or len(photos) == 1):
+        given = f"{len(photos)}, {sum(on_table)} of them with a known table"
+        raise InvalidInput("number of photos", given, "1, or more that all show the board on the table")
+    for name in names:
+        models.check(name)
+        object_windows(photos, name, _COARSE_SIDE)
+    found: list[PhotoObject] = []
+    for number, name in enumerate(names):
+        yield PhotoStep(Progress(number, len(names) + 1, f"Looking for {name}"), tuple(found))
+        found.append(find_object(models, photos, name, rng, config))
+    again = [number for number, one in enumerate(found) if not fits_outline(one.best)] if len(found) > 1 else []
+    total, seen = len(names) + len(again) + 1, {name: photos for name in names}
+    for done, number in enumerate(again, len(names)):
+        yield PhotoStep(Progress(done, total, f"Looking for {names[number]} behind the others"), tuple(found))
+        found[number], seen[names[number]] = _found_behind(models, photos, found, number, rng, config)
+    yield PhotoStep(Progress(total - 1, total, "The table that they lie on"), tuple(found))
+    table = None
+    if not on_table[0]:
+        table = table_from_objects([models.table_prior(name) for name in names], [o.best.pose for o in found])
+        if table is not None:
+            lying = set(table.supported)
+            found = [
+                _on_table(models, seen[o.name][0], o, table, config) if k in lying else o for k, o in enumerate(found)
+            ]
+    yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table)
+
+
+def _found_behind(
+    models: PhotoModels,
+    photos: Sequence[Photograph],
+    found: Sequence[PhotoObject],
+    number: int,
+    rng: np.random.Generator,
+    config: PhotoConfig,
+) -> tuple[PhotoObject, Sequence[Photograph]]:
+    """An object in masks without the others, and these masks; as before if its outline fits them no better."""
+    before = found[number]
+    surfels = {other.name: models.surfels(other.name, FINE_ACROSS) for other in found}
+    without = without_others(photos, before.name, found, surfels)
+    try:
+        now = find_object(models, without, before.name, rng, config)
+    except InvalidInput:  # hardly anything is left of its mask
+        return before, photos
+    return (now, without) if now.best.iou > before.best.iou else (before, photos)
+
+
+def _on_table(
+    models: PhotoModels, photo: Photograph, found: PhotoObject, table: TableGuess, config: PhotoConfig
+) -> PhotoObject:
+    """An object aligned once more, now that it is known to lie on a table; its pose stays in the camera's frame."""
+    start = time.perf_counter()
+    seen = replace(photo, T_world_camera=table.T_world_camera, on_table=True)
+    sharp, plain = (
+        PoseLoss(
+            object_windows([shown], found.name, side),
+            models.surfels(found.name, FINE_ACROSS),
+            table=prior,
+            kind=config.loss,
+        )
+        for shown, side, prior in ((seen, _SHARP_SIDE, models.table_prior(found.name)), (photo, _FINE_SIDE, None))
+    )
+    pose = table.T_world_camera.inverse() @ align(sharp, table.T_world_camera @ found.best.pose)[0]
+    best = _photo_poses(pose[None], plain)[0]
+    doubt = doubt_of(found.name, best, found.rivals, plain)
+    return replace(found, best=best, doubt=doubt, refine_s=found.refine_s + time.perf_counter() - start)
+
+
+def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
+    """Poses with what the loss says of each."""
+    terms = loss.terms(poses)
+    parts = zip(terms.losses, terms.iou, terms.residual, terms.correlation, strict=True)
+    return [PhotoPose(poses[k], *(float(v) for v in values)) for k, values in enumerate(parts)]
+
+
+def find_object(
+    models: PhotoModels, photos: Sequence[Photograph], name: str, rng: np.random.Generator, config: PhotoConfig
+) -> PhotoObject:
+    """Look for one object in its masks; arguments as of `estimate_photo`."""
+    on_table = all(photo.on_table for photo in photos)
+    table = models.table_prior(name) if on_table else None
+    coarse, fine, sharp = (
+        PoseLoss(object_windows(photos, name, side), models.surfels(name, across), table=table, kind=config.loss)
+        for side, across in ((_COARSE_SIDE, COARSE_ACROSS), (_FINE_SIDE, FINE_ACROSS), (_SHARP_SIDE, FINE_ACROSS))
+    )
+    start = time.perf_counter()
+    given = config.starts.get(name)
+    if given is None:
+        candidates, alike = poses_from_mask(coarse, super_fibonacci(_ROTATIONS)), _ALIKE_DEG
+    else:
+        candidates, alike = poses_around(given, coarse.windows[0], _AROUND, rng), _NEAR_DEG
+    ranked = candidates[distinct(candidates, coarse(candidates), _RANKED if given is None else _KEPT, alike)]
+    poses, losses = cma_search(coarse, ranked, generations=_GENERATIONS, population=_POPULATION, spread=1.0, rng=rng)
+    poses = poses[distinct(poses, losses, _KEPT, _APART_DEG if given is None else _NEAR_DEG)]
+    middle = time.perf_counter()
+    poses, losses = cma_search(
+        fine,
+        poses[np.arange(min(len(poses.position), _ALIGNED))],
+        generations=_GENERATIONS,
+        population=_POPULATION,
+        spread=0.35,
+        rng=rng,
+    )
+    poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
+    ends = [align(sharp, poses[k])[0] for k in range(len(poses.position))]
+    poses = Pose.stacked(ends)
+    ready = _photo_poses(poses, fine)
+    best, *rivals = (ready[k] for k in distinct(poses, np.array([p.loss for p in ready]), _ALIGNED, _APART_DEG))
+    doubt = doubt_of(name, best, rivals, fine)
+    return PhotoObject(name, best, tuple(rivals), doubt, middle - start, time.perf_counter() - middle)

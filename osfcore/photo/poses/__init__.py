@@ -1,1 +1,0 @@
-"""Poses of objects in photographs: surfels, losses, searches, Gauss-Newton."""

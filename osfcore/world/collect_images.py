@@ -1,0 +1,299 @@
+"""Image sets and observations of the simulated table, as files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import CannotWrite, InvalidInput, MissingAssets, check_seed
+from osfcore.geometry.cameras import (
+    DEFAULT_IMAGE_SIDE,
+    FIELD_OF_VIEW_DEG,
+    SCENE_CENTRE,
+    Camera,
+    default_cameras,
+    goal_camera,
+    image_side,
+)
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import MAX_OBJECTS, Observation, SceneState
+from osfcore.io.files import folder_at_once, write_json
+from osfcore.io.image_file import to_uint8
+from osfcore.io.observation_file import write_observation
+from osfcore.io.scene_file import Scene, scene_to_json
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.progress import Progress
+from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.imaging import Picture, RayTracer, TracedMesh
+from osfcore.world.scenes import SceneRequest
+from osfcore.world.tabletop import Tabletop
+
+# Image sets for training fields: one object alone, or the bare table, under many lights, in the OSF format.
+#
+# Layout: DIR/{train,test}/anno.json, a list of dicts (`filename`, `RT` 3 x 4 world-to-camera in OpenCV axes, `K` 3
+# x 3, `light_pos` 3-vector in the world, `resolution`), with 8-bit RGBA PNGs beside it. The world of an object set
+# is the object's frame. Every image has its own view and its own light, drawn independently for train and test.
+
+
+FRAME_FILL = 0.87  # share of the image's side that the bounding sphere spans
+TEST_IMAGES = 40
+MIN_IMAGES = 60
+MAX_IMAGES = 5000
+_SAMPLES = 4
+Split = Literal["train", "test"]
+
+
+@dataclass(frozen=True, slots=True)
+class CollectObject:
+    """Images of one object.
+
+    Attributes:
+        name: which object.
+        out: folder to write; must not exist or be empty.
+        images: train and test images together; one in eight, at least 40, are for testing.
+        size: side of the square images [px].
+        seed: of views and lights.
+    """
+
+    name: str
+    out: Path
+    images: int = 300
+    size: int = DEFAULT_IMAGE_SIDE
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CollectTable:
+    """Images of the bare table.
+
+    Attributes:
+        out: folder to write; must not exist or be empty.
+        images: train and test images together; one in eight, at least 40, are for testing.
+        size: side of the square images [px].
+        seed: of views and lights.
+    """
+
+    out: Path
+    images: int = 300
+    size: int = DEFAULT_IMAGE_SIDE
+    seed: int = 0
+
+
+def collect_object(config: CollectObject, library: AssetLibrary) -> Iterator[Progress]:
+    """Write the images of one object, from all sides under lights from all directions.
+
+    Raises:
+        UnknownName, MissingAssets: if the object is not in the library.
+        InvalidInput: if a number is out of range or the folder is not empty.
+    """
+    if not library.has(config.name):
+        library.info(config.name)
+        raise MissingAssets([config.name])
+    mesh = TracedMesh(library.load(config.name).mesh)
+    tracer = RayTracer({config.name: mesh})
+    # The cone that touches the sphere has half-angle asin(radius / distance).
+    half_angle = np.arctan(FRAME_FILL * np.tan(np.deg2rad(FIELD_OF_VIEW_DEG) / 2))
+    distance = mesh.radius_m / np.sin(half_angle)
+
+    def shoot(rng: np.random.Generator, number: int, count: int) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """Camera and unit vector toward the light, both in the object's frame, and RGBA image.
+
+        Args:
+            rng: draws them.
+            number: of the image in its split, which tells the ring of views.
+            count: images of the split.
+        """
+        camera = Camera.look_at("view", distance * _spread(rng, number, count), (0, 0, 0), size=config.size)
+        light = _spread(rng, int(rng.integers(count)), count)
+        picture = tracer.render_alone(config.name, light, camera, samples=_SAMPLES)
+        return camera, light, _straight_alpha(picture)
+
+    yield from _write_set(config.out, config.images, config.size, config.seed, shoot, config.name)
+
+
+def collect_table(config: CollectTable) -> Iterator[Progress]:
+    """Write images of the bare table: half from the default and goal cameras, half from anywhere above the table.
+
+    Images are opaque, the background beyond the table's edge included: they are what a scene's camera sees.
+
+    Raises:
+        InvalidInput: if a number is out of range or the folder is not empty.
+    """
+    tracer = RayTracer({})
+    fixed = (*default_cameras(image_side(config.size)), goal_camera(config.size))
+    nothing = Pose(np.zeros((0, 3)), np.zeros((0, 4)))
+
+    def shoot(rng: np.random.Generator, number: int, count: int) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """Camera, position of the light in the world and RGBA image.
+
+        Args:
+            rng: draws them.
+            number: of the image in its split: odd ones are taken from anywhere.
+            count: images of the split; it does not matter here.
+        """
+        light = Light.random(rng, MIN_LIGHT_ELEVATION_DEG)
+        camera = fixed[(number // 2) % len(fixed)] if number % 2 == 0 else _anywhere(rng, config.size)
+        (picture,) = tracer.render(SceneState((), nothing, light, None), (camera,), samples=_SAMPLES)
+        opaque = np.ones((config.size, config.size, 1), np.float32)
+        return camera, light.position, np.concatenate([picture.rgb, opaque], axis=-1)
+
+    yield from _write_set(config.out, config.images, config.size, config.seed, shoot, "table")
+
+
+def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -> Iterator[Progress]:  # noqa: ANN001
+    """Write both splits into a folder, which takes its name only when everything is there."""
+    image_side(size)
+    if not MIN_IMAGES <= images <= MAX_IMAGES:
+        raise InvalidInput("number of images", images, f"between {MIN_IMAGES} and {MAX_IMAGES}")
+    if seed < 0:
+        raise InvalidInput("seed", seed, "0 or more")
+    out = out.absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InvalidInput("output folder", out, "new or empty")
+    test = max(TEST_IMAGES, images // 8)
+    counts: dict[Split, int] = {"train": images - test, "test": test}
+    done = 0
+    try:
+        with folder_at_once(out) as partial:
+            for part, (split, count) in enumerate(counts.items()):
+                rng = stream_rng(seed, Stream.COLLECTED_IMAGES, part)
+                folder = partial / split
+                folder.mkdir(parents=True)
+                annotations = []
+                for number in range(count):
+                    camera, light, rgba = shoot(rng, number, count)
+                    annotations.append(_save(folder / f"{number:04d}.png", camera, light, rgba))
+                    done += 1
+                    yield Progress(done, images, f"Image {done} of {images} of {what}")
+                (folder / "anno.json").write_text(json.dumps(annotations))
+    except OSError as error:
+        raise CannotWrite(out, error.strerror or str(error)) from error
+
+
+def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray, "h w 4"]) -> dict[str, object]:
+    """Write one image; return its entry in anno.json."""
+    pixels = to_uint8(rgba)
+    if not cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA)):
+        raise OSError(f"{path.name} could not be written")
+    return {
+        "filename": path.name,
+        "RT": camera.T_world_camera.inverse().matrix()[:3].tolist(),
+        "K": camera.intrinsics.tolist(),
+        "light_pos": np.asarray(light, float).tolist(),
+        "resolution": camera.width,
+    }
+
+
+def _straight_alpha(picture: Picture) -> Float[np.ndarray, "h w 4"]:
+    """The object's own colour with its coverage as opacity."""
+    alpha = picture.coverage[0]
+    return np.concatenate([picture.rgb / np.maximum(alpha, 1e-6)[..., None], alpha[..., None]], axis=-1)
+
+
+def _spread(rng: np.random.Generator, number: int, count: int) -> Float[np.ndarray, "3"]:
+    """One of `count` unit vectors that cover the sphere evenly: a random point of the number-th of equal-area rings."""
+    z = 1 - 2 * (number + rng.uniform()) / count
+    angle = rng.uniform(-np.pi, np.pi)
+    radius = np.sqrt(max(1 - z * z, 0))
+    return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+def _anywhere(rng: np.random.Generator, size: int) -> Camera:
+    """A camera 0.5 to 1.1 m from the table's centre, at least 15 deg above the table, looking near its centre."""
+    z = rng.uniform(np.sin(np.deg2rad(15)), 1)
+    angle = rng.uniform(-np.pi, np.pi)
+    radius = np.sqrt(1 - z * z)
+    direction = np.array([radius * np.cos(angle), radius * np.sin(angle), z])
+    target = (*rng.uniform(-0.1, 0.1, 2), SCENE_CENTRE[2])
+    return Camera.look_at("view", rng.uniform(0.5, 1.1) * direction, target, size=size)
+
+
+# One observation of a random scene, as anybody's cameras might have taken it, with the truth beside it.
+
+
+TRUTH_FILE = "truth.json"
+
+
+@dataclass(frozen=True, slots=True)
+class CollectObservation:
+    """An observation of a random scene.
+
+    Attributes:
+        out: folder to write; must not exist or be empty.
+        names: the objects, or None for a random choice.
+        objects: how many objects, where `names` is None.
+        seed: of choice, scene and light.
+        size: side of the square images [px].
+        goal: the goal camera's view alone, without pusher and masks.
+    """
+
+    out: Path
+    names: tuple[str, ...] | None = None
+    objects: int = 3
+    seed: int = 0
+    size: int = DEFAULT_IMAGE_SIDE
+    goal: bool = False
+
+
+def collect_observation(
+    config: CollectObservation, library: AssetLibrary, known: Collection[str] | None = None
+) -> Observation:
+    """Write observation.json with its images, and truth.json with poses and light, which no estimator may see.
+
+    Args:
+        config: what to write.
+        library: where the objects' meshes are.
+        known: names to choose from at random, among the library's; all of them if None.
+
+    Raises:
+        UnknownName, MissingAssets: if an object is not in the library.
+        InvalidInput: if a number is out of range or the folder is not empty.
+        NoRoom: if the objects do not fit side by side.
+        CannotWrite: if the disk refuses.
+    """
+    image_side(config.size)
+    check_seed(config.seed)
+    out = config.out.absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InvalidInput("output folder", out, "new or empty")
+    cameras = (goal_camera(config.size),) if config.goal else default_cameras(config.size)
+    world = Tabletop(library, cameras=cameras, request=SceneRequest(_names(config, library, known), config.objects))
+    try:
+        world.arrange(config.seed)
+        observation = world.render(cameras, masks=not config.goal, with_pusher=not config.goal)
+        truth = scene_to_json(Scene(world.truth(), cameras))
+    finally:
+        world.close()
+    if config.goal:
+        del truth["pusher"]
+    _write(out, observation, truth)
+    return observation
+
+
+def _names(config: CollectObservation, library: AssetLibrary, known: Collection[str] | None) -> tuple[str, ...] | None:
+    """The objects; None leaves the choice, or the complaint that there are none, to the world."""
+    if config.names is not None or known is None:
+        return config.names
+    choice = [name for name in library.names() if name in known]
+    if not choice:
+        return None
+    most = min(len(choice), MAX_OBJECTS)
+    if not 1 <= config.objects <= most:
+        raise InvalidInput("number of objects", config.objects, f"between 1 and {most}")
+    rng = stream_rng(config.seed, Stream.COLLECTED_NAMES)
+    return tuple(choice[i] for i in rng.choice(len(choice), config.objects, replace=False))
+
+
+def _write(out: Path, observation: Observation, truth: dict[str, object]) -> None:
+    """Truth and observation, all or nothing."""
+    with folder_at_once(out) as partial:
+        write_json(partial / TRUTH_FILE, truth)
+        write_observation(partial, observation)

@@ -1,1 +1,0 @@
-"""Data collected from the simulated tabletop: image sets, observations, pushes."""

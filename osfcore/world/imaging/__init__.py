@@ -1,1 +1,0 @@
-"""Pictures of the simulated tabletop: ray tracing by Embree, and TinyRenderer."""

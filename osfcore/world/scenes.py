@@ -1,0 +1,296 @@
+"""What a scene is made of on request: objects, their places, light and conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from osfcore.errors import InvalidInput, MissingAssets, NoRoom, OsfError, OverlappingObjects
+from osfcore.geometry.light import Light, SpotLamp
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, TABLE_SIDE_M, WORKSPACE_HALF_M
+from osfcore.objects.asset import ObjectAsset
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.imaging import Lamp, TableSurface
+from osfcore.world.physics import Physics, lowest_point
+
+# What a random scene shall contain, and whether it can.
+
+
+MAX_HEIGHT_M = 1.0  # of an object's centre when it is put somewhere by hand
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneRequest:
+    """What a random scene shall contain.
+
+    Attributes:
+        names: the objects, or None for a random choice.
+        count: how many objects, where `names` is None.
+        light: the light, or None for a random one at least 10 deg above the table.
+        among: what to choose from, where `names` is None; all objects of the library if None.
+    """
+
+    names: tuple[str, ...] | None = None
+    count: int = 3
+    light: Light | None = None
+    among: tuple[str, ...] | None = None
+
+
+def check_object(library: AssetLibrary, name: str) -> None:
+    """Check that an object's mesh is on this machine.
+
+    Raises:
+        UnknownName: if the catalogue does not know it.
+        MissingAssets: if its mesh has not been fetched.
+    """
+    if not library.has(name):
+        library.info(name)  # raises UnknownName for what no catalogue knows
+        raise MissingAssets([name])
+
+
+def check_request(library: AssetLibrary, request: SceneRequest) -> None:
+    """Check that a request can be met.
+
+    Raises:
+        UnknownName, MissingAssets, InvalidInput: if it cannot.
+    """
+    if request.names is not None:
+        if not 1 <= len(request.names) <= MAX_OBJECTS:
+            raise InvalidInput("number of objects", len(request.names), f"between 1 and {MAX_OBJECTS}")
+        if len(set(request.names)) != len(request.names):
+            raise InvalidInput("list of objects", ", ".join(request.names), "without repetition")
+        for name in request.names:
+            check_object(library, name)
+        return
+    if not 1 <= request.count <= MAX_OBJECTS:
+        raise InvalidInput("number of objects", request.count, f"between 1 and {MAX_OBJECTS}")
+    choice = library.names() if request.among is None else request.among
+    for name in request.among or ():
+        check_object(library, name)
+    if len(set(choice)) != len(choice):
+        raise InvalidInput("list of objects", ", ".join(choice), "without repetition")
+    available = len(choice)
+    if request.among is None and available == 0:
+        raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
+    if request.count > available:
+        raise InvalidInput(
+            "number of objects", request.count, f"at most {available}, as many as there are to choose from"
+        )
+
+
+def check_place(name: str, position: Float[np.ndarray, "3"]) -> None:
+    """Check that an object may be put somewhere by hand [m].
+
+    Raises:
+        InvalidInput: if the place is not over the table.
+    """
+    half = TABLE_SIDE_M / 2
+    if np.abs(position[:2]).max() > half or not 0 <= position[2] <= MAX_HEIGHT_M:
+        allowed = f"over the table: |x|, |y| at most {half:g} and z between 0 and {MAX_HEIGHT_M:g}"
+        raise InvalidInput(f"position of {name} [m]", np.round(position, 4).tolist(), allowed)
+
+
+# Random scenes: objects at rest on the table, side by side inside the workspace, and a free pusher.
+
+
+GAP_M = 0.01  # between objects when placed
+PUSHER_GAP_M = 0.02
+OVERLAP_TOLERANCE_M = 0.002
+DROP_M = 0.001  # objects start this far above the table
+_TRIES_PER_OBJECT = 60
+_LAYOUTS = 60
+_SETTLE_LIMIT_STEPS = 480
+_CALM_STEPS = 12
+_MOVES = 60  # until nothing penetrates any more
+_TOUCH_M = 5e-4  # so little is no penetration: shapes have a margin
+_STANDS_M = 0.01  # above the table at most, for what stands on it
+_SIDEWAYS = 0.3  # of a contact's normal from which it tells a direction
+CALM_SPEED_M_S = 2e-3
+CALM_TURN_RAD_S = 2e-2
+
+
+def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> None:
+    """Drop all objects in random stable poses without overlap, let them rest, put the pusher in a free place.
+
+    Args:
+        physics: a simulation of these objects; it starts over.
+        assets: of the objects, by name.
+        rng: draws poses and places.
+
+    Raises:
+        NoRoom: if no layout was found.
+    """
+    for _ in range(_LAYOUTS):
+        physics.reset()
+        if not _lay_out(physics, assets, rng):
+            continue
+        settle(physics, tuple(assets))
+        inside = all(np.abs(physics.pose(name).position[:2]).max() <= WORKSPACE_HALF_M for name in assets)
+        if inside and is_calm(physics, tuple(assets)) and _place_pusher(physics, tuple(assets), rng):
+            return
+    raise NoRoom(assets, _LAYOUTS)
+
+
+def settle(physics: Physics, names: tuple[str, ...], limit_steps: int = _SETTLE_LIMIT_STEPS) -> int:
+    """Step without pushing until nothing has moved for a twentieth of a second; return the steps taken.
+
+    Args:
+        physics: steps in place.
+        names: objects that shall come to rest.
+        limit_steps: when to give up.
+    """
+    calm = 0
+    for step in range(limit_steps):
+        if calm >= _CALM_STEPS:
+            return step
+        physics.step(np.zeros(3))
+        calm = calm + 1 if is_calm(physics, names) else 0
+    return limit_steps
+
+
+def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None = None) -> None:
+    """Raise if bodies penetrate by more than 2 mm.
+
+    Args:
+        physics: of the bodies.
+        names: of the objects.
+        moved: only pairs of which it is one are looked at; None for all.
+
+    Raises:
+        OverlappingObjects: if so.
+    """
+    for i, first in enumerate(names):
+        gaps = {second: physics.distance(first, second) for second in names[i + 1 :]}
+        gaps["the pusher"] = physics.distance(first, None)
+        gaps["the table"] = physics.table_distance(first)
+        for second, gap in gaps.items():
+            if gap < -OVERLAP_TOLERANCE_M and moved in (None, first, second):
+                raise OverlappingObjects(first, second, -gap)
+
+
+def move_apart(physics: Physics, names: tuple[str, ...]) -> None:
+    """Lift objects that sink into the table, and move apart those that penetrate each other, as little as needed.
+
+    Of two that both stand on the table each gives way by half; of others the one that lies on the other is lifted.
+    Let go while they penetrate, they would be thrown apart.
+    """
+    for _ in range(_MOVES):
+        is_moved = False
+        for i, first in enumerate(names):
+            if (gap := physics.table_distance(first)) < -_TOUCH_M:
+                _shift(physics, first, np.array([0.0, 0.0, -gap]))
+                is_moved = True
+            for second in names[i + 1 :]:
+                gap, normal = physics.separation(first, second)
+                if gap < -_TOUCH_M:
+                    _separate(physics, first, second, -gap, normal)
+                    is_moved = True
+        if not is_moved:
+            return
+
+
+def _separate(physics: Physics, first: str, second: str, depth_m: float, normal: Float[np.ndarray, "3"]) -> None:
+    """Move two objects along the normal that the first one leaves by; horizontally if both stand on the table."""
+    if all(physics.table_distance(name) < _STANDS_M for name in (first, second)):
+        apart = physics.pose(first).position - physics.pose(second).position
+        aside = normal[:2] if np.linalg.norm(normal[:2]) > _SIDEWAYS else apart[:2]
+        by = depth_m / 2 * np.array([*aside, 0.0]) / max(float(np.linalg.norm(aside)), 1e-9)
+        _shift(physics, first, by)
+        _shift(physics, second, -by)
+    elif abs(normal[2]) > _SIDEWAYS:
+        _shift(physics, first if normal[2] > 0 else second, np.array([0.0, 0.0, depth_m]))
+    else:
+        _shift(physics, first, depth_m * normal)
+
+
+def above_table(state: SceneState) -> SceneState:
+    """The state with no object's centre below the table."""
+    positions = np.maximum(state.poses.position, [-np.inf, -np.inf, 0.0])
+    return replace(state, poses=Pose(positions, state.poses.quaternion))
+
+
+def _shift(physics: Physics, name: str, by: Float[np.ndarray, "3"]) -> None:
+    pose = physics.pose(name)
+    physics.place(name, Pose(pose.position + by, pose.quaternion))
+
+
+def is_calm(physics: Physics, names: tuple[str, ...]) -> bool:
+    """Whether every object is slower than 2 mm/s and 0.02 rad/s."""
+    speeds = [physics.speed(name) for name in names]
+    return all(linear < CALM_SPEED_M_S and angular < CALM_TURN_RAD_S for linear, angular in speeds)
+
+
+def random_rest(asset: ObjectAsset, rng: np.random.Generator) -> Float[np.ndarray, "4"]:
+    """A resting orientation by its probability, turned about the vertical at random."""
+    choice = rng.choice(len(asset.resting.quaternions), p=asset.resting.probabilities)
+    turn = quaternion_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
+    return quaternion_multiply(turn, asset.resting.quaternions[choice])
+
+
+def _lay_out(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> bool:
+    # Large objects first: they are the ones that find no place later.
+    order = sorted(assets, key=lambda name: -assets[name].radius_m)
+    placed: list[str] = []
+    for name in order:
+        quaternion = random_rest(assets[name], rng)
+        height = DROP_M - lowest_point(assets[name], quaternion)
+        for _ in range(_TRIES_PER_OBJECT):
+            x, y = rng.uniform(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, 2)
+            physics.place(name, Pose(np.array([x, y, height]), quaternion))
+            if all(physics.distance(name, other) >= GAP_M for other in placed):
+                placed.append(name)
+                break
+        else:
+            return False
+    return True
+
+
+def _place_pusher(physics: Physics, names: tuple[str, ...], rng: np.random.Generator) -> bool:
+    """Somewhere in or just around the workspace, clear of everything."""
+    half = WORKSPACE_HALF_M + 2 * PUSHER_RADIUS_M
+    for _ in range(_TRIES_PER_OBJECT):
+        physics.place_pusher(np.array([*rng.uniform(-half, half, 2), PUSHER_CENTRE_Z_M]))
+        if all(physics.distance(name, None) >= PUSHER_GAP_M for name in names):
+            return True
+    return False
+
+
+# What a simulated tabletop is made of, where that differs from what a method takes for granted.
+
+
+_MAX_FACTOR = 100.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Conditions:
+    """Light, table and contacts of a world; the defaults are those that everything here is made for.
+
+    Attributes:
+        lamp: how strongly, and in which colour, the scene is lit.
+        table: what the table looks like.
+        friction_factor: on the friction of every object, hence between object and table, and object and pusher; between
+            two objects it counts twice.
+        mass_factor: on the mass and the moments of inertia of every object.
+        spot: a near lamp in the place of the distant light, whatever is asked of that; None for the distant light.
+    """
+
+    lamp: Lamp = field(default_factory=Lamp)
+    table: TableSurface = field(default_factory=TableSurface)
+    friction_factor: float = 1.0
+    mass_factor: float = 1.0
+    spot: SpotLamp | None = None
+
+    def __post_init__(self) -> None:
+        """Check the factors.
+
+        Raises:
+            InvalidInput: if one is not positive, or beyond reason.
+        """
+        for what, factor in (("factor on friction", self.friction_factor), ("factor on mass", self.mass_factor)):
+            if not 0 < factor <= _MAX_FACTOR:
+                raise InvalidInput(what, factor, f"above 0 and at most {_MAX_FACTOR:g}")
