@@ -8,6 +8,36 @@ Deviations from eq. 3: the radiance of a point is the mean of the objects' radia
 compositional NeRFs), not their sum, so that overlapping objects do not shine twice as bright; and the light that
 reaches a point is the transmittance of all other objects along the ray toward the light, the limit of a shadow map of
 unlimited resolution.
+
+Its primitives go from densities at samples to the weight of each sample and to a pixel's value.
+
+Emission and absorption along a ray r(t) = o + t d (paper eq. 3, NeRF eq. 1) are
+
+    L = integral of T(t) sigma(r(t)) L_out(r(t)) dt,        T(t) = exp(-integral from t_n to t of sigma(r(s)) ds).
+
+With density and radiance constant over intervals of length delta_i, this is exactly the sum
+
+    tau_i   = sigma_i delta_i                               optical thickness
+    alpha_i = 1 - exp(-tau_i)                               share of the light that interval i absorbs and scatters
+    T_i     = exp(-sum of tau_j over j < i)                 share that reaches interval i
+    w_i     = T_i alpha_i                                   weight of sample i
+    L       = sum of w_i L_i + T_end L_behind,              T_end = exp(-sum of all tau_i).
+
+A worked example: one ray with an empty sample and two that each let half of the light through.
+
+    >>> taus = torch.log(torch.tensor([[1.0, 2.0, 2.0]]))
+    >>> alphas_from_thickness(taus).tolist()
+    [[0.0, 0.5, 0.5]]
+    >>> transmittance(taus).tolist()
+    [[1.0, 1.0, 0.5]]
+    >>> weights = render_weights(taus)
+    >>> weights.tolist()
+    [[0.0, 0.5, 0.25]]
+    >>> final_transmittance(taus).tolist()
+    [0.25]
+    >>> red_then_blue = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    >>> accumulate_along_rays(weights, red_then_blue).tolist()
+    [[0.5, 0.0, 0.25]]
 """
 
 from __future__ import annotations
@@ -94,37 +124,6 @@ class NearLight(NamedTuple):
 def near_light(spot: SpotLamp, tensor: Callable[[object], Tensor]) -> NearLight:
     """A lamp as tensors, which `tensor` makes of arrays."""
     return NearLight(tensor(spot.position), tensor(spot.axis), *spot.cone_rad)
-
-
-# Volume rendering along rays: from densities at samples to the weight of each sample and to a pixel's value.
-#
-# Emission and absorption along a ray r(t) = o + t d (paper eq. 3, NeRF eq. 1) are
-#
-#     L = integral of T(t) sigma(r(t)) L_out(r(t)) dt,        T(t) = exp(-integral from t_n to t of sigma(r(s)) ds).
-#
-# With density and radiance constant over intervals of length delta_i, this is exactly the sum
-#
-#     tau_i   = sigma_i delta_i                               optical thickness
-#     alpha_i = 1 - exp(-tau_i)                               share of the light that interval i absorbs and scatters
-#     T_i     = exp(-sum of tau_j over j < i)                 share that reaches interval i
-#     w_i     = T_i alpha_i                                   weight of sample i
-#     L       = sum of w_i L_i + T_end L_behind,              T_end = exp(-sum of all tau_i).
-#
-# A worked example: one ray with an empty sample and two that each let half of the light through.
-#
-#     >>> taus = torch.log(torch.tensor([[1.0, 2.0, 2.0]]))
-#     >>> alphas_from_thickness(taus).tolist()
-#     [[0.0, 0.5, 0.5]]
-#     >>> transmittance(taus).tolist()
-#     [[1.0, 1.0, 0.5]]
-#     >>> weights = render_weights(taus)
-#     >>> weights.tolist()
-#     [[0.0, 0.5, 0.25]]
-#     >>> final_transmittance(taus).tolist()
-#     [0.25]
-#     >>> red_then_blue = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-#     >>> accumulate_along_rays(weights, red_then_blue).tolist()
-#     [[0.5, 0.0, 0.25]]
 
 
 def alphas_from_thickness(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:

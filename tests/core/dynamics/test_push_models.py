@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from osfcore.dynamics import shapes as field_parts
 from osfcore.dynamics.graph import shipped, write_network
 from osfcore.dynamics.rollout import NETWORK_FILE, load_push_model, load_shapes, network_path
 from osfcore.dynamics.shapes import object_shape

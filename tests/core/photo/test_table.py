@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation import objective as resting_orientations
+from osfcore.estimation.objective import resting_orientations
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.photo.pose_loss import TablePrior
 from osfcore.photo.poses import table_from_points

@@ -1,7 +1,7 @@
 import pytest
 
 import osfcore.experiments.estimation_warmup as module
-from osfcore.estimation import objective as object_models
+from osfcore.estimation import objective
 from osfcore.experiments.estimation_warmup import WARM_SCENE, last_estimate, warm_models
 from osfcore.experiments.fields import MAX_TASKS
 from osfcore.world.tasks import draw_scene
@@ -18,7 +18,7 @@ def test_every_kind_of_estimate_is_made_once_but_goals_only_where_they_are_measu
     warm_models(SOLIDS[:1], solids, library, draw, 32, goal=False)
     models = warm_models(SOLIDS[:2], solids, library, draw, 32)
     assert [what for what, _ in oracle.asked] == [*["first search 4", "next"] * 2, "goal"]
-    monkeypatch.setattr(object_models, "resting_orientations", lambda _: pytest.fail("it was not known yet"))
+    monkeypatch.setattr(objective, "resting_orientations", lambda _: pytest.fail("it was not known yet"))
     for name in SOLIDS[:2]:  # also of what is not in the scene
         assert len(models.resting(name).quaternions) > 0
 

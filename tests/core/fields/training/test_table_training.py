@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.fields import train_table as training_table
+from osfcore.fields import train_table as module
 from osfcore.fields.table import TableField, read_table
 from osfcore.fields.train_table import TrainTable, train_table
 from tests.core.fields.rendered_sets import painted_ball, write_object_set, write_table_set
@@ -102,7 +102,7 @@ def test_seeds_and_places_are_tried_before_anything_is_read(tmp_path):
 
 
 def test_a_table_that_cannot_be_read_back_leaves_the_older_one(table_set, tmp_path, monkeypatch):
-    monkeypatch.setattr(training_table, "table_bytes", lambda table: b"broken")
+    monkeypatch.setattr(module, "table_bytes", lambda table: b"broken")
     out = tmp_path / "a.safetensors"
     out.write_bytes(b"older")
     with pytest.raises(CorruptFile, match="The trained table cannot be used"):

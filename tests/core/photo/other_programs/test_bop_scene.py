@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
-from osfcore.estimation import objective as resting_orientations
+from osfcore.estimation.objective import resting_orientations
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import Pose, quaternion_to_matrix, rotation_angle

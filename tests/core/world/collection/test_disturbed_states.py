@@ -6,7 +6,7 @@ import pytest
 from osfcore.dynamics.motion import SLEEP_M, substates
 from osfcore.geometry.poses import quaternion_conjugate, quaternion_multiply, rotation_angle
 from osfcore.io.push_file import read_pushes
-from osfcore.world import collect_pushes as disturb
+from osfcore.world import collect_pushes as module
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes, disturbed
 from osfcore.world.physics import body_model
 
@@ -57,7 +57,7 @@ def test_what_rests_is_left_alone_and_nothing_is_far_from_what_was_recorded(push
 @pytest.fixture
 def undisturbed(monkeypatch):
     for name in ("_MOST", "_OFF_M", "_OFF_RAD"):
-        monkeypatch.setattr(disturb, name, 0.0)
+        monkeypatch.setattr(module, name, 0.0)
 
 
 @pytest.mark.usefixtures("undisturbed")

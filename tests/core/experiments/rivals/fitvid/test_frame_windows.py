@@ -35,9 +35,9 @@ def test_windows_are_stretches_of_the_episodes(path):
 
 
 def test_objects_that_never_meet_are_not_learned_from(path, monkeypatch):
-    from osfcore.experiments.rivals import train_fitvid as frame_windows
+    from osfcore.experiments.rivals import train_fitvid
 
-    monkeypatch.setattr(frame_windows, "has_held_out_pair", lambda names: True)
+    monkeypatch.setattr(train_fitvid, "has_held_out_pair", lambda names: True)
     with pytest.raises(InvalidInput, match="learn from is 0"):
         VideoFiles((path,))
 
