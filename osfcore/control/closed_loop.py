@@ -48,7 +48,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, planar_turn, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, Observation, SceneState
-from osfcore.geometry.workspace import PUSHER_RADIUS_M
+from osfcore.geometry.workspace import PUSHER_RADIUS_M, WORKSPACE_HALF_M
 from osfcore.planning.costs import ARM_M, Cost, PoseGoal
 from osfcore.planning.parts import COSTS, CostInputs, PlannerInputs
 from osfcore.planning.pushes import PushProposals
@@ -93,6 +93,10 @@ class StageTimer:
 # Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all.
 
 
+_TIED = 0.02  # share of the workspace by which cameras that see it equally well may differ
+_PROBES = 21  # along a side of the workspace
+
+
 def relocalize(
     models: ObjectModels,
     observation: Observation,
@@ -101,6 +105,8 @@ def relocalize(
     config: GoalImageConfig | None = None,
 ) -> Iterator[EstimateStep]:
     """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
+
+    The camera is one of those that see most of the workspace, drawn at random so that another search uses another one.
 
     Args:
         models: fields of the objects and the table.
@@ -111,7 +117,8 @@ def relocalize(
     """
     state = last.state
     lost = [n for n, doubt in enumerate(last.doubts) if doubt]
-    view = int(rng.integers(len(observation.cameras)))
+    shares = np.array([_share_of_workspace(camera) for camera in observation.cameras])
+    view = int(rng.choice(np.flatnonzero(shares >= shares.max() - _TIED)))
     alone = Observation(
         observation.cameras[view : view + 1], observation.images[view : view + 1], observation.names, None, None,
         observation.time_s,
@@ -126,6 +133,16 @@ def relocalize(
         update = step.estimate
         is_worse = update is not None and sum(map(bool, update.doubts)) > len(lost)
         yield replace(step, estimate=last) if is_worse else step
+
+
+def _share_of_workspace(camera: Camera) -> float:
+    """Return the share of a grid of points on the workspace that a camera sees."""
+    side = np.linspace(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, _PROBES)
+    points = np.stack([*np.meshgrid(side, side), np.zeros((_PROBES, _PROBES))], axis=-1)
+    depth = camera.T_world_camera.inverse().apply(points)[..., 2]
+    pixels = camera.project(np.where(depth[..., None] > 0, points, np.nan))
+    with np.errstate(invalid="ignore"):
+        return float(np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=-1).mean())
 
 
 def _with_poses_of(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:
@@ -275,6 +292,7 @@ _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
 _RETREAT = 2  # actions away from the objects, before a search
+_RETREAT_M_S = 0.2  # along the faster axis: slower than a push, lest it touches what it passes
 _DISTURBANCES = frozenset({"lamp", "object", "found", "camera", "brightness"})  # after which steps are counted anew
 _RENEWALS = 10  # at most: something that flickers must not keep a robot going for ever
 
@@ -464,7 +482,7 @@ class Episode:
         away = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
         direction = away / max(float(np.abs(away).max()), 1e-6)
         for _ in range(min(_RETREAT, self._left())):
-            yield self._execute(np.array([*(0.2 * direction), 0.0]))
+            yield self._execute(np.array([*(_RETREAT_M_S * direction), 0.0]))
 
     # The goal
 

@@ -278,6 +278,7 @@ class _Tracker:
         self._push = _pusher_motion(expected.pusher, observation.pusher)
         self._rivals: dict[int, float] = {}
         self._last_fit: tuple[SceneParameters, FitQuality] | None = None
+        self._light_held = True
         self._reporter = StepReporter(4)
 
     def steps(self) -> Iterator[EstimateStep]:
@@ -302,6 +303,8 @@ class _Tracker:
             misfit = misfit & self._poorly_fitted(at.params)
         at = yield from self._refine(at, ~moved, self._middle, 1)
         at = yield from self._refine_finely(at, moved & ~misfit)
+        if not self._light_held:  # descent also says how well it is known
+            *_, at = gauss_newton(self._models, self._coarse, at, iterations=4, objects=[], light=self._middle)
         yield self._finish(at)
 
     def _fit_at_half_size(self, params: SceneParameters) -> FitQuality:
@@ -319,7 +322,7 @@ class _Tracker:
         params = replace(at.params, light=search_light(self._models, self._rough, self._coarse, at.params))
         here, there = (loss_of(self._models, self._coarse, one) for one in (at.params, params))
         if there < self._config.lamp_gain * here:
-            at = replace(at, params=params)
+            at, self._light_held = replace(at, params=params), False
         yield self._step("light", "Shading and shadows", at)
         return at
 
@@ -455,7 +458,9 @@ class _Tracker:
 
     def _finish(self, at: GaussNewtonState) -> EstimateStep:
         fit, allowed = self._fit_finely(at.params), np.maximum(MAX_RESIDUAL, self._allowed)
-        estimate = estimate_with_uncertainty(at.params, at.normals, fit, self._rivals, light_held=True, allowed=allowed)
+        estimate = estimate_with_uncertainty(
+            at.params, at.normals, fit, self._rivals, light_held=self._light_held, allowed=allowed
+        )
         return self._reporter.finish(at, estimate)
 
     def _step(self, stage: Stage, note: str, at: GaussNewtonState) -> EstimateStep:

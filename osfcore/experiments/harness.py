@@ -124,16 +124,20 @@ def share_interval(successes: int, tasks: int) -> tuple[float, float]:
     return float(limits.low), float(limits.high)
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Percentile bootstrap's 95 % interval of a mean (Efron 1979); one value alone says nothing of its spread."""
+def mean_interval(values: Sequence[float]) -> list[float] | None:
+    """Return the percentile bootstrap's 95 % interval of a mean (Efron 1979).
+
+    Returns:
+        None where all values are equal, or there is one alone: nothing says how far the next one would be.
+    """
     if len(values) < 2 or np.ptp(values) == 0:
-        return float(np.mean(values)), float(np.mean(values))
+        return None
     rng = stream_rng(0, Stream.BOOTSTRAP)
     found = bootstrap(
         (np.asarray(values, float),), np.mean, n_resamples=_RESAMPLES, confidence_level=_LEVEL, method="percentile",
         rng=rng,
     )  # fmt: skip
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    return [float(found.confidence_interval.low), float(found.confidence_interval.high)]
 
 
 def compare_shares(ours: Sequence[bool], others: Sequence[bool]) -> dict[str, Any]:
@@ -185,10 +189,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def compare_means(ours: Sequence[float], others: Sequence[float]) -> dict[str, Any]:
-    """The mean "difference" of two methods on the same tasks and its bootstrap "interval" over tasks."""
+    """Return the mean "difference" of two methods on the same tasks and its "interval", see `mean_interval`."""
     differences = [a - b for a, b in zip(ours, others, strict=True)]
-    low, high = mean_interval(differences)
-    return {"difference": float(np.mean(differences)), "interval": [low, high]}
+    return {"difference": float(np.mean(differences)), "interval": mean_interval(differences)}
 
 
 # Pieces of a long evaluation: independent, done by any `concurrent.futures.Executor`, kept as soon as they are

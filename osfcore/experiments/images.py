@@ -262,7 +262,7 @@ def _interval(values: Float[np.ndarray, "tasks"]) -> dict[str, Any]:
     values = values[np.isfinite(values)]
     if not len(values):
         return {"mean": None, "interval": None}
-    return {"mean": _rounded(values.mean()), "interval": [_rounded(end) for end in mean_interval(values.tolist())]}
+    return {"mean": _rounded(values.mean()), "interval": _rounded_ends(mean_interval(values.tolist()))}
 
 
 def _difference(ours: Float[np.ndarray, "tasks"], others: Float[np.ndarray, "tasks"]) -> dict[str, Any]:
@@ -270,7 +270,11 @@ def _difference(ours: Float[np.ndarray, "tasks"], others: Float[np.ndarray, "tas
     if not both.any():
         return {"difference": None, "interval": None}
     told = compare_means(ours[both].tolist(), others[both].tolist())
-    return {"difference": _rounded(told["difference"]), "interval": [_rounded(end) for end in told["interval"]]}
+    return {"difference": _rounded(told["difference"]), "interval": _rounded_ends(told["interval"])}
+
+
+def _rounded_ends(interval: list[float] | None) -> list[float] | None:
+    return None if interval is None else [_rounded(end) for end in interval]
 
 
 def _rounded(value: float | np.floating) -> float:

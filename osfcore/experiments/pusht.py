@@ -291,7 +291,7 @@ def _figures(episodes: Sequence[PushTEpisode]) -> dict[str, Any]:
         "success": float(np.mean(successes)),
         "success_interval": list(share_interval(sum(successes), len(successes))),
         "coverage_mean": float(np.mean(coverages)),
-        "coverage_interval": list(mean_interval(coverages)),
+        "coverage_interval": mean_interval(coverages),
         "coverage_median": float(np.median(coverages)),
         "coverage_p10": float(np.quantile(coverages, 0.1)),
         "coverage_least": min(coverages),

@@ -154,7 +154,8 @@ def _figures(scores: Sequence[RearrangementScore], who: str) -> dict[str, Any]:
         values = [getattr(score, key) for score in scores]
         told[f"{who}{key}_mean"] = _rounded(np.mean(values), 4) if scores else None
         told[f"{who}{key}_median"] = _rounded(np.median(values), 4) if scores else None
-        told[f"{who}{key}_mean_interval"] = [_rounded(end, 4) for end in mean_interval(values)] if scores else None
+        limits = mean_interval(values) if scores else None
+        told[f"{who}{key}_mean_interval"] = None if limits is None else [_rounded(end, 4) for end in limits]
     return told
 
 

@@ -178,7 +178,9 @@ def _show_planners(result: dict[str, Any]) -> None:
     for name, row in result["planners"].items():
         low, high = (100 * limit for limit in row["success_interval"])
         success = f"{100 * row['success']:.0f} % ({low:.0f} to {high:.0f})"
-        coverage = "{:.2f} ({:.2f} to {:.2f})".format(row["coverage_mean"], *row["coverage_interval"])
+        interval = row["coverage_interval"]
+        spread = "" if interval is None else " ({:.2f} to {:.2f})".format(*interval)
+        coverage = f"{row['coverage_mean']:.2f}{spread}"
         times = "".join(f"{row[f'plan_s_{key}']:>{width}.2f}" for key, width in (("mean", 10), ("p90", 6), ("most", 6)))
         print(
             f"{name:14}{success:>22}{coverage:>22}{row['coverage_median']:>8.2f}{row['coverage_least']:>8.2f}"

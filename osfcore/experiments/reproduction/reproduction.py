@@ -454,6 +454,8 @@ def _table(
 def _interval(told: Mapping[str, Any], what: str) -> str:
     if told[what] is None:
         return "-"
+    if told["interval"] is None:
+        return f"{told[what]:.3g}"
     low, high = told["interval"]
     return f"{told[what]:.3g} ({low:.3g} to {high:.3g})"
 

@@ -3,9 +3,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import osfcore.control.closed_loop as module
 from osfcore.control.closed_loop import relocalize
+from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
 from tests.core.control.scenes import CAN, GELATIN, models, sure, table
+
+
+def looks_at(position, target):
+    return Camera.look_at(f"{position}", np.array(position), np.array(target), size=64)
+
+
+def test_a_camera_that_hardly_sees_the_table_is_not_searched(library, monkeypatch):
+    world = table(library)
+    truth, observation = world.truth(), world.observe()
+    world.close()
+    away = looks_at((0.6, 0.0, 0.5), (3.0, 0.0, 0.5))
+    beside = looks_at((0.0, -0.6, 0.5), (0.4, 0.0, 0.0))
+    cameras = (away, beside, observation.cameras[0], away)
+    searched = []
+    monkeypatch.setattr(module, "estimate_goal", lambda _models, seen, *_: searched.append(seen.cameras) or iter(()))
+    shown = replace(observation, cameras=cameras, masks=None)
+    for seed in range(8):
+        with pytest.raises(AssertionError):  # nothing is found in no steps
+            list(relocalize(models().appearance, shown, sure(truth, ("it was lost", "")), np.random.default_rng(seed)))
+    assert searched == [cameras[2:3]] * 8
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def test_what_stands_still_stays_where_it_is(models, truth):
     shift, turn, light = apart(steps[-1].estimate.state, truth)
     assert shift.max() < 0.001
     assert np.rad2deg(turn).max() < 1
-    assert light == 0  # held
+    assert light == steps[-1].estimate.light_std == 0  # held
     assert steps[-1].estimate.trusted
     assert all(step.candidates is None for step in steps)  # nothing to search
 
@@ -90,7 +90,8 @@ def test_a_moved_lamp_is_noticed(models, truth):
     steps = followed(models, moved, truth)
     shift, turn, light = apart(steps[-1].estimate.state, moved)
     assert "light" in [step.stage for step in steps]
-    assert np.rad2deg(light) < 3
+    assert np.rad2deg(light) < 1
+    assert light < 10 * steps[-1].estimate.light_std < np.deg2rad(20)
     assert shift.max() < 0.002
     assert np.rad2deg(turn).max() < 2
 

@@ -28,7 +28,12 @@ def test_the_interval_of_a_mean_narrows_with_the_root_of_the_number():
     widths = [np.ptp(mean_interval(values[:count])) for count in (100, 1600)]
     assert widths[0] == pytest.approx(2 * 1.96 / 10, rel=0.25)
     assert widths[0] / widths[1] == pytest.approx(4, rel=0.25)
-    assert mean_interval([3.0]) == (3.0, 3.0)
+
+
+@pytest.mark.parametrize("values", [[3.0], [3.0, 3.0, 3.0]])
+def test_values_without_spread_have_no_interval(values):
+    assert mean_interval(values) is None
+    assert compare_means(values, [0.0] * len(values)) == {"difference": 3.0, "interval": None}
 
 
 @pytest.mark.parametrize(("only_one", "p"), [(5, 2 / 2**5), (6, 2 / 2**6), (0, 1.0)])
