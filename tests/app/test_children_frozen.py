@@ -27,6 +27,7 @@ def freeze(service):
             os.kill(child, signal.SIGSTOP)
 
 
+@pytest.mark.slow
 def test_an_episode_can_be_cancelled_while_every_child_is_stopped_and_all_comes_back(service):
     port, pid = service
     scene = call(port, "POST", "scenes", {"objects": ["006_mustard_bottle"], "seed": 3})
@@ -47,6 +48,7 @@ def test_an_episode_can_be_cancelled_while_every_child_is_stopped_and_all_comes_
     assert call(port, "GET", "health")["status"] == "ok"
 
 
+@pytest.mark.slow
 def test_health_tells_that_the_simulation_is_gone_until_it_is_back(service):
     port, pid = service
     seen = []

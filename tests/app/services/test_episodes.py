@@ -135,6 +135,7 @@ def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runne
     assert left_over(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_an_episode_toward_poses_knows_where_everything_truly_should_be(episodes, tmp_path):
     goal = episodes.start(AskedEpisode(scene="s", poses=POSES)).params["goal"]
     assert goal == {"id": None, "camera": None, "poses": poses_to_json(POSES), "truth": poses_to_json(POSES)}
@@ -382,6 +383,7 @@ def done(service):
     service.delete(f"/api/scenes/{scene['id']}")
 
 
+@pytest.mark.slow
 def test_an_episode_is_followed_to_its_end(service, services, done):
     episode, scene, refused = done
     assert (episode["status"], episode["error"]) == ("done", None)

@@ -48,6 +48,7 @@ def test_the_true_pose_has_a_small_loss(surfels, taken):
     assert terms.correlation[0] > 0.8
 
 
+@pytest.mark.slow
 def test_the_loss_knows_nothing_of_exposure(surfels, taken):
     darker = replace(taken.photo, image=np.float32(0.5) * taken.photo.image)
     pose = Pose(taken.pose.position[None], taken.pose.quaternion[None])

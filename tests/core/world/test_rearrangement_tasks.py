@@ -63,6 +63,7 @@ def test_one_two_and_three_objects_move_in_turn(library, families):
     assert len(tasks_of(library, "shifted", 1, numbers=[5])[0].moved) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_what_moves_lies_elsewhere_in_the_workspace_and_the_rest_stays(families, family):
     for task in families[family]:

@@ -16,7 +16,7 @@ from tests.app.conftest import LONG, keep_busy, leave_running, running
 BOX = "003_cracker_box"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def busy(service):
     """A job that keeps its turn."""
     job = keep_busy(service)
@@ -123,15 +123,15 @@ def test_poses_that_are_none_are_refused_at_once(service, scene):
     assert "unit quaternion" in is_problem(service.post("/api/episodes", json={"poses": poses}), 422)["detail"]
 
 
-@pytest.mark.parametrize(
-    ("method", "tail"),
-    [("get", ""), ("delete", ""), ("post", "/pause"), ("post", "/resume"), ("post", "/step"), ("patch", "/settings"),
-     ("get", "/events"), ("get", "/frames/0.png"), ("get", "/files/report.json")],
-)  # fmt: skip
-def test_missing_episodes_and_jobs_of_other_kinds_are_not_found(service, busy, method, tail):
-    body = {"json": {"steps": 5}} if method == "patch" else {}
-    for name in ("none", busy):
-        is_problem(getattr(service, method)(f"/api/episodes/{name}{tail}", **body), 404)
+def test_missing_episodes_and_jobs_of_other_kinds_are_not_found(service, busy):
+    paths = [
+        ("get", ""), ("delete", ""), ("post", "/pause"), ("post", "/resume"), ("post", "/step"), ("patch", "/settings"),
+        ("get", "/events"), ("get", "/frames/0.png"), ("get", "/files/report.json"),
+    ]  # fmt: skip
+    for method, tail in paths:
+        body = {"json": {"steps": 5}} if method == "patch" else {}
+        for name in ("none", busy):
+            is_problem(getattr(service, method)(f"/api/episodes/{name}{tail}", **body), 404)
 
 
 def test_orders_that_do_not_fit_say_so(service, waiting):

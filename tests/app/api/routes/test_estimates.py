@@ -62,6 +62,7 @@ def test_a_scene_is_estimated_near_the_truth_that_only_the_simulation_tells(serv
     assert first["simulation"]["light_deg"] < 5
 
 
+@pytest.mark.slow
 def test_the_result_is_exactly_the_state_file(service, first):
     file = service.get(f"/api/jobs/{first['id']}/files/state.json").json()
     assert first["estimate"] == file

@@ -75,6 +75,7 @@ def test_an_object_is_found_by_the_calibrated_camera(photos, tmp_path, capsys):
     assert "--camera tells the focal length" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_people_are_told_what_was_found_and_what_would_help(photos, tmp_path, capsys):
     assert main(["photo", "calibrate", *photos, "--out", str(tmp_path / "camera.json")]) == 0
     told = capsys.readouterr().out

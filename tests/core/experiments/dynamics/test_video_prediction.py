@@ -69,6 +69,7 @@ def test_an_episode_is_predicted_by_all_methods(compared):
     assert told == pytest.approx(copied[0] - copied[1], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_pictures_show_the_first_episode(compared):
     asked, _ = compared
     image = cv2.imread(str(asked.folder / IMAGES_FILE))

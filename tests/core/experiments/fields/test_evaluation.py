@@ -72,6 +72,7 @@ def test_the_report_has_every_object_and_means_over_them(evaluated, solids):
     assert result["scenes"] == 2
 
 
+@pytest.mark.slow
 def test_progress_grows_and_only_the_last_step_reports(evaluated):
     _, steps = evaluated
     assert [step.done for step in steps] == sorted(step.done for step in steps)

@@ -43,6 +43,7 @@ def compared(library, tmp_path_factory):
     return asked, list(compare_relighting(asked, FieldLibrary(None), library))
 
 
+@pytest.mark.slow
 def test_a_scene_is_shown_by_all_methods_under_all_lights(compared):
     asked, steps = compared
     assert [(step.done, step.total) for step in steps] == [(n, 3) for n in range(4)]

@@ -103,6 +103,7 @@ def test_descent_leaves_the_cup_open_and_clears_the_fog(cup):
     assert np.all(density_at(fitted, WALLS) > 0)
 
 
+@pytest.mark.slow
 def test_a_lid_fits_worse_than_a_wall(cup):
     images, hull = cup
     misfit = surface_misfit(hull, images, hull.density > 0)
@@ -130,6 +131,7 @@ def test_brightness_and_unit_of_length_do_not_matter(cup):
     np.testing.assert_allclose(misfit[1], misfit[0], atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_voxels(cup):
     images, hull = cup
     first, second = (fit_voxels(hull, images, steps=3, rays=64, rng=np.random.default_rng(1)) for _ in range(2))
