@@ -398,6 +398,8 @@ class Episode:
 
     def _observe(self, *, masks: bool = False) -> Iterator[Event]:  # returns the Observation
         raw = self._world.observe(masks=masks)
+        if raw.pusher is None:
+            raise InvalidInput("pusher of the world", "missing", "its centre [m], in every observation of an episode")
         yield Observed(self._number, raw)
         observation, changes = self._sight.take(raw)
         for change in changes:

@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import check_ranges
+from osfcore.errors import InvalidInput, check_ranges
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES, Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
@@ -189,7 +189,12 @@ class MPPIPlanner:
 
         Yields:
             The rounds.
+
+        Raises:
+            InvalidInput: if the state has no pusher.
         """
+        if state.pusher is None:
+            raise InvalidInput("pusher of the state to plan from", "missing", "its centre [m]")
         self._refinements += 1
         if self._nominal is None or self._refinements >= self.settings.proposals_every or not self._nominal[0].any():
             self._refinements = 0

@@ -71,6 +71,22 @@ def begun(world, goal, settings=SMALL, **more) -> Episode:
     return Episode(world, KNOWN, goal, settings, np.random.default_rng(0), **more)
 
 
+class Blind:
+    """A world that does not say where its pusher is."""
+
+    def __init__(self, world):
+        self.reset, self.act, self.close = world.reset, world.act, world.close
+        self._world = world
+
+    def observe(self, *, masks=False):
+        return replace(self._world.observe(masks=masks), pusher=None)
+
+
+def test_a_world_must_say_where_its_pusher_is(world, told):
+    with pytest.raises(InvalidInput, match="pusher"):
+        list(begun(Blind(world), shifted(world)).run())
+
+
 @pytest.mark.slow
 def test_the_table_becomes_what_was_asked_for(world, told):
     goal = toward_middle(world)

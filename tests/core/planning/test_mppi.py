@@ -62,6 +62,13 @@ def test_a_plan_leads_toward_the_goal(shapes, start):
         np.testing.assert_array_equal(r.best.positions[0], r.rollouts.positions[r.costs.argmin()])
 
 
+def test_without_a_pusher_there_is_no_plan(shapes, start):
+    with pytest.raises(InvalidInput, match="pusher"):
+        planned(
+            MPPIPlanner(carried, PushProposals(shapes), SMALL), replace(start, pusher=None), goal_of(start, (0.1, 0))
+        )
+
+
 def test_planning_on_comes_closer(shapes, start):
     goal = goal_of(start, (0.12, -0.08))
     planner = MPPIPlanner(carried, PushProposals(shapes), SMALL)
