@@ -1,3 +1,5 @@
+"""Closed loop: closed loop, relocalization, adapted models, monitor."""
+
 from collections import Counter
 from dataclasses import replace
 
@@ -6,7 +8,17 @@ import pytest
 
 from osfcore.control import closed_loop as module
 from osfcore.control import estimators
-from osfcore.control.closed_loop import Episode
+from osfcore.control.closed_loop import (
+    AdaptedModels,
+    Episode,
+    ProgressMonitor,
+    estimate_goal_image,
+    lamp_moved,
+    lies_otherwise,
+    moved_by_hand,
+    offsets,
+    relocalize,
+)
 from osfcore.control.events import (
     ActionExecuted,
     EpisodeSettings,
@@ -21,13 +33,17 @@ from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
 from osfcore.estimation.camera_response import ImageModel, srgb_of_linear
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.states import SceneState
 from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSettings
 from osfcore.progress import Progress
 from tests.core.control.scenes import CAN, GELATIN, LIGHT, NAMES, models, perfect_fit, sure, table
+
+# Closed loop
+
 
 DARK = ImageModel(np.full(3, 0.67), 1.0, np.ones(3), "srgb")
 SMALL = EpisodeSettings(steps=12, plan=PlanSettings(samples=48, horizon=10))
@@ -279,3 +295,172 @@ def test_by_real_eyes_a_lamp_and_an_object_moved_by_hand_are_survived(world):
     truth = world.truth()
     for name in NAMES:
         assert last.estimate.state.pose(name).position == pytest.approx(truth.pose(name).position, abs=0.005)
+
+
+# Relocalization
+
+
+def looks_at(position, target):
+    return Camera.look_at(f"{position}", np.array(position), np.array(target), size=64)
+
+
+def test_a_camera_that_hardly_sees_the_table_is_not_searched(library, monkeypatch):
+    world = table(library)
+    truth, observation = world.truth(), world.observe()
+    world.close()
+    away = looks_at((0.6, 0.0, 0.5), (3.0, 0.0, 0.5))
+    beside = looks_at((0.0, -0.6, 0.5), (0.4, 0.0, 0.0))
+    cameras = (away, beside, observation.cameras[0], away)
+    searched = []
+    monkeypatch.setattr(module, "estimate_goal", lambda _models, seen, *_: searched.append(seen.cameras) or iter(()))
+    shown = replace(observation, cameras=cameras, masks=None)
+    for seed in range(8):
+        with pytest.raises(AssertionError):  # nothing is found in no steps
+            list(relocalize(models().appearance, shown, sure(truth, ("it was lost", "")), np.random.default_rng(seed)))
+    assert searched == [cameras[2:3]] * 8
+
+
+@pytest.mark.slow
+def test_what_is_lost_is_found_anywhere_on_the_table(library):
+    world = table(library)
+    truth, observation = world.truth(), world.observe()
+    world.close()
+    position = truth.poses.position.copy()
+    position[0, :2] += [0.15, -0.1] if position[0, 0] < 0 else [-0.15, 0.1]
+    last = sure(replace(truth, poses=Pose(position, truth.poses.quaternion)), ("it was lost", ""))
+    *before, step = relocalize(models().appearance, observation, last, np.random.default_rng(0))
+    assert all(one.estimate is None for one in before)
+    found = step.estimate
+    assert found.trusted
+    for name in (GELATIN, CAN):
+        assert found.state.pose(name).position == pytest.approx(truth.pose(name).position, abs=0.005)
+
+
+# Adapted models
+
+
+OTHER = ImageModel(np.full(3, 0.5), 1.0, np.array([0.5, 0.6, 0.7]), "srgb")
+STATE = SceneState(NAMES, Pose(np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1))), LIGHT, None)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return AdaptedModels(models().appearance)
+
+
+@pytest.fixture
+def goal():
+    camera = goal_camera()
+    return GoalImage(camera, np.full((camera.height, camera.width, 3), 0.5, np.float32))
+
+
+def test_models_for_usual_pictures_are_left_as_they_are(usual, goal):
+    assert usual.to(None, NAMES) is usual
+    assert usual.normalized_goal(goal) is goal
+
+
+def estimated(monkeypatch, usual, scene, goal, *, trusts):
+    """What is found where an estimator trusts only these models, and what it was given."""
+    given = []
+
+    def steps(models, seen, *_):
+        given.append((models, seen.images[0]))
+        found = sure(STATE, ("", "") if models is trusts else ("it differs", ""))
+        yield EstimateStep(Progress(1, 2, "Looking"), "together", STATE)
+        yield EstimateStep(Progress(2, 2, "Done"), "done", STATE, estimate=found)
+
+    monkeypatch.setattr(module, "estimate_goal", steps)
+    told = list(estimate_goal_image(usual, scene, goal, STATE, None))
+    assert [step.estimate is None for step in told] == [True] * (len(told) - 1) + [False]
+    return told[-1], given
+
+
+def test_a_goal_image_is_taken_as_the_first_frame_was(monkeypatch, usual, goal):
+    scene = usual.to(OTHER, NAMES)
+    last, given = estimated(monkeypatch, usual, scene, goal, trusts=scene.models)
+    assert last.image_model is OTHER
+    ((_, image),) = given
+    np.testing.assert_array_equal(image, scene.normalized_goal(goal).image)
+
+
+def test_a_goal_image_that_the_cameras_would_not_take_is_tried_as_a_usual_one(monkeypatch, usual, goal):
+    scene = usual.to(OTHER, NAMES)
+    last, given = estimated(monkeypatch, usual, scene, goal, trusts=usual.models)
+    assert last.image_model is None
+    assert last.estimate.trusted
+    np.testing.assert_array_equal(given[1][1], goal.image)
+
+
+def test_a_goal_image_that_nothing_explains_stays_the_cameras_own(monkeypatch, usual, goal):
+    last, _ = estimated(monkeypatch, usual, usual.to(OTHER, NAMES), goal, trusts=None)
+    assert last.image_model is OTHER
+    assert last.estimate.reason
+
+
+def test_usual_pictures_are_looked_at_once(monkeypatch, usual, goal):
+    last, given = estimated(monkeypatch, usual, usual, goal, trusts=None)
+    assert (last.image_model, len(given)) == (None, 1)
+
+
+# Monitor
+
+
+UPRIGHT = np.array([1.0, 0, 0, 0])
+MONITORED_STATE = SceneState(
+    ("a", "b"),
+    Pose(np.array([[0.1, 0.0, 0.02], [-0.2, 0.05, 0.03]]), np.stack([UPRIGHT, UPRIGHT])),
+    Light(np.array([0.0, 0.3, 1])),
+    np.array([0.15, 0.0, 0.06]),
+)
+
+
+def shifted_state(state: SceneState, number: int, shift) -> SceneState:
+    position = state.poses.position.copy()
+    position[number] += shift
+    return replace(state, poses=Pose(position, state.poses.quaternion))
+
+
+def test_offsets_are_on_the_table_and_turns_about_any_axis():
+    there = Pose(np.array([0.1, 0.03, 0.5]), quaternion_exp(np.array([0, 0, 0.4])))
+    far, turned = offsets(PoseGoal.of(MONITORED_STATE, {"a": there}), MONITORED_STATE)
+    np.testing.assert_allclose(far, [0.03, 0], atol=1e-12)
+    np.testing.assert_allclose(turned, [0.4, 0], atol=1e-7)
+
+
+def test_what_is_turned_about_the_vertical_lies_on_the_same_side_and_what_rolled_does_not():
+    turned, rolled = (
+        Pose(MONITORED_STATE.pose("a").position, quaternion_exp(np.array(by))) for by in ([0, 0, 2.0], [0.4, 0, 0])
+    )
+    np.testing.assert_array_equal(
+        lies_otherwise(PoseGoal.of(MONITORED_STATE, {"a": turned}), MONITORED_STATE), [False, False]
+    )
+    np.testing.assert_array_equal(
+        lies_otherwise(PoseGoal.of(MONITORED_STATE, {"a": rolled}), MONITORED_STATE), [True, False]
+    )
+
+
+def test_patience_lasts_while_there_is_progress():
+    patience = ProgressMonitor()
+    assert not any(patience.is_stalled(0.5 - 0.005 * step) for step in range(60))
+
+
+def test_patience_ends_after_a_while_without_and_begins_anew():
+    patience = ProgressMonitor()
+    told = [patience.is_stalled(0.2) for _ in range(40)]
+    assert told.index(True) == 16
+    assert sum(told) == 2
+
+
+@pytest.mark.parametrize(("angle", "is_told"), [(0.0, False), (0.03, False), (0.2, True), (1.0, True)])
+def test_a_lamp_counts_as_moved_from_a_few_degrees_on(angle, is_told):
+    told = lamp_moved(Light.from_angles(0.3, 0.3), Light.from_angles(0.3, 0.3 + angle))
+    assert told == (pytest.approx(angle) if is_told else None)
+
+
+def test_an_object_far_from_the_pusher_was_carried():
+    assert moved_by_hand(MONITORED_STATE, shifted_state(MONITORED_STATE, 1, [0.0, 0.06, 0.0])) == ("b",)
+    assert moved_by_hand(MONITORED_STATE, shifted_state(MONITORED_STATE, 1, [0.0, 0.01, 0.0])) == ()
+
+
+def test_what_the_pusher_can_reach_may_have_been_pushed():
+    assert moved_by_hand(MONITORED_STATE, shifted_state(MONITORED_STATE, 0, [0.0, 0.06, 0.0])) == ()

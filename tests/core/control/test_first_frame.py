@@ -1,11 +1,21 @@
-"""First frames of pictures whose exposure, response, ambient light and table nobody tells."""
+"""First frame: first frame, prepared look."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from osfcore.control.first_frame import estimate_first
+from osfcore.control.closed_loop import Episode
+from osfcore.control.events import EpisodeSettings, GoalFound, Looking, Noticed, Stepped
+from osfcore.control.first_frame import (
+    PreparedLook,
+    PreparedLooks,
+    estimate_first,
+    prepared_from_json,
+    prepared_to_json,
+)
+from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput
 from osfcore.estimation.camera_response import ImageModel, srgb_of_linear
 from osfcore.estimation.first_frame import FirstFrameConfig
@@ -13,9 +23,16 @@ from osfcore.estimation.first_frame import estimate_first as estimate_usual
 from osfcore.estimation.objective import views_of
 from osfcore.estimation.photometry import adapted
 from osfcore.estimation.search import check_table
-from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.planning.mppi import PlanSettings
+from tests.core.control.scenes import CAN, sure, table
+from tests.core.control.scenes import models as prepared_look_models
 from tests.core.estimation.scenes import BOTTLE, BOX, NAMES, apart, lying, observe, scene, shipped_models
+
+# First frames of pictures whose exposure, response, ambient light and table nobody tells.
+
 
 BRICK = "061_foam_brick"
 QUICK = FirstFrameConfig(2, 6, 2, 8, 2, 3, 2)
@@ -105,3 +122,84 @@ def test_masks_are_needed(models, truth):
     seen = observe(models, truth, default_cameras(48)[:1], masks=False)
     with pytest.raises(InvalidInput, match="masks of the first frame"):
         next(estimate_first(models, seen, np.random.default_rng(0)))
+
+
+# Prepared look
+
+
+KNOWN = prepared_look_models()
+SMALL = EpisodeSettings(steps=1, plan=PlanSettings(samples=16, horizon=4))
+
+
+@pytest.fixture
+def world(library):
+    world = table(library)
+    yield world
+    world.close()
+
+
+@pytest.fixture
+def goal(world):
+    camera = goal_camera()
+    return GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
+
+
+@pytest.fixture
+def prepared(world, goal):
+    truth, seen = world.truth(), world.observe()
+    of_goal = sure(replace(truth, pusher=None))
+    return PreparedLooks(
+        PreparedLook.of(KNOWN.appearance, seen, sure(truth)),
+        PreparedLook.of(KNOWN.appearance, goal.observed(truth.names), of_goal),
+    )
+
+
+def test_it_explains_what_it_was_made_from_and_nothing_else(world, prepared):
+    assert prepared.first.explains(KNOWN.appearance, world.observe())
+    pose = world.truth().pose(CAN)
+    world.move_object(CAN, Pose(pose.position + [0.02, 0.0, 0.0], pose.quaternion))
+    assert not prepared.first.explains(KNOWN.appearance, world.observe())
+
+
+@pytest.mark.slow
+def test_an_episode_takes_what_fits_and_looks_itself_for_the_rest(world, goal, prepared):
+    """The can is moved after the preparation: the first frame is estimated anew, the goal image is not."""
+    pose = world.truth().pose(CAN)
+    world.move_object(CAN, Pose(pose.position + [0.0, 0.05, 0.0], pose.quaternion))
+    episode = Episode(world, KNOWN, goal, SMALL, np.random.default_rng(0), prepared=prepared)
+    looks, prepared_of = {"first": 0, "goal": 0, "next": 0}, []
+    for event in episode.run():
+        if isinstance(event, Noticed) and event.matter == "prepared":
+            prepared_of.append(event.text)
+        if isinstance(event, Looking):
+            looks[event.look] += 1
+        if isinstance(event, Stepped):
+            break
+        if isinstance(event, GoalFound):
+            np.testing.assert_allclose(event.goal.pose(CAN).position, pose.position, atol=1e-6)
+    assert looks["first"] > 5
+    assert looks["goal"] == 1
+    assert prepared_of == ["The estimate of the goal image was prepared with this example."]
+    truth = world.truth()
+    np.testing.assert_allclose(event.estimate.state.poses.position, truth.poses.position, atol=3e-3)
+
+
+def test_it_is_the_same_once_written_and_read(prepared):
+    read = prepared_from_json(json.loads(json.dumps(prepared_to_json(prepared))))
+    for mine, theirs in ((prepared.first, read.first), (prepared.goal, read.goal)):
+        np.testing.assert_allclose(mine.residuals, theirs.residuals, atol=1e-6)
+        np.testing.assert_allclose(mine.estimate.state.poses.position, theirs.estimate.state.poses.position, atol=1e-12)
+        assert mine.estimate.state.names == theirs.estimate.state.names
+
+
+@pytest.mark.parametrize("spoil", [{"goal": None}, {"first": {"estimate": {}, "residuals": []}}])
+def test_what_is_not_whole_is_refused(prepared, spoil):
+    with pytest.raises(InvalidInput):
+        prepared_from_json({**prepared_to_json(prepared), **spoil})
+
+
+def test_as_many_residuals_as_objects_are_needed(prepared):
+    data = prepared_to_json(prepared)
+    data["first"]["residuals"] = [0.1]
+    with pytest.raises(InvalidInput, match="residuals"):
+        prepared_from_json(data)

@@ -1,3 +1,7 @@
+"""Board: board, board page, planar pose."""
+
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +16,19 @@ from osfcore.experiments.board_views import (
     tag_print,
 )
 from osfcore.geometry.poses import rotation_angle
-from osfcore.photo.board import Board, locate_board, locate_tag
+from osfcore.photo.board import (
+    RULER_M,
+    Board,
+    board_pdf,
+    focal_length,
+    locate_board,
+    locate_tag,
+    page_image,
+    planar_pose,
+)
+
+# Board
+
 
 VGA = (640, 480)
 BOARD = Board()
@@ -230,3 +246,114 @@ def test_boards_that_cannot_be_are_refused(wrong, what):
 def test_unknown_dictionaries_are_refused():
     with pytest.raises(UnknownName, match="DICT_4X4_50"):
         Board(dictionary="DICT_4x4_50")
+
+
+# Board page
+
+
+DOT_M = 0.0254 / 600
+BOARDS = [Board(), Board(7, 5, 0.036, 0.027, "DICT_5X5_50"), Board(8, 6, 0.0322, 0.0241)]
+
+
+def edges(line):
+    return np.flatnonzero(np.diff(line.astype(int))) + 1
+
+
+def test_pdf_is_a_page_of_a4_in_landscape_and_small():
+    pdf = board_pdf(Board())
+    (box,) = re.findall(rb"/MediaBox \[ ?([\d. ]+)\]", pdf)
+    millimetres = np.array(box.split(), float) / 72 * 25.4
+    np.testing.assert_allclose(millimetres, (0, 0, 297, 210), atol=0.1)
+    assert (b"/Width 7016" in pdf, b"/Height 4961" in pdf) == (True, True)
+    assert len(pdf) < 300_000
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=str)
+def test_board_has_its_exact_size_in_the_middle_of_the_page(board):
+    page = page_image(board, 1 / DOT_M)
+    np.testing.assert_allclose(np.array(page.shape[::-1]) * DOT_M, (0.297, 0.21), atol=5e-5)
+    centre = np.array([0.297, 0.21]) / 2
+    at = (centre + board.corners_m() * (1, -1)) / DOT_M
+    inside = 0.04 * board.square_m / DOT_M
+    for x, y in at[:: len(at) - 1]:  # the first and the last corner: colours change exactly there
+        across = page[round(y - inside), round(x - inside) : round(x + inside)]
+        down = page[round(y - inside) : round(y + inside), round(x - inside)]
+        assert edges(across) + round(x - inside) == pytest.approx([x], abs=1)
+        assert edges(down) + round(y - inside) == pytest.approx([y], abs=1)
+    rows, columns = (np.flatnonzero(~page.all(axis=axis)) * DOT_M for axis in (1, 0))
+    assert rows[0] > 0.008
+    assert columns[0] > 0.008
+    assert columns[-1] < 0.297 - 0.008
+
+
+def test_ruler_is_100_mm_long_and_does_not_touch_the_board():
+    page = page_image(Board(), 1 / DOT_M)
+    below = page[round((0.105 + 0.088 + 0.001) / DOT_M) :]
+    longest = max(np.diff(edges(row))[::2].max() for row in below if not row.all())  # runs of ink between two edges
+    assert longest * DOT_M == pytest.approx(RULER_M, abs=4e-4)
+
+
+# Planar pose
+
+
+SIZE = (640, 480)
+POINTS = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(-0.06, 0.06, 3)), axis=-1).reshape(-1, 2)
+
+
+def seen(camera, points=POINTS):
+    pose, intrinsics = camera
+    projected = pose.inverse().apply(np.pad(points, ((0, 0), (0, 1)))) @ intrinsics.T
+    return projected[:, :2] / projected[:, 2:]
+
+
+@pytest.mark.parametrize("points", [POINTS, POINTS[[0, 4, 14, 10]]], ids=["15 points", "4 points"])
+def test_pose_is_exact_for_exact_points(points):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        pose, intrinsics = camera = random_camera(rng, SIZE)
+        found, rms = planar_pose(points, seen(camera, points), intrinsics)
+        assert rotation_angle(found.quaternion, pose.quaternion) < 1e-5
+        assert np.linalg.norm(found.position - pose.position) < 1e-5
+        assert rms < 1e-3
+
+
+def test_camera_is_above_the_table_however_the_points_scatter():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        camera = random_camera(rng, SIZE, elevations_deg=(70, 90))
+        found, _ = planar_pose(POINTS, seen(camera) + rng.normal(0, 1, POINTS.shape), camera[1])
+        assert found.position[2] > 0
+
+
+def test_a_view_from_below_is_refused():
+    pose, intrinsics = random_camera(np.random.default_rng(2), SIZE)
+    mirrored = seen((pose, intrinsics)) * (-1, 1) + (SIZE[0], 0)
+    with pytest.raises(InvalidInput, match="its back"):
+        planar_pose(POINTS, mirrored, intrinsics)
+
+
+def test_focal_length_is_exact_for_exact_points():
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        camera = random_camera(rng, SIZE, elevations_deg=(30, 60))
+        focal, deviation = focal_length(POINTS, seen(camera), SIZE, accuracy_px=0.01)
+        assert focal == pytest.approx(camera[1][0, 0], rel=1e-3)
+        assert 0 < deviation < 0.01 * focal
+
+
+def test_deviation_of_the_focal_length_tells_its_scatter():
+    rng = np.random.default_rng(4)
+    camera = random_camera(rng, SIZE, elevations_deg=(45, 45))
+    found = [focal_length(POINTS, seen(camera) + rng.normal(0, 0.1, POINTS.shape), SIZE, 0.01) for _ in range(100)]
+    focals, deviations = np.array(found).T
+    assert np.std(focals) == pytest.approx(np.median(deviations), rel=0.3)
+    assert abs(np.mean(focals) - camera[1][0, 0]) < 0.5 * np.std(focals)
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.1])
+def test_focal_length_is_refused_from_straight_above(noise_px):
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        pixels = seen(random_camera(rng, SIZE, elevations_deg=(87, 90)))
+        with pytest.raises(InvalidInput, match="focal length is unknown"):
+            focal_length(POINTS, pixels + rng.normal(0, noise_px, pixels.shape), SIZE, accuracy_px=0.05)

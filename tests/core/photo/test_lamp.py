@@ -1,9 +1,16 @@
+"""Lamp: lamp, near lamp."""
+
 import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
 from osfcore.estimation.objective import fibonacci_sphere
-from osfcore.photo.lamp import ShadedPixels, fit_lamp
+from osfcore.geometry.light import SpotLamp
+from osfcore.geometry.poses import Pose
+from osfcore.photo.lamp import TABLE, LitPixels, ShadedPixels, Shadows, fit_lamp, fit_near_lamp
+from osfcore.photo.pose_loss import Surfels
+
+# Lamp
 
 
 def ball(rng, count=3000):
@@ -54,3 +61,159 @@ def test_exposure_changes_the_strength_alone():
 def test_few_pixels_are_refused():
     with pytest.raises(InvalidInput, match="number of shaded pixels is 3"):
         ShadedPixels(np.ones((3, 3)), np.ones((3, 3)), np.ones((3, 3)))
+
+
+# A near lamp from pixels of two balls on a table, made by the model in closed form.
+
+
+BALLS = ((np.array([0.09, 0.0, 0.05]), 0.05), (np.array([-0.06, 0.08, 0.04]), 0.04))
+CENTRE = np.zeros(3)
+
+
+def ball_under_lamp(radius, count=6000):
+    normals = fibonacci_sphere(count).astype(np.float32)
+    spacing = radius * np.sqrt(4 * np.pi / count)
+    return Surfels(radius * normals, normals, np.full_like(normals, 0.5), float(spacing))
+
+
+def shadows():
+    still = Pose.identity().quaternion
+    return Shadows([ball_under_lamp(radius) for _, radius in BALLS], [Pose(centre, still) for centre, _ in BALLS])
+
+
+def surfaces(rng):
+    """Points, normals and owners of what a camera above sees."""
+    table = np.column_stack([rng.uniform(-0.35, 0.35, (2500, 2)), np.zeros(2500)])
+    table = table[[all(np.linalg.norm(p[:2] - c[:2]) > r for c, r in BALLS) for p in table]]
+    points, normals = [table], [np.tile([0.0, 0.0, 1.0], (len(table), 1))]
+    owner = [np.full(len(table), TABLE)]
+    for number, (centre, radius) in enumerate(BALLS):
+        normal = fibonacci_sphere(900)
+        normal = normal[normal[:, 2] > -0.2]
+        points.append(centre + radius * normal)
+        normals.append(normal)
+        owner.append(np.full(len(normal), number))
+    return np.concatenate(points), np.concatenate(normals), np.concatenate(owner)
+
+
+def reached(points, toward, length):
+    """Whether no ball stands between points and the lamp, by the quadratic equation of ray and sphere."""
+    free = np.ones(len(points))
+    for centre, radius in BALLS:
+        way = centre - points
+        along = np.einsum("ij,ij->i", way, toward)
+        across = np.einsum("ij,ij->i", way, way) - along**2
+        entry = along - np.sqrt(np.maximum(radius**2 - across, 0))
+        free[(across < radius**2) & (entry > 1e-6) & (entry < length)] = 0
+    return free
+
+
+def scene(spot=None, direction=None, ambient=0.3, diffuse=0.7, gain=1.0, noise=0.004, seed=0, views=1):
+    """Pixels under a near lamp, a distant one from a direction, or none."""
+    rng = np.random.default_rng(seed)
+    points, normals, owner = surfaces(rng)
+    albedo = np.where(owner[:, None] == TABLE, 1.0, rng.uniform(0.2, 0.9, (len(points), 3)))
+    own = np.where(owner[:, None] == TABLE, [0.6, 0.5, 0.4], albedo)
+    share = np.zeros(len(points))
+    if spot is not None:
+        toward, length = spot.toward(points), np.linalg.norm(spot.position - points, axis=1)
+        share = spot.falloff(points) * spot.spot_factor(points) * reached(points, toward, length)
+        share *= np.maximum(np.einsum("ij,ij->i", toward, normals), 0)
+    if direction is not None:
+        share = np.maximum(normals @ direction, 0) * reached(points, np.tile(direction, (len(points), 1)), np.inf)
+    radiance = gain * own * (ambient + diffuse * share)[:, None] + rng.normal(0, noise, own.shape)
+    return LitPixels(radiance, albedo, points, normals, owner, np.arange(len(points)) % views, shadows())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("place", "cone"), [((0.3, -0.2, 0.4), (60, 75)), ((-0.5, 0.3, 0.35), (14, 22)), ((0.1, 0.6, 0.9), (12, 18))]
+)
+def test_place_and_cone_are_recovered(place, cone):
+    spot = SpotLamp(np.array(place), np.array([0.02, -0.01, 0.0]), *cone)
+    found = fit_near_lamp(scene(spot), CENTRE)
+    assert not found.is_diffuse
+    assert angle_deg(found.direction, spot.direction) < 2
+    assert found.distance_known
+    assert abs(found.distance / spot.distance - 1) < 0.08
+    assert angle_deg(found.lamp.direction, found.direction) < 1e-3
+    if cone[1] < 45:
+        assert abs(found.lamp.outer_deg - cone[1]) < 4
+
+
+def test_deviations_cover_the_errors():
+    spot = SpotLamp(np.array([0.4, 0.3, 0.5]), CENTRE, 60, 75)
+    found = fit_near_lamp(scene(spot, seed=1), CENTRE)
+    assert np.deg2rad(angle_deg(found.direction, spot.direction)) < 3 * found.std
+    assert abs(np.log(found.distance / spot.distance)) < 3 * found.log_distance_std
+
+
+def test_of_a_distant_lamp_the_distance_stays_unknown():
+    direction = np.array([0.5, -0.4, 0.7]) / np.linalg.norm([0.5, -0.4, 0.7])
+    found = fit_near_lamp(scene(direction=direction), CENTRE)
+    assert not found.is_diffuse
+    assert angle_deg(found.direction, direction) < 2
+    assert not found.distance_known
+    assert found.lamp is None
+
+
+def test_light_from_everywhere_is_called_diffuse():
+    found = fit_near_lamp(scene(ambient=0.8), CENTRE)
+    assert found.is_diffuse
+    assert not found.distance_known
+
+
+@pytest.mark.slow
+def test_strength_is_relative_to_the_exposure():
+    spot = SpotLamp(np.array([0.3, -0.2, 0.4]), CENTRE, 60, 75)
+    one, half = (fit_near_lamp(scene(spot, gain=g, noise=0.004 * g), CENTRE) for g in (1.0, 0.5))
+    np.testing.assert_allclose(half.strength, one.strength / 2, rtol=0.05)
+    np.testing.assert_allclose(one.strength, 0.7, rtol=0.15)
+    assert angle_deg(one.direction, half.direction) < 0.5
+
+
+def test_each_view_has_its_own_exposure():
+    spot = SpotLamp(np.array([0.3, -0.2, 0.4]), CENTRE, 60, 75)
+    pixels = scene(spot, views=2)
+    pixels.radiance[pixels.view == 1] *= 0.4
+    found = fit_near_lamp(pixels, CENTRE)
+    assert angle_deg(found.direction, spot.direction) < 2
+    np.testing.assert_allclose(found.strength[1], 0.4 * found.strength[0], rtol=0.1)
+
+
+def test_objects_alone_tell_the_direction():
+    spot = SpotLamp(np.array([0.4, 0.3, 0.5]), CENTRE, 60, 75)
+    whole = scene(spot)
+    kept = whole.owner != TABLE
+    columns = (whole.radiance, whole.albedo, whole.points, whole.normals, whole.owner, whole.view)
+    pixels = LitPixels(*(column[kept] for column in columns), whole.shadows)
+    assert angle_deg(fit_near_lamp(pixels, CENTRE).direction, spot.direction) < 4
+
+
+def test_few_pixels_are_refused_near_lamp():
+    with pytest.raises(InvalidInput, match="number of shaded pixels is 4"):
+        LitPixels(*(np.ones((4, 3)) for _ in range(4)), np.zeros(4, int), np.zeros(4, int), shadows())
+
+
+@pytest.mark.parametrize("direction", [(0.6, 0.0, 0.8), (0.0, -0.8, 0.6)])
+def test_shadows_on_the_table_lie_where_geometry_says(direction):
+    points, _, owner = surfaces(np.random.default_rng(0))
+    points, direction = points[owner == TABLE], np.array(direction)
+    expected = reached(points, np.tile(direction, (len(points), 1)), np.inf)
+    found = shadows().from_direction(direction, points)
+    assert np.sum(np.abs(found - expected) > 0.5) < 0.15 * np.sum(1 - expected)
+    place = np.array([0.15, 0.1, 0.3])
+    way = place - points
+    length = np.linalg.norm(way, axis=1)
+    expected = reached(points, way / length[:, None], length)
+    found = shadows().from_place(place, points)
+    assert np.sum(np.abs(found - expected) > 0.5) < 0.15 * np.sum(1 - expected)
+
+
+def test_a_ball_does_not_shade_its_own_lit_side():
+    cast = shadows()
+    centre, radius = BALLS[0]
+    normals = fibonacci_sphere(400)
+    normals = normals[normals[:, 2] > 0.3]
+    lifted = cast.lifted(centre + radius * normals, normals)
+    assert cast.from_direction(np.array([0.0, 0.0, 1.0]), lifted).min() > 0.999

@@ -1,22 +1,43 @@
-"""Closed forms, for both paths: what physics says of simple scenes, neither of them may change."""
+"""Reference: reference, volume rendering, solids."""
 
+import doctest
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput, UnknownName
+from osfcore.fields.kiloosf import FLOOR_G
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import quaternion_multiply, rotate
-from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_CENTRE_Z_M, PUSHER_CLEARANCE_M, PUSHER_HEIGHT_M
-from osfcore.render.reference import render_on_device, render_reference
+from osfcore.geometry.workspace import (
+    PUSHER_ALBEDO,
+    PUSHER_CENTRE_Z_M,
+    PUSHER_CLEARANCE_M,
+    PUSHER_HEIGHT_M,
+    PUSHER_RADIUS_M,
+)
+from osfcore.render import reference
+from osfcore.render.reference import (
+    accumulate_along_rays,
+    final_transmittance,
+    pusher_field,
+    render_on_device,
+    render_reference,
+    render_weights,
+    solid_field,
+    transmittance,
+)
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, OUTPUTS, Quality, SceneBatch
 from tests.core.render.scenes import (
     UPRIGHT,
     ball,
     block,
+    corners_of,
     fog,
     fog_depth,
     plain_table,
@@ -25,6 +46,9 @@ from tests.core.render.scenes import (
     view,
     wooden_table,
 )
+
+# Closed forms, for both paths: what physics says of simple scenes, neither of them may change.
+
 
 ABOVE = (0.0, 0.0, 1.0)
 
@@ -293,3 +317,62 @@ def test_an_object_may_be_called_pusher():
     slow, fast = both(fields, plain_table(), scene, view(size=24))
     np.testing.assert_allclose(slow.rgb, fast.rgb, atol=1e-3)
     assert slow.masks.any()
+
+
+# Volume rendering
+
+
+TAUS = st.lists(st.floats(0, 20), min_size=1, max_size=30).map(lambda taus: torch.tensor([taus], dtype=torch.float64))
+
+
+def test_the_worked_example_is_right():
+    failed, tried = doctest.testmod(reference, extraglobs={"torch": torch})
+    assert (failed, tried) == (0, 8)
+
+
+@given(TAUS)
+def test_what_is_not_scattered_passes(taus):
+    torch.testing.assert_close(render_weights(taus).sum(dim=1) + final_transmittance(taus), torch.ones(1).double())
+    assert (transmittance(taus).diff(dim=1) <= 1e-12).all()
+
+
+@given(st.floats(0.01, 30), st.floats(0.1, 2), st.integers(1, 64))
+def test_a_homogeneous_medium_follows_beer_and_lambert_however_finely_it_is_sampled(sigma, length, num_samples):
+    taus = torch.full((1, num_samples), sigma * length / num_samples, dtype=torch.float64)
+    glow = accumulate_along_rays(render_weights(taus), torch.ones(1, num_samples, 1).double())
+    np.testing.assert_allclose(glow.item(), 1 - np.exp(-sigma * length), rtol=1e-9)
+
+
+# Solids
+
+
+@pytest.mark.parametrize("hidden", [1, 8, 16])
+def test_the_pusher_fills_its_cylinder_and_nothing_else(hidden):
+    field = pusher_field(hidden)
+    places, g = corners_of(field), field.rows[1:, 0]
+    depth = np.minimum(PUSHER_RADIUS_M - np.hypot(*places[:, :2].T), PUSHER_HEIGHT_M / 2 - np.abs(places[:, 2]))
+    assert np.all(g[depth > 1e-6] > 0)
+    assert np.all(g[depth < -field.voxel] <= FLOOR_G)
+    np.testing.assert_allclose(field.rows[1:, 1:4], np.broadcast_to(PUSHER_ALBEDO, (len(g), 3)), atol=1e-6)
+    assert field.hidden == hidden
+    assert not field.networks.any()
+
+
+def test_the_pusher_looks_as_wide_and_high_as_it_is():
+    camera = view((2, 0, PUSHER_CENTRE_Z_M), (0, 0, PUSHER_CENTRE_Z_M), 128, 5.0)
+    scene = state({"p": (0, 0, PUSHER_CENTRE_Z_M)})
+    rendered = SceneRenderer({"p": pusher_field(8)}, None).render(SceneBatch.of(scene), [camera], outputs=OUTPUTS)
+    per_metre = 64 / np.tan(np.deg2rad(2.5)) / 2
+    mask = rendered.masks[0, 0, 0]
+    assert abs(mask.any(axis=1).sum() - PUSHER_HEIGHT_M * per_metre) < 3
+    assert abs(mask.any(axis=0).sum() - 2 * PUSHER_RADIUS_M * per_metre) < 3
+
+
+def test_the_shell_of_a_solid_is_closed():
+    """No corner of the grid's faces is in the shell, whatever the size."""
+    for half in ([0.01, 0.02, 0.03], [0.05, 0.05, 0.0501]):
+        field = solid_field(lambda x, h=half: (h - np.abs(x)).min(axis=-1), lambda x: x, np.array(half), (1, 1, 1),
+                            voxel=0.005, hidden=4)  # fmt: skip
+        for axis in range(3):
+            assert not np.moveaxis(field.index, axis, 0)[[0, -1]].any()
+        assert np.all(field.extent[0] <= -np.array(half) + field.voxel)

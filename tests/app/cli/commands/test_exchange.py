@@ -18,7 +18,7 @@ from osfcore.io.scene_file import Scene, scene_to_json
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.core.export.test_splats import HALF, ellipsoid_field
-from tests.core.photo.other_programs.bop_scenes import write_bop_scene
+from tests.core.photo.bop_scenes import write_bop_scene
 
 NAMES = ("003_cracker_box", "006_mustard_bottle")
 

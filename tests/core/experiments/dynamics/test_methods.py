@@ -11,7 +11,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.paper.dynamics import WEIGHTS_FILE, PaperPushModel, write_network
 from tests.core.dynamics.scenes import network as our_network
 from tests.core.experiments.pushes import NAMES, episode, shapes
-from tests.core.paper.dynamics.scenes import KAPPAS, network
+from tests.core.paper.scenes import KAPPAS, network
 
 FIELDS = FieldLibrary(None)
 

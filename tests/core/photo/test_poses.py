@@ -1,0 +1,271 @@
+"""Poses: estimate photo, occlusion, pose search, table from objects."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.estimation.objective import resting_orientations
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
+from osfcore.photo.lamp import photo_light
+from osfcore.photo.pose_loss import PoseLoss, TablePrior, draw, object_windows, surfels_of
+from osfcore.photo.poses import (
+    FINE_ACROSS,
+    PhotoConfig,
+    PhotoModels,
+    PhotoObject,
+    PhotoPose,
+    distinct,
+    estimate_photo,
+    moved,
+    poses_around,
+    poses_from_mask,
+    super_fibonacci,
+    table_from_objects,
+    without_others,
+)
+from osfcore.render.renderer import SceneRenderer
+from osfcore.render.types import SceneBatch
+from tests.core.photo.conftest import NAME, take
+
+# Poses and light of an object in a photograph of unknown exposure, white balance and lamp.
+
+
+@pytest.fixture(scope="module")
+def models(fields):
+    return PhotoModels(fields)
+
+
+def found_in(models, photo, name, config=None):
+    *_, last = estimate_photo(models, [photo], [name], np.random.default_rng(0), config)
+    return last.found[0]
+
+
+def errors(found, pose):
+    turned = rotation_angle(found.best.pose.quaternion, pose.quaternion)
+    return np.linalg.norm(found.best.pose.position - pose.position), np.rad2deg(turned)
+
+
+@pytest.fixture(scope="module")
+def found(models, taken):
+    return found_in(models, taken.photo, NAME)
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.slow
+def test_without_a_start(found, taken):
+    distance, turned = errors(found, taken.pose)
+    assert distance < 8e-3
+    assert turned < 3
+    assert found.doubt == ""
+    assert found.ratio > 1.15
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.slow
+def test_from_a_start_two_centimetres_and_fifteen_degrees_off(models, taken):
+    turn = quaternion_exp(np.deg2rad(15) * np.array([0.6, 0, 0.8]))
+    start = Pose(taken.pose.position + [0.012, 0.0, 0.016], quaternion_multiply(turn, taken.pose.quaternion))
+    distance, turned = errors(found_in(models, taken.photo, NAME, PhotoConfig({NAME: start})), taken.pose)
+    assert distance < 8e-3
+    assert turned < 3
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.slow
+def test_a_wrong_name_is_doubted(models, taken):
+    photo = replace(taken.photo, masks={"006_mustard_bottle": taken.photo.masks[NAME]})
+    assert found_in(models, photo, "006_mustard_bottle").doubt
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_the_lamp_by_the_shading_of_a_bottle(models, fields):
+    bottle = "006_mustard_bottle"
+    taken = take(fields, bottle, light=(0.7, -0.5, -0.4))
+    there = PhotoObject(bottle, PhotoPose(taken.pose, 0.3, 0.95, 0.2, 0.8), (), "", 0.0, 0.0)
+    light = photo_light(taken.photo, [there], [models.surfels(bottle, FINE_ACROSS)])
+    assert not light.is_diffuse
+    assert np.rad2deg(np.arccos(light.direction @ taken.light)) < 12
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_an_object_without_a_field_is_told(models, taken):
+    photo = replace(taken.photo, masks={"teapot": taken.photo.masks[NAME]})
+    with pytest.raises(UnknownName, match="no field named 'teapot'"):
+        found_in(models, photo, "teapot")
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_photos_without_a_common_table_are_told(models, taken):
+    with pytest.raises(InvalidInput, match="number of photos is 2, 0 of them with a known table"):
+        next(estimate_photo(models, [taken.photo, taken.photo], [NAME], np.random.default_rng(0)))
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_no_photo_is_told(models):
+    with pytest.raises(InvalidInput, match="number of photos is 0"):
+        next(estimate_photo(models, [], [NAME], np.random.default_rng(0)))
+
+
+# Masks that lack a part of what stands in front, or hold a part of it.
+
+
+BEHIND = "006_mustard_bottle"
+
+
+@pytest.fixture(scope="module")
+def surfels(models):
+    return {name: models.surfels(name, FINE_ACROSS) for name in (NAME, BEHIND)}
+
+
+def at(pose, name=NAME, iou=0.95):
+    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9), (), "", 0.0, 0.0)
+
+
+@pytest.fixture
+def spoiled(taken):
+    """The front's mask lacks its left part; that behind it claims the middle of it and something beside it."""
+    whole = taken.photo.masks[NAME]
+    columns = np.nonzero(whole)[1]
+    third = np.quantile(columns, 1 / 3), np.quantile(columns, 2 / 3)
+    x = np.arange(whole.shape[1])
+    front, behind = whole & (x > third[0]), whole & (x > third[0]) & (x < third[1])
+    behind[:20, :20] = True
+    return replace(taken.photo, masks={NAME: front, BEHIND: behind})
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_what_is_drawn_is_added_to_the_others_and_taken_from_the_own_mask(taken, spoiled, surfels):
+    found = [at(taken.pose), at(Pose.identity(), BEHIND, iou=0.5)]
+    (seen,) = without_others([spoiled], BEHIND, found, surfels)
+    whole = taken.photo.masks[NAME]
+    assert (seen.masks[NAME] & whole).sum() / (seen.masks[NAME] | whole).sum() > 0.95
+    assert seen.masks[BEHIND][:20, :20].all()
+    assert seen.masks[BEHIND].sum() < 400 + 0.05 * spoiled.masks[BEHIND].sum()
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_an_outline_that_fits_badly_takes_nothing_from_the_own_mask(taken, spoiled, surfels):
+    found = [at(taken.pose, iou=0.5), at(Pose.identity(), BEHIND, iou=0.5)]
+    (seen,) = without_others([spoiled], BEHIND, found, surfels)
+    np.testing.assert_array_equal(seen.masks[BEHIND], spoiled.masks[BEHIND])
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_photographs_without_the_object_are_left_as_they_are(taken, surfels):
+    (seen,) = without_others([taken.photo], BEHIND, [at(taken.pose)], surfels)
+    assert seen is taken.photo
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.slow
+def test_an_object_behind_another_of_which_half_is_marked(models, fields, taken):
+    """The box hides the bottle's lower half, but only the box's own lower half is marked: both are looked for twice."""
+    front = Pose(np.array([0.01, 0.05, 0.5]), quaternion_exp(np.array([1.2, 0.9, -0.3])))
+    behind = Pose(np.array([0.0, 0.02, 0.64]), quaternion_exp(np.array([-1.5, 0.3, 0.1])))
+    both = Pose.stacked([front, behind])
+    batch = SceneBatch((NAME, BEHIND), both.position[None], both.quaternion[None], taken.light[None], None)
+    camera = Camera("photo", Pose.identity(), taken.photo.intrinsics, 300, 260)
+    drawn = SceneRenderer(fields, None).render(batch, [camera], outputs={"rgb", "masks"})
+    box, bottle = drawn.masks[0, 0]
+    half = box & (np.arange(260)[:, None] > np.median(np.nonzero(box)[0]))
+    image = np.where((box | bottle)[..., None], drawn.rgb[0, 0], 0.2).astype(np.float32)
+    exposed = np.ones(box.shape, bool)
+    photo = replace(taken.photo, image=image, well_exposed=exposed, masks={NAME: half, BEHIND: bottle})
+    *_, last = estimate_photo(models, [photo], (NAME, BEHIND), np.random.default_rng(0))
+    assert last.progress.total == 2 + 2 + 1
+    for found, pose in zip(last.found, (front, behind), strict=True):
+        assert np.rad2deg(rotation_angle(found.best.pose.quaternion, pose.quaternion)) < 5
+        assert found.doubt == ""
+
+
+# Pose search
+
+
+def test_super_fibonacci_rotations_are_everywhere():
+    spiral = super_fibonacci(3000)
+    np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), 1, atol=1e-12)
+    asked = Rotation.random(200, random_state=1).as_quat(scalar_first=True)
+    nearest = np.array([rotation_angle(spiral, q).min() for q in asked])
+    assert np.rad2deg(nearest.max()) < 20
+
+
+def test_outlines_are_put_where_the_mask_is(fields, taken):
+    loss = PoseLoss(object_windows([taken.photo], NAME, 44), surfels_of(fields[NAME], 0.004))
+    poses = poses_from_mask(loss, super_fibonacci(50))
+    window = loss.windows[0]
+    shown = draw(loss.surfels, window, poses)[0] >= 0
+    areas = shown.sum(axis=(1, 2)) / window.mask.sum()
+    assert np.all(np.abs(areas - 1) < 0.25)
+    rows, columns = np.mgrid[: window.size[0], : window.size[1]] + 0.5
+    centres = np.stack([(shown * a).sum(axis=(1, 2)) / shown.sum(axis=(1, 2)) for a in (columns, rows)], axis=1)
+    assert np.abs(centres - window.centroid).max() < 2
+
+
+def test_steps_are_taken_along_the_cameras_axes(taken):
+    window = object_windows([taken.photo], NAME, 44)[0]
+    steps = np.array([[0.01, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
+    poses = moved(taken.pose, window, steps)
+    np.testing.assert_allclose(poses.position[0] - taken.pose.position, [0.01, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(poses.position[1], taken.pose.position, atol=1e-12)
+    np.testing.assert_allclose(rotation_angle(poses.quaternion[1], taken.pose.quaternion), 0.2, atol=1e-12)
+
+
+def test_the_given_pose_is_among_those_around_it(taken):
+    window = object_windows([taken.photo], NAME, 44)[0]
+    poses = poses_around(taken.pose, window, 20, np.random.default_rng(0))
+    np.testing.assert_allclose(poses.position[0], taken.pose.position, atol=1e-12)
+
+
+def test_distinct_poses_are_the_best_and_differ():
+    angles = np.array([0.0, 0.05, 0.5, 1.0, 1.02])
+    turns = quaternion_exp(np.stack([angles, 0 * angles, 0 * angles], axis=1))
+    losses = np.array([0.3, 0.1, 0.5, 0.2, 0.4])
+    assert distinct(Pose(np.zeros((5, 3)), turns), losses, 3, 10.0) == [1, 3, 2]
+
+
+# The table from how objects lie on it.
+
+
+T_CAMERA_WORLD = Pose(np.array([0.05, -0.02, 0.8]), quaternion_exp(np.array([2.3, 0.2, 0.1])))
+
+
+@pytest.fixture(scope="module")
+def resting(fields):
+    return [resting_orientations(field) for field in fields.values()]
+
+
+def standing(resting, number, x, y):
+    turned = Pose(np.zeros(3), resting.quaternions[number])
+    return T_CAMERA_WORLD @ Pose(np.array([x, y, -resting.lowest(turned)]), turned.quaternion)
+
+
+def test_objects_that_stand_on_a_table_tell_where_it_is(resting):
+    poses = [standing(r, k, 0.1 * k, -0.05 * k) for k, r in enumerate(resting)]
+    found = table_from_objects([TablePrior(r) for r in resting], poses)
+    assert found.supported == (0, 1)
+    table = T_CAMERA_WORLD.apply(np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) * [1, 1, 0])
+    np.testing.assert_allclose(found.T_world_camera.apply(table)[:, 2], 0, atol=3e-3)
+    assert found.T_world_camera.position[2] > 0.3
+    assert found.spread_deg < 2
+
+
+def test_errors_of_the_poses_average_out(resting):
+    rng = np.random.default_rng(1)
+    both = [r for r in resting for _ in range(3)]
+    poses = []
+    for k, r in enumerate(both):
+        turn = quaternion_exp(np.deg2rad(4) * rng.normal(size=3) / np.sqrt(3))
+        pose = standing(r, k % 24, *rng.uniform(-0.2, 0.2, 2))
+        poses.append(Pose(pose.position, quaternion_multiply(turn, pose.quaternion)))
+    found = table_from_objects([TablePrior(r) for r in both], poses)
+    up = found.T_world_camera.inverse().matrix()[:3, 2]
+    true = T_CAMERA_WORLD.matrix()[:3, 2]
+    assert np.rad2deg(np.arccos(up @ true)) < 4
+
+
+def test_one_object_does_not_tell(resting):
+    assert table_from_objects([TablePrior(resting[0])], [standing(resting[0], 0, 0, 0)]) is None

@@ -1,0 +1,173 @@
+"""Costs: image cost, pose cost."""
+
+import numpy as np
+import pytest
+
+from osfcore.errors import InvalidInput
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+from osfcore.planning.costs import SIDE, ImageCost, PoseCost, PoseGoal
+from osfcore.render.renderer import SceneRenderer
+from osfcore.render.types import SceneBatch
+from tests.core.dynamics.scenes import CAN, GELATIN, boxes, scene
+
+# Image cost
+
+
+CAMERA = goal_camera(96)
+LIGHT = Light.from_angles(0.5, 1.0)
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def renderer() -> SceneRenderer:
+    fields = FieldLibrary(None)
+    return SceneRenderer({name: fields.load(name) for name in (CAN, GELATIN)}, fields.load_table())
+
+
+@pytest.fixture(scope="module")
+def goal() -> SceneState:
+    """The fields' frames lie at the middle of things."""
+    shapes = {CAN: boxes(((0, 0, 0), (0.03, 0.03, 0.05))), GELATIN: boxes(((0, 0, 0), (0.04, 0.03, 0.015)))}
+    state = scene(shapes, {CAN: (0.05, 0.0), GELATIN: (-0.1, 0.08)})
+    return SceneState(state.names, state.poses, LIGHT, None)
+
+
+@pytest.fixture(scope="module")
+def cost(renderer, goal) -> ImageCost:
+    return ImageCost(renderer, CAMERA, renderer.render(SceneBatch.of(goal), (CAMERA,)).rgb[0, 0], LIGHT)
+
+
+def futures(goal, shifts) -> Rollouts:
+    """One future for each place beside its goal at which the can stays."""
+    positions = np.broadcast_to(goal.poses.position, (len(shifts), STEPS + 1, 2, 3)).copy()
+    positions[:, :, 0, :2] += np.array(shifts)[:, None]
+    quaternions = np.broadcast_to(goal.poses.quaternion, (len(shifts), STEPS + 1, 2, 4))
+    return Rollouts(goal.names, positions, quaternions, np.zeros((len(shifts), STEPS + 1, 3)))
+
+
+@pytest.mark.parametrize("direction", [0.0, 2.0, 4.0])
+def test_the_nearer_the_goal_the_cheaper(cost, goal, direction):
+    unit = np.array([np.cos(direction), np.sin(direction)])
+    costs = cost(futures(goal, [d * unit for d in (0.0, 0.005, 0.01, 0.02, 0.03)]))
+    assert (np.diff(costs) > 0).all()
+    assert costs[-1] > 2 * costs[0]
+
+
+def test_equal_futures_cost_the_same_whatever_is_beside_them(cost, goal):
+    told = futures(goal, [(0.02, 0.0), (0.0, 0.01), (0.02, 0.0)])
+    costs = cost(told)
+    assert costs[0] == costs[2] != costs[1]
+    np.testing.assert_allclose([cost(told[k])[0] for k in range(3)], costs)
+
+
+def test_the_last_state_counts_and_the_one_before_all_actions_does_not(cost, goal):
+    at_goal, away = futures(goal, [(0.0, 0.0)]), futures(goal, [(0.03, 0.0)])
+    positions = np.repeat(at_goal.positions, 3, axis=0)
+    positions[1, 0] = away.positions[0, 0]
+    positions[2, -1] = away.positions[0, -1]
+    quaternions, pusher = (np.repeat(part, 3, axis=0) for part in (at_goal.quaternions, at_goal.pusher))
+    costs = cost(Rollouts(goal.names, positions, quaternions, pusher))
+    assert costs[1] == costs[0]
+    assert costs[0] < costs[2] < cost(away)[0]
+
+
+def test_costs_are_summed_over_the_horizon(cost, goal):
+    told = futures(goal, [(0.02, 0.01)])
+    half = Rollouts(told.names, told.positions[:, :3], told.quaternions[:, :3], told.pusher[:, :3])
+    np.testing.assert_allclose(cost(told), 2 * cost(half))
+
+
+def test_the_pusher_plays_no_part(cost, goal):
+    told = futures(goal, [(0.01, 0.0)])
+    other = Rollouts(told.names, told.positions, told.quaternions, told.pusher + 0.1)
+    np.testing.assert_array_equal(cost(other), cost(told))
+
+
+def test_small_images_are_compared_as_they_are(renderer, goal):
+    camera = goal_camera(SIDE // 2)
+    image = renderer.render(SceneBatch.of(goal), (camera,)).rgb[0, 0]
+    near, far = ImageCost(renderer, camera, image, LIGHT)(futures(goal, [(0.0, 0.0), (0.03, 0.0)]))
+    assert near < far / 5
+
+
+@pytest.mark.parametrize("shape", [(96, 64, 3), (96, 96), (96, 96, 4), (48, 48, 3)])
+def test_an_image_of_another_size_is_refused(renderer, shape):
+    with pytest.raises(InvalidInput, match=r"shape of the goal image is .*\(96, 96, 3\)"):
+        ImageCost(renderer, CAMERA, np.zeros(shape), LIGHT)
+
+
+# Pose cost
+
+
+UPRIGHT = np.array([1.0, 0, 0, 0])
+STATE = SceneState(
+    ("a", "b"),
+    Pose(np.array([[0.1, 0.0, 0.02], [-0.1, 0.05, 0.03]]), np.stack([UPRIGHT, UPRIGHT])),
+    Light(np.array([0.0, 0, 1])),
+    np.array([0.0, 0.0, 0.06]),
+)
+THERE = Pose(np.array([0.1, 0.2, 0.02]), UPRIGHT)
+
+
+def futures_by_pose(*last, turn: float = 0.0, steps: int = 3) -> Rollouts:
+    """One future for each place that object a comes to at once and stays at."""
+    positions = np.broadcast_to(STATE.poses.position, (len(last), steps + 1, 2, 3)).copy()
+    positions[:, 1:, 0, :2] = np.array(last)[:, None]
+    quaternions = np.broadcast_to(STATE.poses.quaternion, (len(last), steps + 1, 2, 4)).copy()
+    quaternions[:, 1:, 0] = quaternion_exp(np.array([0, 0, turn]))
+    return Rollouts(STATE.names, positions, quaternions, np.zeros((len(last), steps + 1, 3)))
+
+
+def test_what_is_not_moved_is_to_stay():
+    goal = PoseGoal.of(STATE, {"a": THERE})
+    np.testing.assert_allclose(goal.offsets_m(STATE), [[0, 0.2], [0, 0]], atol=1e-12)
+    other = SceneState(("b", "a"), STATE.poses[[1, 0]], STATE.light, STATE.pusher)
+    np.testing.assert_allclose(goal.offsets_m(other), [[0, 0], [0, 0.2]], atol=1e-12)
+
+
+def test_an_object_that_is_not_there_is_told():
+    with pytest.raises(InvalidInput, match="teapot"):
+        PoseGoal.of(STATE, {"teapot": THERE})
+
+
+def test_each_object_has_its_goal():
+    goal = PoseGoal.of(STATE, {"a": THERE})
+    np.testing.assert_array_equal(goal.pose("a").matrix(), THERE.matrix())
+    np.testing.assert_array_equal(goal.pose("b").matrix(), STATE.pose("b").matrix())
+
+
+def test_a_replaced_goal_is_another_one_with_the_rest_as_it_was():
+    goal = PoseGoal.of(STATE, {"a": THERE})
+    turned = Pose(np.array([-0.2, 0.0, 0.03]), quaternion_exp(np.array([0, 0, 1.0])))
+    other = goal.replaced({"b": turned})
+    assert other.names == goal.names
+    np.testing.assert_array_equal(other.poses.matrix(), [THERE.matrix(), turned.matrix()])
+    np.testing.assert_array_equal(goal.pose("b").matrix(), STATE.pose("b").matrix())
+    np.testing.assert_array_equal(goal.replaced({}).poses.matrix(), goal.poses.matrix())
+
+
+def test_a_goal_that_is_met_costs_nothing():
+    assert PoseCost(PoseGoal.of(STATE, {"a": THERE}))(futures_by_pose((0.1, 0.2))) == pytest.approx(0)
+
+
+def test_cost_is_the_distance_on_the_way_and_twice_at_the_end():
+    cost = PoseCost(PoseGoal.of(STATE, {"a": THERE}))(futures_by_pose((0.1, 0.0), (0.1, 0.1), (0.4, 0.2)))
+    np.testing.assert_allclose(cost, [0.6, 0.3, 0.9], atol=1e-12)
+
+
+@pytest.mark.parametrize(("turn", "counted"), [(0.3, 0.3), (-1.1, 1.1), (np.pi, np.pi), (1.5 * np.pi, 0.5 * np.pi)])
+def test_rotations_count_by_an_arm(turn, counted):
+    goal = PoseGoal.of(STATE, {"a": THERE})
+    assert PoseCost(goal, 0.05)(futures_by_pose((0.1, 0.2), turn=turn)) == pytest.approx(3 * 0.05 * counted)
+    assert PoseCost(goal, 0.0)(futures_by_pose((0.1, 0.2), turn=turn)) == pytest.approx(0)
+
+
+def test_objects_in_another_order_cost_the_same():
+    cost, told = PoseCost(PoseGoal.of(STATE, {"a": THERE})), futures_by_pose((0.15, 0.1), turn=0.4)
+    swapped = Rollouts(("b", "a"), told.positions[:, :, ::-1], told.quaternions[:, :, ::-1], told.pusher)
+    np.testing.assert_allclose(cost(swapped), cost(told))
