@@ -13,7 +13,7 @@ from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.fields.kiloosf import read_field
 from osfcore.paper.dynamics import read_network as read_paper_network
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes
-from tests.core.experiments.rivals.fitvid.videos import write_videos
+from tests.core.experiments.videos import write_videos
 from tests.core.fields.sets import write_set
 from tests.core.paper.scenes import episode, write
 

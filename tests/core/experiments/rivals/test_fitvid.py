@@ -1,14 +1,34 @@
+"""Fitvid: model, recurrence, weights."""
+
+import math
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import load, save
 
-from osfcore.errors import InvalidInput
-from osfcore.experiments.rivals.fitvid import DecoderCell, EncoderCell, FitVidModel, FitVidSettings
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.experiments.rivals.fitvid import (
+    FORMAT,
+    DecoderCell,
+    EncoderCell,
+    FitVidModel,
+    FitVidSettings,
+    Gaussian,
+    LatentLSTM,
+    kl_divergence,
+    read_fitvid,
+    write_fitvid,
+)
 from osfcore.experiments.rivals.train_fitvid import as_frames
-from tests.core.experiments.rivals.fitvid.videos import square_video
+from tests.core.experiments.videos import square_video
+
+# Model
+
 
 TINY = FitVidSettings(side=16, width=2, features=12, hidden=16, latent=3)
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def model(settings=TINY, seed=0, **more) -> FitVidModel:
@@ -26,22 +46,26 @@ def scene(side=16, steps=4, seed=0):
     return video, torch.as_tensor(actions[None], dtype=torch.float32)
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(("side", "stages"), [(16, 2), (32, 3), (64, 4), (128, 5), (1024, 8)])
 def test_every_stage_halves_the_image_down_to_8_pixels(side, stages):
     assert FitVidSettings(side=side).stages == stages
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_the_default_has_about_eight_million_parameters():
     with torch.device("meta"):
         assert 7e6 < FitVidModel().parameter_count < 9e6
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_the_original_had_302_million():
     """With its 64 channels at 64 pixels, of which the variance that is never used is not counted."""
     with torch.device("meta"):
         assert FitVidModel(FitVidSettings(side=64, width=64)).parameter_count == pytest.approx(302e6, rel=0.03)
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     "bad", [{"side": 20}, {"side": 8}, {"side": 2048}, {"width": 0}, {"features": 0}, {"hidden": 0}, {"latent": 0}]
 )
@@ -50,6 +74,7 @@ def test_sizes_out_of_range_are_refused(bad):
         FitVidSettings(**bad)
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_decoder_cell_begins_as_its_shortcut():
     x = torch.randn(2, 4, 8, 8)
     torch.testing.assert_close(DecoderCell(4, 4)(x), torch.nn.functional.silu(x))
@@ -57,6 +82,7 @@ def test_a_decoder_cell_begins_as_its_shortcut():
     assert EncoderCell(4, 6, 2)(x).shape == (2, 6, 4, 4)
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("side", [16, 32])
 def test_predictions_have_the_stated_shape_and_are_images(side):
     network = model(FitVidSettings(side=side, width=1, features=8, hidden=8, latent=2)).eval()
@@ -68,17 +94,20 @@ def test_predictions_have_the_stated_shape_and_are_images(side):
         assert 0 <= frames.min() <= frames.max() <= 1
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_new_network_copies_the_last_frame():
     context = np.random.default_rng(0).random((2, 16, 16, 3))
     frames = FitVidModel(TINY).eval().predict(context, np.full((2, 3, 3), 0.1))
     np.testing.assert_allclose(frames, np.broadcast_to(context[1], frames.shape), atol=1 / 255)
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_frames_of_another_size_are_refused():
     with pytest.raises(InvalidInput, match="context frames"):
         model().eval().predict(np.zeros((2, 32, 32, 3)), np.zeros((1, 1, 3)))
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_means_are_the_same_each_time_and_draws_are_not():
     network = model().eval()
     context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.zeros((2, 3, 3))
@@ -91,6 +120,7 @@ def test_means_are_the_same_each_time_and_draws_are_not():
     assert np.abs(one[0] - one[1]).max() > 0  # each sequence draws its own
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_each_sequence_is_predicted_as_if_alone_and_nothing_sees_the_future():
     network = model().eval()
     rng = np.random.default_rng(0)
@@ -104,6 +134,7 @@ def test_each_sequence_is_predicted_as_if_alone_and_nothing_sees_the_future():
     assert np.abs(later[:, 2] - together[:2, 2]).max() > 0
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_the_action_between_the_context_frames_counts():
     network = model().eval()
     context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.zeros((1, 1, 3))
@@ -112,6 +143,7 @@ def test_the_action_between_the_context_frames_counts():
     assert np.abs(still - network.predict(context, actions, between=np.array([0.3, 0, 0]))).max() > 0
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_gradients_reach_every_parameter():
     network = model()
     with torch.no_grad():  # what begins at zero would hide what is behind it
@@ -124,6 +156,7 @@ def test_gradients_reach_every_parameter():
     assert dead == []
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_the_error_is_that_of_the_frames_and_latents_come_from_the_generator():
     network = model()
     video, actions = scene()
@@ -134,6 +167,7 @@ def test_the_error_is_that_of_the_frames_and_latents_come_from_the_generator():
     assert 0 < float(first.squared_error.detach()) < 4  # four frames, each of a mean over pixels below 1
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.slow
 def test_a_short_sequence_can_be_learned_better_than_by_copying():
     network = model(FitVidSettings(side=16, width=4, features=16, hidden=32, latent=2))
@@ -150,7 +184,129 @@ def test_a_short_sequence_can_be_learned_better_than_by_copying():
     assert float(losses.squared_error.detach()) / 4 < 0.6 * copied
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_half_the_precision_changes_little():
     context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.zeros((1, 2, 3))
     whole, half = (model(precision=p).eval().predict(context, actions) for p in (torch.float32, torch.bfloat16))
     assert 0 < np.abs(whole - half).max() < 0.05
+
+
+# Recurrence
+
+
+numbers = st.floats(-3, 3)
+gaussians = st.tuples(numbers, numbers).map(lambda pair: Gaussian(torch.tensor([pair[0]]), torch.tensor([pair[1]])))
+
+
+@given(one=gaussians)
+def test_a_gaussian_does_not_diverge_from_itself(one):
+    assert float(kl_divergence(one, one)) == pytest.approx(0, abs=1e-6)
+
+
+@given(p=gaussians, q=gaussians)
+def test_it_is_what_torch_computes_and_never_negative(p, q):
+    normal = [torch.distributions.Normal(g.mean, (g.logvar / 2).exp()) for g in (p, q)]
+    expected = torch.distributions.kl_divergence(*normal).sum()
+    torch.testing.assert_close(kl_divergence(p, q), expected, rtol=1e-4, atol=1e-5)
+    assert float(kl_divergence(p, q)) >= -1e-5
+
+
+def test_closed_forms_add_up_over_components():
+    zero = torch.zeros(3)
+    p = Gaussian(torch.tensor([1.0, 0.0, 2.0]), torch.tensor([0.0, math.log(4), 0.0]))
+    q = Gaussian(zero, zero)
+    assert float(kl_divergence(p, q)) == pytest.approx(0.5 + (4 - 1 - math.log(4)) / 2 + 2)
+
+
+def test_draws_have_the_mean_and_the_variance():
+    one = Gaussian(torch.full((40_000,), 2.0), torch.full((40_000,), math.log(9.0)))
+    drawn = one.sample(torch.Generator().manual_seed(0))
+    assert float(drawn.mean()) == pytest.approx(2, abs=0.05)
+    assert float(drawn.std()) == pytest.approx(3, abs=0.05)
+
+
+def test_step_by_step_is_the_same_as_all_at_once():
+    lstm = LatentLSTM(5, 8, 3)
+    x = torch.rand(2, 4, 5)
+    whole, _ = lstm(x)
+    state, parts = None, []
+    for step in range(4):
+        part, state = lstm(x[:, step : step + 1], state)
+        parts.append(part.mean)
+    torch.testing.assert_close(torch.cat(parts, dim=1), whole.mean)
+
+
+# Weights
+
+
+TINY_OF_WEIGHTS = FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)
+META = {"format": FORMAT, "side": "16", "width": "1", "features": "6", "hidden": "8", "latent": "2"}
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    network = FitVidModel(TINY_OF_WEIGHTS)
+    network.losses(torch.rand(2, 4, 3, 16, 16), torch.zeros(2, 3, 3), None)  # so that batch norm has seen something
+    return network.eval()
+
+
+@pytest.fixture
+def file(network, tmp_path):
+    write_fitvid(tmp_path / "net.safetensors", network)
+    return tmp_path / "net.safetensors"
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_what_was_written_predicts_the_same(network, file):
+    again = read_fitvid(file)
+    assert again.settings == TINY_OF_WEIGHTS
+    assert not again.training
+    for name, value in network.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, rtol=1e-3, atol=1e-6)
+    context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.full((2, 3, 3), 0.1)
+    np.testing.assert_allclose(again.predict(context, actions), network.predict(context, actions), atol=5e-3)
+    write_fitvid(file.with_name("twice.safetensors"), again)
+    assert load(file.read_bytes()).keys() == load(file.with_name("twice.safetensors").read_bytes()).keys()
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_parameters_take_two_bytes(network, file):
+    assert file.stat().st_size < 2.6 * network.parameter_count + 40_000
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_it_computes_in_what_is_asked_for(file):
+    assert read_fitvid(file, torch.bfloat16).precision == torch.bfloat16
+
+
+def damaged(file, **changes):
+    tensors = {**load(file.read_bytes()), **changes}
+    return save({name: tensor for name, tensor in tensors.items() if tensor is not None}, META)
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f: f.read_bytes()[:1000], "no video prediction network"),
+        (lambda f: b"rubbish", "no video prediction network"),
+        (lambda f: save(load(f.read_bytes()), {**META, "format": "pushes-2"}), FORMAT),
+        (lambda f: save(load(f.read_bytes()), {n: v for n, v in META.items() if n != "hidden"}), "no video"),
+        (lambda f: save(load(f.read_bytes()), {**META, "side": "17"}), "side of the frames"),
+        (lambda f: save(load(f.read_bytes()), {**META, "width": "256", "hidden": "4096"}), "do not fit"),
+        (lambda f: damaged(f, **{"encoder.head.bias": None}), "do not fit"),
+        (lambda f: damaged(f, **{"encoder.head.bias": torch.zeros(7)}), "do not fit"),
+        (lambda f: damaged(f, **{"encoder.head.bias": torch.full((6,), torch.nan)}), "not all finite"),
+    ],
+)
+def test_damaged_files_are_refused(file, spoil, words):
+    file.write_bytes(spoil(file))
+    with pytest.raises(CorruptFile, match=words):
+        read_fitvid(file)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(CorruptFile):
+        read_fitvid(tmp_path / "none.safetensors")
