@@ -112,6 +112,9 @@ def reach(case, made):
                 case.body[key] = made[key]
 
 
+# A thread of the running service may draw from `random` while an example is made, which Hypothesis takes for the
+# example's own doing.
+@pytest.mark.filterwarnings("ignore:Do not use the `random` module inside strategies")
 @pytest.mark.slow
 @schema.parametrize()
 @settings(

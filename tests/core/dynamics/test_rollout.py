@@ -11,7 +11,7 @@ import osfcore.dynamics.rollout as module
 from osfcore.dynamics.graph import shipped, write_network
 from osfcore.dynamics.motion import SUBSTEPS, pusher_path
 from osfcore.dynamics.rollout import NETWORK_FILE, PushModel, load_push_model, load_shapes, network_path
-from osfcore.dynamics.shapes import object_shape
+from osfcore.dynamics.shapes import field_parts, object_shape
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
 from osfcore.fields.kiloosf import write_field
