@@ -51,7 +51,7 @@ def worker_pool(
 def _cluster(address: str, answers_within_s: float) -> Iterator[Executor]:
     try:
         from distributed import Client
-        from distributed.comm import connect
+        from distributed.comm.core import connect
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise OsfError("--cluster needs Dask; 'pip install osf-manipulation[cluster]' brings it.") from None
