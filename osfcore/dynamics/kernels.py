@@ -3,6 +3,8 @@
 The same numbers as `graph.py` in PyTorch, which training needs for its gradients; `rollout.py` alone calls it.
 """
 
+# ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
+
 from __future__ import annotations
 
 import math
@@ -60,9 +62,6 @@ NEVER = np.float32(1e9)  # more than any distance
 # numbers are gathered one by one instead of loaded sixteen at once. Products take four rows and four inputs at a
 # time, so that weights are loaded and outputs stored less often. That is as fast as OpenBLAS, whose threads would
 # get in each other's way here.
-
-
-# ruff: noqa: ANN001, ANN201, ANN202 - compiled helpers; types are given by their callers
 
 
 NODE_WIDTH, EDGE_WIDTH, MOTION_WIDTH = (np.int64(-(-n // 4) * 4) for n in (NODE_FEATURES, EDGE_FEATURES, MOTION))
@@ -300,9 +299,6 @@ def _silu(x, count) -> None:
 # is the distance, the normal out of the first outline (x, y) and the point of it that is nearest (x, y).
 
 
-# ruff: noqa: ANN001, ANN201, ANN202 - compiled helpers; types are given by their callers
-
-
 CIRCLE_X, CIRCLE_Y = (
     f(2 * np.pi / OUTLINE * np.arange(OUTLINE)).astype(np.float32) for f in (np.cos, np.sin)
 )  # as `polygons.circle`
@@ -458,10 +454,8 @@ def push_motion(x, y, inward_x, inward_y, depth, shift_x, shift_y, arm):
     return gain * edge_x, gain * edge_y, gain * turn
 
 
-# What may move in a substep of one scene, and where it touches: `contact_graph` and `contact_geometry`, compiled.
-
-
-# ruff: noqa: ANN001, ANN201, ANN202 - compiled helpers; types are given by their callers
+# What may move in a substep of one scene, and where it touches: the contacts of `osfcore.dynamics.graph` and
+# `osfcore.dynamics.shapes`, compiled.
 
 
 _TRAVEL, _TOUCH, _RIM = (np.float32(x) for x in (TRAVEL_M, TOUCH_M, PUSHER_RADIUS_M))
@@ -791,9 +785,6 @@ def _separation_bound(p, q, c):
 # What the network sees of one scene's contacts: `osfcore.dynamics.graph`, compiled.
 
 
-# ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
-
-
 def _fan(count: int, radius: float, height: float) -> np.ndarray:
     angles = 2 * np.pi / count * np.arange(count)
     return np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)], axis=1)
@@ -1004,10 +995,7 @@ def _add_neighbour(k, is_first, c, scratch, rows, at) -> None:
     _put_direction(rows, at, scratch, i, scratch[j, 0], scratch[j, 1])
 
 
-# Rollouts of many scenes, compiled: `osfcore.dynamics.graph` with all that it calls. Only `rollout.py` calls it.
-
-
-# ruff: noqa: ANN001, ANN202, D417 - compiled helpers; types are given by their callers
+# Rollouts of many scenes, compiled: `osfcore.dynamics.graph` with all that it calls.
 
 
 _ANGLES = 2 * np.pi / 8 * np.arange(8)

@@ -255,7 +255,7 @@ def _descend(parts, values, index, origins, directions, lights, rgb, alpha, offs
             _spread(rows, weights, features, gains, count, depth, light, slope, miss, parts[part])
 
 
-# From an OSF to a KiloOSF: the second of the paper's three steps; fine-tuning on images (optimise.py) follows.
+# From an OSF to a KiloOSF: the second of the paper's three steps; fine-tuning on images follows.
 #
 # The teacher's density is baked into the corners of a fine grid, which gives the shell; then albedo, dipoles,
 # ambient light and the tiny networks learn to answer as the teacher does at random points near the surface. Lights

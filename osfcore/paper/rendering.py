@@ -1,5 +1,7 @@
 """The paper's renderer: scenes of KiloOSFs as published, composed by eq. 3, with shadow maps."""
 
+# ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -34,9 +36,6 @@ from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBa
 #
 # Conventions of types and inlining are those of `osfcore.render.kernels`. Positions are in voxel coordinates, in
 # which the corners of a field's grid are whole numbers.
-
-
-# ruff: noqa: ANN001, ANN201, D417 - compiled helpers; types are given by their callers
 
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -272,9 +271,6 @@ def _solid_voxels(occupied: Bool[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "
 # the map.
 
 
-# ruff: noqa: ANN001, ANN201, D417 - compiled helpers; types are given by their callers
-
-
 NOTHING = np.float32(-1e9)
 _DECIMALS = 2  # of a light's direction up to which objects share a map: 0.3 degrees
 _OPAQUE = np.float32(0.5)
@@ -438,15 +434,12 @@ def pusher_distance(scene, b, ox, oy, oz, dx, dy, dz):
     return best, cap
 
 
-# Compiled compositional volume rendering of tiny networks (paper eq. 3). Only `renderer.py` calls it.
+# Compiled compositional volume rendering of tiny networks (paper eq. 3).
 #
 # Sample k of every object lies at t = (k + 1/2) * step from the camera, so that densities and radiances of objects
 # that overlap are summed at the same points, as eq. 3 has it:
 #
 #     L = sum_k T_k (1 - exp(-sigma_k step)) L_k + T_end L_behind,  sigma_k = sum_n sigma_n,  L_k = sum_n rho_n L_light
-
-
-# ruff: noqa: ANN001, ANN202, D417 - compiled helpers; types are given by their callers
 
 
 MOST_OBJECTS = 24

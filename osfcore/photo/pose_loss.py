@@ -23,7 +23,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, orthogonal_basis, quaternion_conjugate, quaternion_to_matrix, rotate
 from osfcore.photo.photograph import Photograph
 
-# Compiled comparison of an object's surfels in many poses with one photograph. Only `pose_objective.py` calls it.
+# Compiled comparison of an object's surfels in many poses with one photograph.
 
 
 # ruff: noqa: ANN001, D417 - compiled code; types are given by its caller

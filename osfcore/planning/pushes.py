@@ -413,7 +413,7 @@ def _sample_directions(count: int, rng: np.random.Generator | None) -> tuple[np.
 # A sampled sequence pushes several objects, and few samples push all of them well. Each future is cut into stages:
 # the actions from the first that moves an object up to the first that moves another one instead. What a stage does
 # to an object that nothing moved before, it does as well if it comes first. Sequences of up to three stages of
-# different objects are ranked by what they take from the cost of `pose_cost`, if stages do not disturb each other,
+# different objects are ranked by what they take from the cost of `PoseCost`, if stages do not disturb each other,
 #
 #     sum_i g_i (2 + (T - t_i) / T),        t_i <= T,
 #

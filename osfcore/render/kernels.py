@@ -3,6 +3,8 @@
 From the layers of tiny networks up to whole images; `renderer.py` alone calls it.
 """
 
+# ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
+
 from __future__ import annotations
 
 from typing import Any, NamedTuple
@@ -28,9 +30,6 @@ KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "nu
 # Indices are unsigned: signed ones may count from the end in numba, which is decided at each access, so that
 # numbers are gathered one by one instead of loaded eight or sixteen at once. Four inputs are taken at a time, so
 # that outputs are stored and loaded less often.
-
-
-# ruff: noqa: ANN001, ANN201 - compiled helpers; types are given by their callers
 
 
 _LAYER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
@@ -95,12 +94,9 @@ def three_outputs(flat, at, inputs, count):
 
 # Compiled light of near lamps: where it comes from at a point, and how much of it arrives.
 #
-# Kernels and helpers take `lamps`: `lamps.Lamps`, or None under distant lights. Numba compiles one version for
+# Kernels and helpers take `lamps`: `renderer.Lamps`, or None under distant lights. Numba compiles one version for
 # each, and leaves out of it what the other one asks for: distant lights cost nothing because there are lamps, and
 # change no bit.
-
-
-# ruff: noqa: ANN001, ANN201, D417 - compiled helpers; types are given by their callers
 
 
 _THREE = np.float32(3)
@@ -152,12 +148,9 @@ def light_on_table(lamps, b, x, y):
     return max(red, _ZERO) * gain, max(green, _ZERO) * gain, max(blue, _ZERO) * gain
 
 
-# Compiled sampling of fields along rays: next samples, shadows, scattered radiance. Only `kernels.py` calls it.
+# Compiled sampling of fields along rays: next samples, shadows, scattered radiance.
 #
-# Conventions of coordinates, types and inlining are those of `kernels.py`.
-
-
-# ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
+# Conventions of coordinates, types and inlining are those of the ray marching below.
 
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -353,9 +346,6 @@ def radiance_at(pack, fields, scene, lamps, b, n, t, rules, work):
 # Compiled rays from pixels to the table, and the table where nothing stands on it.
 
 
-# ruff: noqa: ANN001, ANN201, D417 - compiled helpers; types are given by their callers
-
-
 @numba.njit(**HELPER)
 def pixel_ray(cameras, view, u, v):
     """Unit direction in the world through a place of the image, and 1 / the length it had.
@@ -457,16 +447,13 @@ def empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples):
     return red, green, blue, reach / np.float32(max(hits, 1))
 
 
-# Compiled ray marching through several fields at once, with shadows. Only `launch.py` calls it.
+# Compiled ray marching through several fields at once, with shadows.
 #
 # Everything happens in voxel coordinates: those of object n in which its grid's corners are whole numbers. Samples
 # of object n lie at t = (k + 1/2) * step_n from the camera, those of a shadow ray at the same spacing from the
 # point that asks for light; t is in metres throughout. Arrays are indexed in full, never sliced, integers are made
 # float32 before they meet one, and helpers are inlined and count no references (`_nrt=False`; they allocate
 # nothing): slices, double precision and counting would each cost more than the arithmetic here.
-
-
-# ruff: noqa: ANN001, ANN202, D417 - compiled helpers; types are given by their callers
 
 
 MOST_OBJECTS = 24

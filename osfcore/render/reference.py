@@ -2,7 +2,7 @@
 
 It defines what the fast path must compute, and it is what a GPU runs. For each ray, each object's field is sampled in
 its own frame (paper eq. 1); a sample's radiance is rho L_light with one light, distant or near (eq. 2); the samples of
-all objects are sorted by distance and composited by `volume_rendering` (eq. 3).
+all objects are sorted by distance and composited (eq. 3).
 
 Deviations from eq. 3: the radiance of a point is the mean of the objects' radiances weighted by their densities (as in
 compositional NeRFs), not their sum, so that overlapping objects do not shine twice as bright; and the light that
