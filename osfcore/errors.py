@@ -1,7 +1,7 @@
-"""What can go wrong because of an input: one sentence with the value and what is allowed.
+"""Errors of inputs: one sentence each, with the value and what is allowed.
 
 Every error is an `OsfError`, so a caller at the edge (command line, REST) can show its text as it is. Constructors take
-the facts and write the sentence. Nothing here knows of exit codes or HTTP.
+the facts, keep them as fields for whoever acts on them, and write the sentence. Nothing here knows of exit codes or HTTP.
 """
 
 import difflib
@@ -45,7 +45,7 @@ def _meant(name: str, known: list[str]) -> str:
 
 
 class OsfError(ValueError):
-    """A mistake in an input, told in one sentence that a user can act on."""
+    """A mistake in an input, in one sentence that a user can act on."""
 
     def __init__(self, sentence: str = "") -> None:
         super().__init__(shown(sentence, _MOST_CHARACTERS))
@@ -80,6 +80,7 @@ class UnknownName(OsfError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         known = list(known)
+        self.kind, self.name = kind, name
         meant = _meant(name, known)
         super().__init__(f"There is no {kind} named {shown(repr(name))};{meant} known: {_listed(known)}.")
 
@@ -93,14 +94,16 @@ class NotThere(UnknownName):
 
     def __init__(self, kind: str) -> None:
         OsfError.__init__(self, f"There is no such {kind}; it may have been deleted.")
+        self.kind = kind
 
 
 class MissingAssets(OsfError):
     """Objects that the catalogue knows but whose meshes have not been fetched."""
 
     def __init__(self, names: Iterable[str]) -> None:
+        self.names = sorted(names)
         super().__init__(
-            f"The meshes of these objects are not on this machine: {_listed(names)}; "
+            f"The meshes of these objects are not on this machine: {_listed(self.names)}; "
             "fetch them under Objects on the page, or with 'osf assets fetch'."
         )
 
@@ -109,6 +112,7 @@ class OverlappingObjects(OsfError):
     """Two bodies that penetrate each other."""
 
     def __init__(self, first: str, second: str, depth_m: float) -> None:
+        self.first, self.second = first, second
         super().__init__(f"{first} and {second} overlap by {1000 * depth_m:.0f} mm; move one of them away.")
 
 
@@ -127,6 +131,7 @@ class CorruptFile(OsfError):
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(f"{path} cannot be used: {reason}.")
+        self.path, self.reason = str(path), reason
 
 
 class CannotWrite(OsfError):
@@ -134,6 +139,7 @@ class CannotWrite(OsfError):
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(f"{path} cannot be written: {reason}.")
+        self.path, self.reason = str(path), reason
 
 
 class WorkerDied(OsfError):
@@ -148,6 +154,7 @@ class FetchFailed(OsfError):
 
     def __init__(self, what: str, reason: str) -> None:
         super().__init__(f"{what} could not be fetched: {reason}. Nothing was changed.")
+        self.what, self.reason = what, reason
 
 
 def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "size"]:
