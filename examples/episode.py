@@ -5,10 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from osfcore import AssetLibrary, Episode, FieldLibrary, GoalImage, Tabletop, goal_camera, load_scene_models
-from osfcore.control.events import EpisodeSettings
-from osfcore.world.tasks import random_goal
-from osfcore.world.scenes import SceneRequest
+from osfcore import (
+    AssetLibrary,
+    Episode,
+    EpisodeSettings,
+    FieldLibrary,
+    GoalImage,
+    SceneRequest,
+    Tabletop,
+    goal_camera,
+    load_scene_models,
+    random_goal,
+)
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 

@@ -3,9 +3,16 @@
 import numpy as np
 from scene import table
 
-from osfcore import FieldLibrary, ObjectModels, Observation, SceneBatch, default_cameras, estimate_first
-from osfcore.geometry.poses import rotation_angle
-from osfcore.render.types import Quality
+from osfcore import (
+    FieldLibrary,
+    ObjectModels,
+    Observation,
+    Quality,
+    SceneBatch,
+    default_cameras,
+    estimate_first,
+    rotation_angle,
+)
 
 
 def main() -> None:

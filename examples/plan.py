@@ -3,11 +3,17 @@
 import numpy as np
 from scene import table
 
-from osfcore import FieldLibrary, MPPIPlanner, Pose, SceneState, load_push_model
-from osfcore.dynamics.rollout import load_shapes
-from osfcore.geometry.workspace import STEP_S
-from osfcore.planning.costs import PoseCost, PoseGoal
-from osfcore.planning.pushes import PushProposals
+from osfcore import (
+    FieldLibrary,
+    MPPIPlanner,
+    Pose,
+    PoseCost,
+    PoseGoal,
+    PushProposals,
+    SceneState,
+    load_push_model,
+    load_shapes,
+)
 
 STEPS = 12
 
@@ -27,7 +33,7 @@ def main() -> None:
         future = model.rollout(state, actions[None])
         planner.shift(2)
         poses = Pose(future.positions[0, -1], future.quaternions[0, -1])
-        pusher = state.pusher + STEP_S * actions.sum(axis=0)
+        pusher = state.pusher + 0.2 * actions.sum(axis=0)  # an action is a velocity that is held for 0.2 s
         state = SceneState(state.names, poses, state.light, pusher)
         left = 1000 * np.linalg.norm(poses.position[0] - target.position)
         print(f"after {step + 2:2d} actions the can is {left:3.0f} mm from its goal")

@@ -3,9 +3,7 @@
 import numpy as np
 from scene import table
 
-from osfcore import FieldLibrary, Light, SceneBatch, SceneRenderer, goal_camera
-from osfcore.io.image_file import to_uint8, write_png
-from osfcore.render.types import Quality
+from osfcore import FieldLibrary, Light, Quality, SceneBatch, SceneRenderer, goal_camera, to_uint8, write_png
 
 
 def main() -> None:

@@ -10,11 +10,7 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Response
 
-from osfcore import AssetLibrary, Tabletop, default_cameras
-from osfcore.estimation.camera_response import srgb_of_linear
-from osfcore.io.image_file import to_uint8
-from osfcore.io.scene_file import camera_to_json
-from osfcore.world.scenes import SceneRequest
+from osfcore import AssetLibrary, SceneRequest, Tabletop, camera_to_json, default_cameras, srgb_of_linear, to_uint8
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 BOX, TOP_SPEED_M_S, DEADMAN_S, SLICES_HZ = (-0.35, -0.35, 0.35, 0.35), 0.43, 0.2, 60.0  # the table keeps the box

@@ -1,7 +1,7 @@
 """Errors of inputs: one sentence each, with the value and what is allowed.
 
-Every error is an `OsfError`, so a caller at the edge (command line, REST) can show its text as it is. Constructors take
-the facts, keep them as fields for whoever acts on them, and write the sentence. Nothing here knows of exit codes or HTTP.
+Every error is an `OsfError`, whose text the command line and REST show as it is. Constructors take the facts, keep them
+as fields and write the sentence.
 """
 
 import difflib
@@ -19,7 +19,7 @@ _MOST_NEAR = 3  # names that may have been meant
 
 
 def shown(value: object, most: int = _SHOWN_CHARACTERS) -> str:
-    """A value from a file as a sentence may show it: on one line, printable, cut in the middle if it is long."""
+    """Return a value as a message shows it: on one line, printable, cut in the middle if it is long."""
     text = str(value)
     if len(text) > most:
         text = f"{text[: most * 2 // 3]}...{text[-most // 3 :]}"
@@ -37,7 +37,7 @@ def _rebuilt(kind: type["OsfError"], sentence: str, facts: dict[str, object]) ->
 
 
 def _meant(name: str, known: list[str]) -> str:
-    """A question for names that hold what was given, or are spelt nearly so."""
+    """Return a question for known names that contain the given one or are spelt alike; "" if there are none."""
     if not isinstance(name, str) or not 0 < len(name) <= _SHOWN_CHARACTERS:
         return ""
     near = [one for one in known if name.lower() in one.lower()] or difflib.get_close_matches(name, known, cutoff=0.7)
@@ -51,7 +51,7 @@ class OsfError(ValueError):
         super().__init__(shown(sentence, _MOST_CHARACTERS))
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Survive the way out of a worker process, although constructors take facts rather than the sentence."""
+        """Pickle the sentence and the facts, for the way out of a worker process."""
         return _rebuilt, (type(self), str(self), self.__dict__)
 
 
@@ -86,7 +86,7 @@ class UnknownName(OsfError):
 
 
 class NotThere(UnknownName):
-    """Something known by an identifier, which says nothing to people; most often it was deleted meanwhile.
+    """An identifier of nothing, which is not shown to people; most often it was deleted meanwhile.
 
     Args:
         kind: what it would be, such as "scene".
@@ -158,7 +158,7 @@ class FetchFailed(OsfError):
 
 
 def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "size"]:
-    """A float64 copy of a vector, checked.
+    """Return a float64 copy of a vector after checking it.
 
     Args:
         value: anything that NumPy makes an array of.
@@ -178,13 +178,13 @@ def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "siz
 
 
 def check_ranges(*limits: tuple[str, float, float, float]) -> None:
-    """Refuse numbers outside their ranges; NaN is in none.
+    """Refuse numbers outside their ranges, NaN included.
 
     Args:
-        limits: of each number what it is, its value, and the least and the largest that is allowed.
+        limits: name, value, least and largest allowed value of each number.
 
     Raises:
-        InvalidInput: naming the first that is out of range.
+        InvalidInput: for the first that is out of range.
     """
     for what, value, low, high in limits:
         if not low <= value <= high:
@@ -192,7 +192,7 @@ def check_ranges(*limits: tuple[str, float, float, float]) -> None:
 
 
 def check_seed(value: int) -> int:
-    """A seed that every random generator takes.
+    """Return a seed after checking that every random generator takes it.
 
     Raises:
         InvalidInput: if it is negative or has more than 63 bits.

@@ -56,7 +56,7 @@ def _sequence(seed: int, stream: Stream, numbers: tuple[int, ...]) -> np.random.
 
 
 def stream_rng(seed: int, stream: Stream, *numbers: int) -> np.random.Generator:
-    """The generator of one stream.
+    """Return the generator of one stream.
 
     Args:
         seed: of everything random, 0 or more.
@@ -67,5 +67,5 @@ def stream_rng(seed: int, stream: Stream, *numbers: int) -> np.random.Generator:
 
 
 def stream_seed(seed: int, stream: Stream, *numbers: int) -> int:
-    """A 31-bit seed that is drawn from one stream, for whatever takes a seed instead of a generator."""
+    """Return a 31-bit seed drawn from one stream, for code that takes a seed instead of a generator."""
     return int(_sequence(seed, stream, numbers).generate_state(1)[0] >> 1)

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
 import httpx2
@@ -43,10 +42,8 @@ from osfcore.io.scene_file import (
     state_to_json,
 )
 
-# What the service answers, as frozen dataclasses with the core's own types; members it does not know are left
-# alone.
-#
-# Each is decoded from the JSON that the REST interface documents; a test compares them with its OpenAPI schema.
+# Answers of the service, decoded from the JSON that the REST interface documents; unknown members are ignored. A test
+# compares them with the OpenAPI schema.
 
 
 class Health(Entry):
@@ -70,8 +67,8 @@ class RemoteScene:
     """A table of the service.
 
     Attributes:
-        id: names it.
-        state: poses of the objects, light and pusher as they truly are.
+        id: its identifier.
+        state: true poses of the objects, light and pusher.
         cameras: that look at it; the last one takes goal images.
         time_s: simulated time since it was made [s].
     """
@@ -83,7 +80,7 @@ class RemoteScene:
 
     @staticmethod
     def of(data: dict[str, Any]) -> RemoteScene:
-        """From what the service answers."""
+        """Decode an answer of the service."""
         scene, facts = scene_from_json(data), decode(_SceneFacts, data, "scene")
         return RemoteScene(facts.id, scene.state, scene.cameras, facts.time_s)
 
@@ -98,7 +95,7 @@ class Goal:
     """A goal image that the service keeps.
 
     Attributes:
-        id: names it.
+        id: its identifier.
         name: for people.
         camera: that took the image.
         names: of the objects whose places in it are known; none of a photo.
@@ -111,7 +108,7 @@ class Goal:
 
     @staticmethod
     def of(data: object) -> Goal:
-        """From what the service answers."""
+        """Decode an answer of the service."""
         facts = decode(_GoalFacts, data, "goal")
         names = tuple(one.name for one in facts.objects or ())
         return Goal(facts.id, facts.name, facts.camera.camera(), names)
@@ -146,12 +143,12 @@ class _Running(Entry):
     """Work of the service as it is now.
 
     Attributes:
-        id: names it.
+        id: its identifier.
         status: of its job.
-        stage: what it does, such as "first", "goal", "plan", "act" in an episode.
+        stage: of the work, such as "first", "goal", "plan", "act" in an episode.
         done: units of work, or actions of an episode, that are done.
-        total: in all, at most; 0 before it is known.
-        note: what happens now, for people.
+        total: at most so many units; 0 before it is known.
+        note: the work of the moment, for people.
         eta_s: estimated time left [s].
         error: why it failed, if it did.
     """
@@ -180,7 +177,7 @@ class Episode(_Running):
         outcome: "reached", "out of steps" or "refused" once it has ended by itself.
         text: the outcome in a sentence.
         steps: all so far.
-        files: that `Client.download` brings.
+        files: names for `Client.download`.
     """
 
     name: str
@@ -214,11 +211,11 @@ _RECONNECTS = 5  # in a row, without an event between them
 
 
 class ServiceError(OsfError):
-    """What the service answered instead, or that it does not answer.
+    """The service refused a request, or does not answer.
 
     Args:
         sentence: for a person.
-        status: of HTTP; 0 where nothing was answered.
+        status: of HTTP; 0 without an answer.
     """
 
     def __init__(self, sentence: str, status: int = 0) -> None:
@@ -227,10 +224,10 @@ class ServiceError(OsfError):
 
 
 class Connection:
-    """One service.
+    """A connection to one service.
 
     Args:
-        http: a client of its own, with base address and headers; closed with this.
+        http: an HTTP client with base address and headers; closed with this.
     """
 
     def __init__(self, http: httpx2.Client) -> None:
@@ -253,7 +250,7 @@ class Connection:
         self._http.close()
 
     def json(self, method: str, path: str, body: object = None, **query: object) -> Any:  # noqa: ANN401
-        """What a request answers, parsed.
+        """Return the parsed answer to a request.
 
         Raises:
             ServiceError: if it is refused or there is no answer.
@@ -261,7 +258,7 @@ class Connection:
         return self._answer(method, path, query, json=body).json()
 
     def send(self, method: str, path: str, content: bytes, kind: str, **query: object) -> Any:  # noqa: ANN401
-        """What a request with a file answers, parsed.
+        """Return the parsed answer to a request with a file.
 
         Args:
             method: of HTTP.
@@ -276,7 +273,7 @@ class Connection:
         return self._answer(method, path, query, content=content, headers={"Content-Type": kind}).json()
 
     def bytes(self, path: str, **query: object) -> bytes:
-        """A file.
+        """Return a file.
 
         Raises:
             ServiceError: if there is none or no answer.
@@ -284,15 +281,13 @@ class Connection:
         return self._answer("GET", path, query).content
 
     def download(self, path: str, to: Path) -> Path:
-        """Write a file to disk piece by piece; it is there when it is whole.
+        """Write a file to disk piece by piece; it appears when it is whole.
 
         Raises:
             ServiceError: if there is none or no answer.
             CannotWrite: if the disk refuses.
         """
-        with self._told(), self._http.stream("GET", path) as answer:
-            if answer.is_error:
-                answer.read()
+        with self._reached(), self._http.stream("GET", path) as answer:
             _check(answer)
             with file_at_once(to) as partial, partial.open("wb") as file:
                 for chunk in answer.iter_bytes():
@@ -300,7 +295,7 @@ class Connection:
         return to
 
     def follow(self, path: str) -> Iterator[Any]:
-        """The data of events of a stream, parsed, until it ends; it is opened again where the network breaks it.
+        """Yield the parsed data of a stream of events until it ends; open it again where the network breaks it.
 
         Raises:
             ServiceError: if there is no such stream, or the service no longer answers.
@@ -309,8 +304,6 @@ class Connection:
         while True:
             try:
                 with self._http.sse(path, timeout=_QUIET_S) as events:
-                    if events.response.is_error:
-                        events.response.read()
                     _check(events.response)
                     for event in events:
                         breaks = 0
@@ -323,31 +316,33 @@ class Connection:
 
     def _answer(self, method: str, path: str, query: dict[str, object], **more: Any) -> httpx2.Response:  # noqa: ANN401
         params: Any = {key: value for key, value in query.items() if value is not None}
-        with self._told():
+        with self._reached():
             answer = self._http.request(method, path, params=params, **more)
         _check(answer)
         return answer
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _reached(self) -> Iterator[None]:
+        """Raise errors of the network as `ServiceError`."""
         try:
             yield
         except (httpx2.TransportError, httpx2.InvalidURL) as error:
             raise self._silent(error) from error
 
     def _silent(self, error: Exception) -> ServiceError:
-        told = f"The service at {self._http.base_url} does not answer ({error})"
-        return ServiceError(f"{told}; start it with 'osf serve', or give its address.")
+        what = f"The service at {self._http.base_url} does not answer ({error})"
+        return ServiceError(f"{what}; start it with 'osf serve', or give its address.")
 
 
 def _check(answer: httpx2.Response) -> None:
     if answer.is_success:
         return
+    answer.read()
     try:
         detail = answer.json()["detail"]
     except (ValueError, KeyError, TypeError):
-        told = f"{answer.url} answered {answer.status_code} as this service does not"
-        detail = f"{told}; give the address of one that 'osf serve' runs."
+        what = f"{answer.url} answered {answer.status_code} as this service does not"
+        detail = f"{what}; give the address of one that 'osf serve' runs."
     raise ServiceError(detail, answer.status_code)
 
 
@@ -380,9 +375,7 @@ class Client:
         """Itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close."""
         self.close()
 
@@ -391,11 +384,11 @@ class Client:
         self._service.close()
 
     def health(self) -> Health:
-        """Whether and how the service runs."""
+        """Return whether and how the service runs."""
         return decode(Health, self._service.json("GET", "/api/health"), "health")
 
     def objects(self) -> tuple[str, ...]:
-        """Names of the objects that scenes can be made of."""
+        """Return the names of the objects that scenes can be made of."""
         listed = self._service.json("GET", "/api/objects")["objects"]
         return tuple(one["name"] for one in listed if one["available"])
 
@@ -432,7 +425,7 @@ class Client:
         return RemoteScene.of(self._service.json("POST", "/api/scenes", body))
 
     def scene(self, scene: str | None = None) -> RemoteScene:
-        """A table as it is now; the one that is shown if none is named."""
+        """Return a table as it is now; the one that is shown if none is named."""
         return RemoteScene.of(self._service.json("GET", f"/api/scenes/{scene or self._shown()}"))
 
     def act(self, actions: Float[np.ndarray, "T 3"], scene: str | None = None) -> RemoteScene:
@@ -447,7 +440,7 @@ class Client:
     def image(
         self, camera: str = "goal", scene: str | None = None, *, size: int | None = None, pusher: bool = True
     ) -> Float32[np.ndarray, "h w 3"]:
-        """What a camera of a table sees.
+        """Return the image of a camera of a table.
 
         Args:
             camera: "0" to "3", or "goal".
@@ -461,7 +454,7 @@ class Client:
     # Goals
 
     def upload_goal(self, photo: str | Path | Float[np.ndarray, "h w 3"], name: str | None = None) -> Goal:
-        """Send a photo that shows how the table shall look.
+        """Send a photo of the goal.
 
         Args:
             photo: a file, or linear RGB in [0, 1].
@@ -493,11 +486,11 @@ class Client:
         return Goal.of(self._service.json("POST", "/api/goals", body))
 
     def goal_image(self, goal: Goal) -> Float32[np.ndarray, "h w 3"]:
-        """The image itself."""
+        """Return the image of a goal."""
         return _image(self._service.bytes(f"/api/goals/{goal.id}/image.png"))
 
     def goal_problem(self, goal: Goal, scene: str | None = None) -> str:
-        """What speaks against a goal for a table, in a sentence; "" if nothing does."""
+        """Return why a goal is unfit for a table, in a sentence; "" if it is fit."""
         return self._service.json("GET", f"/api/goals/{goal.id}/check", scene=scene)["text"]
 
     # Estimates and predictions
@@ -511,11 +504,11 @@ class Client:
         prior: str | None = None,
         seed: int = 0,
     ) -> Iterator[Estimate]:
-        """Find poses and light; yields how it goes, last with the result.
+        """Estimate poses and light; yield the progress, last with the result.
 
         Args:
             mode: "first" from masks alone, "next" without masks from an earlier estimate, "goal" from one view.
-            observation: a folder with observation.json; what the cameras of a table see otherwise.
+            observation: a folder with observation.json; otherwise the cameras of a table are used.
             scene: the table; the one that is shown if none is named.
             prior: the earlier estimate of mode "next" and "goal"; the latest of the table otherwise.
             seed: of the search.
@@ -529,7 +522,7 @@ class Client:
         return self._followed("/api/estimates", data, Estimate)
 
     def predict(self, actions: Float[np.ndarray, "K T 3"], state: SceneState | None = None) -> Rollouts:
-        """What sequences of pusher velocities would do.
+        """Predict what sequences of pusher velocities would do.
 
         Args:
             actions: each held for 0.2 s [m/s].
@@ -546,7 +539,7 @@ class Client:
     def episode(
         self, goal: Goal | Mapping[str, Pose], *, scene: str | None = None, seed: int = 0, **settings: object
     ) -> Iterator[Episode]:
-        """Rearrange a table until it looks like the goal; yields how it goes, last how it ended.
+        """Rearrange a table until it looks like the goal; yield the progress, last the outcome.
 
         The episode starts at once and goes on if nobody follows it any more; `cancel` ends it.
 
@@ -554,7 +547,7 @@ class Client:
             goal: a goal image, or poses of all objects.
             scene: the table; the one that is shown if none is named.
             seed: of the search and the planner.
-            settings: what shall be other than by default: steps, replan_every, cost, samples, horizon, temperature,
+            settings: that differ from the defaults: steps, replan_every, cost, samples, horizon, temperature,
                 despite_doubts, method.
 
         Raises:
@@ -565,11 +558,11 @@ class Client:
         return self._followed("/api/episodes", data, Episode)
 
     def episodes(self) -> tuple[Episode, ...]:
-        """The latest episodes, newest first, without their steps."""
+        """Return the latest episodes, newest first, without their steps."""
         return tuple(decode(Episode, one, "episode") for one in self._service.json("GET", "/api/episodes")["episodes"])
 
     def cancel(self, running: Episode | Estimate) -> None:
-        """End an episode or an estimate; what an episode has done is kept.
+        """End an episode or an estimate; the actions of an episode are kept.
 
         Raises:
             ServiceError: if it has ended already.
@@ -597,7 +590,7 @@ class Client:
         return current
 
     def _followed(self, place: str, data: dict[str, Any], kind: type[T]) -> Iterator[T]:
-        """How a job is now whenever it changes."""
+        """Yield the state of a job now and after every change."""
         path = f"{place}/{data['id']}"
 
         def states() -> Iterator[T]:

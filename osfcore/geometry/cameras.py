@@ -19,7 +19,7 @@ GOAL_CAMERA_POSITION = (0.0, -0.45, 0.8)
 
 
 def image_side(value: int, what: str = "image size [px]") -> int:
-    """The side of an image [px], checked.
+    """Return the side of an image [px] after checking it.
 
     Raises:
         InvalidInput: outside 16 to 1024.
@@ -34,7 +34,7 @@ class Camera:
     """A pinhole camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
 
     Attributes:
-        name: how files and pages call it.
+        name: its name in files and pages.
         T_world_camera: pose of the camera in the world.
         intrinsics: focal lengths and principal point, 3 x 3 [px].
         width: of the image [px].
@@ -68,10 +68,10 @@ class Camera:
         fov_y_deg: float = FIELD_OF_VIEW_DEG,
         up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     ) -> Camera:
-        """A camera with a square image that looks at a point.
+        """Return a camera with a square image that looks at a point.
 
         Args:
-            name: how files and pages call it.
+            name: its name in files and pages.
             position: of the optical centre in the world [m].
             target: what appears in the middle of the image [m].
             size: sides of the image [px].
@@ -102,17 +102,17 @@ class Camera:
         return float(2 * np.arctan2(self.height / 2, self.intrinsics[1, 1]))
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view with another number of pixels."""
+        """Return the same view with another number of pixels."""
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
         return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
 
     def project(self, points_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixel coordinates of world points [px]; meaningless for points behind the camera."""
+        """Return pixel coordinates of world points [px]; meaningless for points behind the camera."""
         points = self.T_world_camera.inverse().apply(points_world) @ self.intrinsics.T
         return points[..., :2] / points[..., 2:]
 
     def ray_directions(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-        """Unit directions in the world of the rays through pixel coordinates [px]."""
+        """Return unit directions in the world of the rays through pixel coordinates [px]."""
         ones = np.ones((*pixels.shape[:-1], 1))
         directions = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -120,10 +120,10 @@ class Camera:
 
 
 def default_cameras(size: int = DEFAULT_IMAGE_SIDE) -> tuple[Camera, ...]:
-    """Cameras "0" to "3" around the table."""
+    """Return the cameras "0" to "3" around the table."""
     return tuple(Camera.look_at(str(i), p, SCENE_CENTRE, size=size) for i, p in enumerate(CAMERA_POSITIONS))
 
 
 def goal_camera(size: int = DEFAULT_IMAGE_SIDE) -> Camera:
-    """The camera "goal", from which goal images are taken."""
+    """Return the camera "goal", from which goal images are taken."""
     return Camera.look_at("goal", GOAL_CAMERA_POSITION, SCENE_CENTRE, size=size)

@@ -1,4 +1,6 @@
-"""Convex parts that together fill an object: what the physics, and the prediction of pushes, touches."""
+"""Convex parts that together fill an object, for physics and the prediction of pushes."""
+
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,7 +19,7 @@ _SAMPLES = 20_000
 def convex_parts(
     vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], concavity: float = CONCAVITY
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Vertices of convex parts, at most 16 of at most 64 vertices; the same for the same mesh.
+    """Return the vertices of convex parts, at most 16 of at most 64 vertices; the same for the same mesh.
 
     Bodies with shallow dents only, such as cans, are one part: coacd would spend many on the rim of a lid.
 
@@ -41,7 +43,7 @@ def convex_parts(
 
 
 def dent_depth_m(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"]) -> float:
-    """How far the convex hull's surface lies from the mesh [m], for all but the deepest hundredth of it."""
+    """Return how far the convex hull's surface lies from the mesh [m], for all but its deepest hundredth."""
     import trimesh
     from scipy.spatial import KDTree
 
@@ -76,7 +78,7 @@ def _decomposed(
 def reduced_hull(
     points: Float[np.ndarray, "P 3"], max_vertices: int = MAX_VERTICES, tolerance_m: float = CUT_TOLERANCE_M
 ) -> Float[np.ndarray, "M 3"] | None:
-    """A convex hull of few vertices around points, or None if they span no volume.
+    """Return a convex hull of few vertices around points, or None if they span no volume.
 
     Starts from the extremes along 13 axes and adds the point that sticks out most, again and again. Where
     `max_vertices` do not suffice, the hull is swollen by half of what still sticks out, or until only about twice the
@@ -92,9 +94,7 @@ def reduced_hull(
     """
     try:
         points = points[ConvexHull(points).vertices]
-        axes = np.array(
-            [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
-        )
+        axes = np.array([axis for axis in product((-1, 0, 1), repeat=3) if any(axis)])
         chosen = np.unique((points @ axes.T).argmax(axis=0))
         hull = ConvexHull(points[chosen], incremental=True)
         while True:

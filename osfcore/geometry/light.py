@@ -16,10 +16,10 @@ MIN_LIGHT_ELEVATION_DEG = 5.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Light:
-    """A distant, parallel, white light. Only its direction can be observed.
+    """A distant, parallel, white light; only its direction can be observed.
 
     Attributes:
-        position: 1 m from the table's centre, toward the light [m]; any other length is brought to 1.
+        position: 1 m from the table's centre, toward the light [m]; other lengths are brought to 1 m.
     """
 
     position: Float[np.ndarray, "3"]
@@ -31,20 +31,18 @@ class Light:
         if not length > 1e-9:
             raise InvalidInput("light position [m]", position.tolist(), "away from the table's centre")
         position = position / length
-        elevation_deg = float(np.rad2deg(np.arcsin(np.clip(position[2], -1, 1))))
-        if elevation_deg < MIN_LIGHT_ELEVATION_DEG - 1e-6:
-            raise InvalidInput("light elevation [deg]", f"{elevation_deg:.1f}", f"at least {MIN_LIGHT_ELEVATION_DEG:g}")
+        _check_elevation(position, "light elevation [deg]")
         object.__setattr__(self, "position", position)
 
     @staticmethod
     def from_angles(azimuth_rad: float, elevation_rad: float) -> Light:
-        """A light at an azimuth from +x toward +y and an elevation above the table [rad]."""
+        """Return a light at an azimuth from +x toward +y and an elevation above the table [rad]."""
         c = np.cos(elevation_rad)
         return Light(np.array([c * np.cos(azimuth_rad), c * np.sin(azimuth_rad), np.sin(elevation_rad)]))
 
     @staticmethod
     def random(rng: np.random.Generator, min_elevation_deg: float = 10.0) -> Light:
-        """A light drawn uniformly (by solid angle) from the hemisphere above `min_elevation_deg`."""
+        """Draw a light uniformly (by solid angle) from the hemisphere above `min_elevation_deg`."""
         z = rng.uniform(np.sin(np.deg2rad(min_elevation_deg)), 1.0)
         return Light.from_angles(rng.uniform(-np.pi, np.pi), float(np.arcsin(z)))
 
@@ -54,8 +52,14 @@ class Light:
         return self.position
 
     def angle_to(self, other: Light) -> float:
-        """The angle between the directions of two lights [rad]."""
+        """Return the angle between the directions of two lights [rad]."""
         return float(np.arccos(np.clip(self.direction @ other.direction, -1, 1)))
+
+
+def _check_elevation(direction: Float[np.ndarray, "3"], what: str) -> None:
+    elevation_deg = float(np.rad2deg(np.arcsin(np.clip(direction[2], -1, 1))))
+    if elevation_deg < MIN_LIGHT_ELEVATION_DEG - 1e-6:
+        raise InvalidInput(what, f"{elevation_deg:.1f}", f"at least {MIN_LIGHT_ELEVATION_DEG:g}")
 
 
 # A lamp at a finite distance that looks at a point: light falls off with distance and with the angle to its axis.
@@ -71,7 +75,7 @@ class Light:
 
 
 MIN_LAMP_DISTANCE_M = 0.15
-MIN_PENUMBRA_RAD = 1e-6  # what divides where the cone has no penumbra
+MIN_PENUMBRA_RAD = 1e-6  # divisor where the cone has no penumbra
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,10 +105,7 @@ class SpotLamp:
         if self.distance < MIN_LAMP_DISTANCE_M:
             allowed = f"at least {MIN_LAMP_DISTANCE_M:g}"
             raise InvalidInput("distance of the lamp from the table's centre [m]", f"{self.distance:.3f}", allowed)
-        elevation_deg = float(np.rad2deg(np.arcsin(np.clip(self.direction[2], -1, 1))))
-        if elevation_deg < MIN_LIGHT_ELEVATION_DEG - 1e-6:
-            what = "elevation of the lamp above the table, seen from its centre [deg]"
-            raise InvalidInput(what, f"{elevation_deg:.1f}", f"at least {MIN_LIGHT_ELEVATION_DEG:g}")
+        _check_elevation(self.direction, "elevation of the lamp above the table, seen from its centre [deg]")
         if not np.linalg.norm(self.aim - self.position) > 1e-6:
             raise InvalidInput("point that the lamp looks at [m]", self.aim.tolist(), "away from the lamp itself")
         if not 0 < self.inner_deg <= self.outer_deg <= 90:
@@ -113,7 +114,7 @@ class SpotLamp:
 
     @property
     def distance(self) -> float:
-        """From the table's centre [m]."""
+        """Distance from the table's centre [m]."""
         return float(np.linalg.norm(self.position))
 
     @property
@@ -138,17 +139,17 @@ class SpotLamp:
         return Light(self.position)
 
     def toward(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 3"]:
-        """Unit vectors from points [m] toward the lamp."""
+        """Return the unit vectors from points [m] toward the lamp."""
         way = self.position - points
         return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
 
     def falloff(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
-        """How the light spreads on its way to points [m], (d0 / r)^2: 1 at the table's centre."""
+        """Return the falloff with distance at points [m], (d0 / r)^2: 1 at the table's centre."""
         squared = np.sum((self.position - points) ** 2, axis=-1)
         return np.asarray(self.distance**2 / np.maximum(squared, 1e-18))
 
     def spot_factor(self, points: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
-        """Share of the light that the cone sends toward points [m]."""
+        """Return the share of the light that the cone sends toward points [m]."""
         inner, outer = self.cone_rad
         angle = np.arccos(np.clip(-self.toward(points) @ self.axis, -1, 1))
         s = np.clip((outer - angle) / max(outer - inner, MIN_PENUMBRA_RAD), 0, 1)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 class Gap(NamedTuple):
-    """Between a convex outline and something else.
+    """The gap between a convex outline and something else.
 
     Attributes:
         distance: between the two [m]; negative where they overlap.
@@ -40,7 +40,7 @@ def dot(a: Float[Tensor, "*#batch 2"], b: Float[Tensor, "*#batch 2"]) -> Float[T
 
 
 def gap_to_point(outline: Float[Tensor, "A K 2"], point: Float[Tensor, "A 2"]) -> Gap:
-    """From outlines to one point each."""
+    """Return the gaps from outlines to one point each."""
     side = outline.roll(-1, dims=1) - outline
     away = point[:, None] - outline
     along = dot(away, side) / (dot(side, side) + 1e-12)
@@ -55,7 +55,7 @@ def gap_to_point(outline: Float[Tensor, "A K 2"], point: Float[Tensor, "A 2"]) -
 
 
 def gap_between(first: Float[Tensor, "E K 2"], second: Float[Tensor, "E K 2"]) -> Gap:
-    """From first outlines to second ones, by the best separating axis among the normals of both outlines' sides.
+    """Return the gaps from first to second outlines, by the best separating axis among the normals of their sides.
 
     The distance is exact for overlapping outlines and where a side is involved, and too small between two corners.
     """
@@ -70,14 +70,13 @@ def gap_between(first: Float[Tensor, "E K 2"], second: Float[Tensor, "E K 2"]) -
 
 
 def _separation(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest separation along the normals of the first outlines' sides, and that normal."""
+    """Return the largest separation along the normals of the first outlines' sides [m], and that normal."""
     side = first.roll(-1, dims=1) - first
     length = (dot(side, side) + 1e-16).sqrt()
     normal = torch.stack([side[..., 1], -side[..., 0]], dim=-1) / length[..., None]
     # Not from the side's own corner: points found with an error may run back a little before they go on.
-    reach = torch.matmul(normal, second.transpose(1, 2)).amin(dim=2) - torch.matmul(normal, first.transpose(1, 2)).amax(
-        dim=2
-    )
+    nearest = torch.matmul(normal, second.transpose(1, 2)).amin(dim=2)
+    reach = nearest - torch.matmul(normal, first.transpose(1, 2)).amax(dim=2)
     reach = torch.where(length > 1e-4, reach, -1.0)  # repeated points have no side between them
     best = reach.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)
@@ -85,6 +84,6 @@ def _separation(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def direction_index(direction: Float[Tensor, "A 2"], count: int) -> Int[Tensor, "A"]:
-    """Number of the nearest of `count` equally spaced directions."""
+    """Return the number of the nearest of `count` equally spaced directions."""
     angle = torch.atan2(direction[:, 1], direction[:, 0])
     return (angle * (count / (2 * math.pi))).round().long() % count

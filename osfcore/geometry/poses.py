@@ -108,7 +108,7 @@ def planar_turns(
 
 
 def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") -> Float[np.ndarray, "*batch 4"]:
-    """The same quaternions with norm 1, up to rounding; those that have it are given back bit by bit.
+    """Return the same quaternions with norm 1, up to rounding; those that have it come back bit by bit.
 
     Raises:
         InvalidInput: if a norm is off by more than 1e-3: such a quaternion is a mistake, not a rounding error.
@@ -143,12 +143,12 @@ class Pose:
 
     @staticmethod
     def joined(*batches: Pose) -> Pose:
-        """One batch of several, along the first axis."""
+        """Join batches along the first axis."""
         return Pose(np.concatenate([b.position for b in batches]), np.concatenate([b.quaternion for b in batches]))
 
     @staticmethod
     def stacked(poses: Iterable[Pose]) -> Pose:
-        """One batch of single poses, or of batches of one size along a new first axis; none is a batch of 0."""
+        """Stack poses, or batches of one size, along a new first axis; no poses give a batch of 0."""
         every = list(poses)
         if not every:
             return Pose.identity(0)
@@ -195,3 +195,12 @@ def orthogonal_basis(direction: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarra
     first = np.cross(direction, helper)
     first /= np.linalg.norm(first)
     return first, np.cross(direction, first)
+
+
+def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
+    """Return unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    azimuth = np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)

@@ -1,4 +1,4 @@
-"""Sequences of actions, and the futures that are predicted from them."""
+"""Sequences of actions, and the futures predicted from them."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ class Rollouts:
     pusher: Float[np.ndarray, "K T1 3"]
 
     def __getitem__(self, sequence: int) -> Rollouts:
-        """One sequence alone, K = 1."""
+        """Return one sequence alone, K = 1."""
         k = slice(sequence, sequence + 1)
         return Rollouts(self.names, self.positions[k], self.quaternions[k], self.pusher[k])
 
     @staticmethod
     def joined(parts: Sequence[Rollouts]) -> Rollouts:
-        """Futures of the same scene, one after another."""
+        """Join futures of the same scene along K."""
         positions, quaternions, pusher = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("positions", "quaternions", "pusher")
         )
         return Rollouts(parts[0].names, positions, quaternions, pusher)
 
     def after(self, actions: int) -> Rollouts:
-        """What is left of the futures after some actions; at least the last state."""
+        """Return the rest of the futures after some actions; at least the last state."""
         t = slice(min(actions, self.positions.shape[1] - 1), None)
         return Rollouts(self.names, self.positions[:, t], self.quaternions[:, t], self.pusher[:, t])
 
 
 def check_actions(actions: object) -> Float[np.ndarray, "K T 3"]:
-    """Sequences of actions that can be rolled out.
+    """Return sequences of actions after checking that they can be rolled out.
 
     Raises:
         InvalidInput: if they are not K x T x 3 finite numbers within the limits; the message names the first one.

@@ -59,7 +59,7 @@ class SceneState:
         return self.poses[self._number(name)]
 
     def reordered(self, names: tuple[str, ...]) -> SceneState:
-        """The same state with its objects in another order.
+        """Return the same state with its objects in another order.
 
         Raises:
             UnknownName: if one of them is not in the scene.
@@ -73,7 +73,7 @@ class SceneState:
 
 
 def shifted_poses(state: SceneState, shifts_m: Mapping[str, tuple[float, float]]) -> dict[str, Pose]:
-    """Poses of some objects, each moved along x and y from where it is in a state, lying as it lies."""
+    """Return poses of some objects, each moved along x and y [m] from its pose in a state, not turned."""
     return {
         name: Pose(state.pose(name).position + np.array([*shift, 0.0]), state.pose(name).quaternion)
         for name, shift in shifts_m.items()
@@ -82,7 +82,7 @@ def shifted_poses(state: SceneState, shifts_m: Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """What the cameras and the robot report at one instant; no depth, no poses.
+    """The report of cameras and robot at one instant: no depth, no poses.
 
     Attributes:
         cameras: V cameras of one image size.
@@ -102,29 +102,27 @@ class Observation:
 
 
 def pose_rows(poses: Pose) -> Float[np.ndarray, "N 7"]:
-    """Position [m] and quaternion (w, x, y, z) of each object, as programs that learn are told them.
+    """Return position [m] and quaternion (w, x, y, z) of each object, as programs that learn get them.
 
-    q and -q are one rotation, told with w >= 0; what has fallen off the table is told within 1.2 m of its centre.
+    Of q and -q, which are one rotation, the one with w >= 0 is given. Positions of objects that have fallen off the
+    table are clipped to 1.2 m around its centre.
     """
     signs = np.where(poses.quaternion[:, :1] < 0, -1.0, 1.0)
     positions = poses.position.clip(-TABLE_SIDE_M, TABLE_SIDE_M)
     return np.concatenate([positions, (signs * poses.quaternion).clip(-1, 1)], axis=1)
 
 
-# What an estimator believes: a scene state, how sure it is, and whether to act on it.
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class EstimatedState:
-    """A scene state with its uncertainty.
+    """A scene state as estimated, with its uncertainty and whether to act on it.
 
     Attributes:
         state: the most likely state.
         position_std: standard deviation of each object's position, per axis [m].
         rotation_std: of each object's orientation, per axis of a small rotation [rad].
         light_std: of the direction toward the light, per axis [rad].
-        doubts: for each object why it should not be trusted; "" where it may be.
-        reason: why the whole should not be trusted, in a sentence; "" where it may be.
+        doubts: for each object why it should not be trusted; "" if it can be.
+        reason: why the whole should not be trusted, in a sentence; "" if it can be.
     """
 
     state: SceneState
@@ -157,5 +155,5 @@ class EstimatedState:
         return tuple(name for name, doubt in zip(self.state.names, self.doubts, strict=True) if doubt)
 
     def with_pusher(self, pusher: Float[np.ndarray, "3"] | None) -> EstimatedState:
-        """The same with the pusher where the robot says it is: it knows its hand [m]."""
+        """Return the same with the pusher where the robot reports it [m]."""
         return replace(self, state=replace(self.state, pusher=pusher))

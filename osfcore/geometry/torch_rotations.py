@@ -1,4 +1,4 @@
-"""Rotations on torch tensors, quaternions (w, x, y, z); what `osfcore.geometry.poses` is for numpy."""
+"""Rotations on torch tensors as quaternions (w, x, y, z), like `osfcore.geometry.poses` for numpy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def multiply(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Floa
 
 
 def unit(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The same quaternions with norm 1."""
+    """Return the same quaternions with norm 1."""
     return q / q.norm(dim=-1, keepdim=True)
 
 

@@ -1,4 +1,4 @@
-"""Validation of files that people bring, with the reason in words and pictures of what was understood."""
+"""Check files that people bring, and draw how they were understood."""
 
 from __future__ import annotations
 
@@ -18,7 +18,16 @@ from osfcore.fields.kiloosf import FORMAT as FIELD_FORMAT
 from osfcore.fields.kiloosf import read_field, tensor_format
 from osfcore.fields.table import TABLE_FORMAT, read_table
 from osfcore.fields.visual_hull import carve, silhouette_box
-from osfcore.inspection.overlays import draw_line, draw_mask, draw_text, object_colour, observation_sheet, overlay_sheet
+from osfcore.inspection.overlays import (
+    AXIS_COLOURS,
+    draw_line,
+    draw_mask,
+    draw_text,
+    object_colour,
+    observation_sheet,
+    overlay_sheet,
+    tiled,
+)
 from osfcore.io.archives import unpack_set
 from osfcore.io.files import read_json
 from osfcore.io.image_file import to_uint8, write_png
@@ -28,14 +37,10 @@ from osfcore.io.output_paths import check_place
 from osfcore.io.scene_file import actions_from_json, estimated_from_json, is_estimated, scene_from_json
 from osfcore.photo.bop import BopImage, is_bop_scene, read_images, result_images
 
-# What a scene of BOP holds, whether its parts fit each other, and pictures of how it was understood.
-
-
 _SHARE = 0.5  # of the objects whose annotated place must fit their masks
 _LEAST_PIXELS = 20  # of a mask that counts
 _AXIS_M = 0.05
-_AXES = ((0, 0, 255), (0, 255, 0), (255, 0, 0))
-_MOST_TILES, _COLUMNS, _SIDE = 8, 4, 384
+_MOST_TILES, _SIDE = 8, 384
 
 
 def check_places(images: Sequence[BopImage]) -> None:
@@ -66,11 +71,8 @@ def _fits(image: BopImage, name: str) -> bool:
 
 
 def bop_sheet(images: Sequence[BopImage]) -> UInt8[np.ndarray, "H W 3"]:
-    """A tile for each of up to eight images, BGR: outlines of masks, and axes of 5 cm of each annotated object."""
-    tiles = [_tile(image) for image in images[:_MOST_TILES]]
-    columns = min(_COLUMNS, len(tiles))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])
+    """Draw a tile for each of up to eight images, BGR: outlines of masks, and 5 cm axes of each annotated object."""
+    return tiled([_tile(image) for image in images[:_MOST_TILES]])
 
 
 def _tile(image: BopImage) -> UInt8[np.ndarray, "h w 3"]:
@@ -79,7 +81,7 @@ def _tile(image: BopImage) -> UInt8[np.ndarray, "h w 3"]:
     for number, (name, pose) in enumerate(image.poses.items()):
         if name in image.masks:
             draw_mask(bgr, image.masks[name], name, object_colour(number))
-        for axis, colour in zip(np.eye(3), _AXES, strict=True):
+        for axis, colour in zip(np.eye(3), AXIS_COLOURS, strict=True):
             draw_line(bgr, camera, pose.position, pose.apply(_AXIS_M * axis), colour, 2)
     draw_text(bgr, f"image {image.number}", (6, 16), (255, 255, 255))
     return bgr
@@ -90,7 +92,7 @@ _REASON_CHARACTERS = 500
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a file turned out to be.
+    """The kind and the contents of a file.
 
     Attributes:
         kind: "scene", "state", "observation", "scene of BOP", "results file of BOP", "image set", "push file",
@@ -105,7 +107,7 @@ class Report:
 
 
 def check_path(path: Path) -> Report:
-    """Find out what a file or folder is and whether it is sound.
+    """Return the kind and the contents of a file or folder that is sound.
 
     Raises:
         CorruptFile: if it is of no known kind or broken; the message says where.
@@ -121,17 +123,14 @@ def check_path(path: Path) -> Report:
         if path.name == OBSERVATION_FILE:
             raise CorruptFile(path, "it is one file of an observation; check the folder that holds it")
         return read_json(path, _any_json)
-    if path.suffix.lower() in (".h5", ".hdf5"):
-        return _check_pushes(path)
-    if path.suffix.lower() == ".safetensors":
-        return _check_field(path)
-    if path.suffix.lower() == ".csv":
-        return _check_results(path)
-    kinds = (
-        "a .json scene, state or actions, a .h5 push file, a .safetensors field or network, a .csv of BOP's results, "
-        "nor the folder of an observation, image set or scene of BOP"
+    others = {".h5": _check_pushes, ".hdf5": _check_pushes, ".safetensors": _check_field, ".csv": _check_results}
+    if check := others.get(path.suffix.lower()):
+        return check(path)
+    raise CorruptFile(
+        path,
+        "it is neither a .json scene, state or actions, a .h5 push file, a .safetensors field or network, a .csv of "
+        "BOP's results, nor the folder of an observation, image set or scene of BOP",
     )
-    raise CorruptFile(path, f"it is neither {kinds}")
 
 
 def _any_json(data: object) -> Report:
@@ -195,9 +194,8 @@ def _check_field(path: Path) -> Report:
     field = read_field(path)
     size = " x ".join(f"{side:.3g}" for side in field.extent[1] - field.extent[0])
     facts = {"corners": len(field.rows) - 1, "networks": len(field.networks)}
-    return Report(
-        "field", f"an object of {size}, {facts['corners']} voxel corners, {facts['networks']} networks", facts
-    )
+    summary = f"an object of {size}, {facts['corners']} voxel corners, {facts['networks']} networks"
+    return Report("field", summary, facts)
 
 
 def _check_pushes(path: Path) -> Report:
@@ -220,7 +218,7 @@ def _check_image_set(folder: Path) -> Report:
 
 @contextlib.contextmanager
 def _unpacked(path: Path) -> Iterator[Path]:
-    """The folder of an image set, or of a zipped one for as long as it is looked at."""
+    """Give the folder of an image set, unpacked for as long as this is open if it is a zip."""
     if path.is_dir() or path.suffix.lower() != ".zip":
         yield path
         return
@@ -235,7 +233,7 @@ def _unpacked(path: Path) -> Iterator[Path]:
 
 
 def draw_overlay(path: Path, out: Path) -> None:
-    """Draw what was understood of a set or an observation into its images, as one PNG.
+    """Draw how a set or an observation was understood into its images, as one PNG.
 
     For some images of a set that is the world's axes (x red, y green, z blue), the direction of the light (yellow) and
     the box that holds every silhouette (magenta). Where cameras and silhouettes contradict each other there is no such
@@ -253,20 +251,16 @@ def draw_overlay(path: Path, out: Path) -> None:
         CannotWrite: if it cannot be written.
     """
     check_overlay_place(out)
-    write_png(out, _sheet(path)[..., ::-1])
-
-
-def _sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     if is_observation(path):
-        return observation_sheet(read_observation(path))
-    return bop_sheet(read_images(path)) if is_bop_scene(path) else _set_sheet(path)
-
-
-def _set_sheet(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    with _unpacked(path) as folder:
-        sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))
-    has_box = not any(images.is_opaque for images in sets)
-    return overlay_sheet(sets, carve(*sets).box if has_box else None)
+        sheet = observation_sheet(read_observation(path))
+    elif is_bop_scene(path):
+        sheet = bop_sheet(read_images(path))
+    else:
+        with _unpacked(path) as folder:
+            sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))
+        has_box = not any(images.is_opaque for images in sets)
+        sheet = overlay_sheet(sets, carve(*sets).box if has_box else None)
+    write_png(out, sheet[..., ::-1])
 
 
 def check_overlay_place(out: Path) -> None:

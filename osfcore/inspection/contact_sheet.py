@@ -21,9 +21,6 @@ from osfcore.photo.pose_loss import draw, object_windows
 from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject
 from osfcore.world.imaging import RayTracer, TracedMesh
 
-# Contact sheets: truth, ours and the difference, below each other; and grids of images with names.
-
-
 DIFFERENCE_GAIN = 4
 _LABEL_PX = 16
 _ROW_LABEL_PX = 40
@@ -37,8 +34,8 @@ class Comparison:
 
     Attributes:
         label: a few letters above it.
-        truth: what it should look like.
-        ours: what it looks like.
+        truth: the image as it should be.
+        ours: the image as it is.
     """
 
     label: str
@@ -49,12 +46,12 @@ class Comparison:
 def contact_sheet(
     columns: Sequence[Comparison], *, per_row: int = 8, truth: str = "truth"
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Columns side by side, in blocks of `per_row`: truth, ours and the absolute difference x 4, below each other.
+    """Put columns side by side, in blocks of `per_row`: truth, ours and four times their absolute difference.
 
     Args:
-        columns: what to show.
+        columns: at least one.
         per_row: columns in a block.
-        truth: what to call the first row, in a few letters.
+        truth: name of the first row, in a few letters.
 
     Raises:
         InvalidInput: if there is nothing to show, or sizes differ.
@@ -68,7 +65,7 @@ def contact_sheet(
 
 
 def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Three rows with a line of labels above and a margin of row names on the left."""
+    """Put columns into three rows, with a line of labels above and a margin of row names on the left."""
     height, width = columns[0].truth.shape[:2]
     sheet = np.full((_LABEL_PX + 3 * height, _ROW_LABEL_PX + len(columns) * width, 3), _PAPER, np.uint8)
     for row, name in enumerate((first, "ours", f"diff x{DIFFERENCE_GAIN}")):
@@ -87,7 +84,7 @@ def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 
 def image_grid(
     rows: Mapping[str, Sequence[UInt8[np.ndarray, "h w 3"]]], columns: Sequence[str]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Images in rows and columns, with the columns' names above and the rows' on the left.
+    """Put images into rows and columns, with the columns' names above and the rows' on the left.
 
     Args:
         rows: by name.
@@ -125,20 +122,17 @@ def put_text(sheet: UInt8[np.ndarray, "H W 3"], text: str, place: tuple[int, int
     cv2.putText(sheet, text, place, font, scale, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-# Contact sheets of photographed objects: the photo, outlines, and what the surfels look like.
-
-
 _SIDE = 180  # of a mask [px]
 _MASK_COLOUR, _FOUND_COLOUR = (255, 60, 60), (60, 220, 60)
 
 
 def sheet(models: PhotoModels, photo: Photograph, found: PhotoObject) -> UInt8[np.ndarray, "H W 3"]:
-    """Photo; photo with the outlines of the mask (red) and of what was found (green); the object in its pose.
+    """Draw the photo, the outlines of the mask (red) and of the pose (green) in it, and the object in its pose.
 
     Args:
         models: of the objects.
-        photo: in whose frame the pose is told.
-        found: in it.
+        photo: in whose frame the pose is.
+        found: the object and its pose.
     """
     window = object_windows([photo], found.name, _SIDE)[0]
     surfels, pose = models.surfels(found.name, FINE_ACROSS), found.best.pose
@@ -162,9 +156,6 @@ def write_sheet(path: Path, models: PhotoModels, photo: Photograph, found: Photo
     write_png(path, sheet(models, photo, found))
 
 
-# One object from all around in one picture, by the project's own image model: what a thumbnail turns through.
-
-
 VIEWS, SIDE = 24, 96
 _FIELD_OF_VIEW_DEG = 24.0
 _ELEVATION_RAD = np.deg2rad(22.0)
@@ -172,7 +163,7 @@ _LIGHT_TURN_RAD, _LIGHT_ELEVATION_RAD = np.deg2rad(-50.0), np.deg2rad(48.0)  # f
 
 
 def turntable(mesh: TexturedMesh, views: int = VIEWS, side: int = SIDE) -> UInt8[np.ndarray, "side width 4"]:
-    """Views of an object that turns once under a lamp that stays, side by side.
+    """Render an object that turns once under a lamp that stays, by the project's image model; views side by side.
 
     Args:
         mesh: the object.
@@ -203,7 +194,7 @@ def _direction(azimuth: float, elevation: float) -> np.ndarray:
 
 
 def turntable_png(mesh: TexturedMesh) -> bytes:
-    """The same as PNG."""
+    """Return the views of `turntable` as PNG."""
     picture = turntable(mesh)
     in_file_order = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
     return cv2.imencode(".png", in_file_order, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()

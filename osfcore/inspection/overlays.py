@@ -1,4 +1,4 @@
-"""Pictures of how image sets and observations were understood: axes, light, boxes and masks drawn into images."""
+"""Draw axes, light, boxes and masks into the images of sets and observations, to show how they were understood."""
 
 from __future__ import annotations
 
@@ -17,19 +17,24 @@ from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.io.image_file import to_uint8
 from osfcore.io.image_set import ImageSet
 
-# Pictures of how a set was understood: axes, light and the object's box, drawn into some of its images.
-
-
-_COLUMNS = 4  # images of each set
+_COLUMNS = 4  # images of each set, and most images of an observation in a row
 _SIDE = 256
 _NEAR = 1e-3  # share of a line's distance at which what lies behind the camera is cut off
 _BACKGROUND = 96
-_RED, _GREEN, _BLUE = (0, 0, 255), (0, 255, 0), (255, 0, 0)
+AXIS_COLOURS = (0, 0, 255), (0, 255, 0), (255, 0, 0)  # x red, y green, z blue, BGR
+_RED = AXIS_COLOURS[0]
 _YELLOW, _MAGENTA, _WHITE = (0, 255, 255), (255, 0, 255), (255, 255, 255)
 
 
+def tiled(tiles: Sequence[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "H W 3"]:
+    """Put tiles of one size into rows of at most four, the last one filled up with black."""
+    columns = min(_COLUMNS, len(tiles))
+    full = [*tiles, *[np.zeros_like(tiles[0])] * (-len(tiles) % columns)]
+    return np.vstack([np.hstack(full[i : i + columns]) for i in range(0, len(full), columns)])
+
+
 def overlay_sheet(sets: Sequence[ImageSet], box: Float[np.ndarray, "2 3"] | None) -> UInt8[np.ndarray, "H W 3"]:
-    """A row of tiles for each set, BGR: world axes (x red, y green, z blue), light (yellow), box (magenta).
+    """Draw a row of tiles for each set, BGR: world axes (x red, y green, z blue), light (yellow), box (magenta).
 
     Args:
         sets: splits of one set; of each, images from its whole length are shown.
@@ -51,11 +56,11 @@ def _tile(images: ImageSet, index: int, box: Float[np.ndarray, "2 3"] | None) ->
     camera = images.cameras[index].resized(_SIDE, _SIDE)
     middle = np.zeros(3) if box is None else box.mean(axis=0)
     if box is not None:
-        for a, b in _edges(box):
-            draw_line(bgr, camera, a, b, _MAGENTA, 1)
+        for a, b in combinations(product((0, 1), repeat=3), 2):
+            if sum(i != j for i, j in zip(a, b, strict=True)) == 1:  # corners of one edge
+                draw_line(bgr, camera, box[a, (0, 1, 2)], box[b, (0, 1, 2)], _MAGENTA, 1)
     length = 0.25 * float(np.linalg.norm(camera.T_world_camera.position - middle))
-    for axis, colour, letter in zip(np.eye(3), (_RED, _GREEN, _BLUE), "xyz", strict=True):
-        draw_line(bgr, camera, np.zeros(3), length * axis, colour, 2, letter)
+    _draw_axes(bgr, camera, length)
     draw_line(bgr, camera, middle, middle + length * images.light_directions[index], _YELLOW, 2, "light")
     draw_text(bgr, camera.name, (6, 16), _WHITE)
     if camera.T_world_camera.inverse().apply(middle)[2] <= 0:
@@ -63,11 +68,10 @@ def _tile(images: ImageSet, index: int, box: Float[np.ndarray, "2 3"] | None) ->
     return bgr
 
 
-def _edges(box: Float[np.ndarray, "2 3"]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The twelve edges: pairs of corners that differ in one coordinate."""
-    corners = list(product((0, 1), repeat=3))
-    pairs = [(a, b) for a, b in combinations(corners, 2) if sum(i != j for i, j in zip(a, b, strict=True)) == 1]
-    return [(box[a, (0, 1, 2)], box[b, (0, 1, 2)]) for a, b in pairs]
+def _draw_axes(bgr: UInt8[np.ndarray, "h w 3"], camera: Camera, length: float) -> None:
+    """Draw the world's axes at its origin [m]."""
+    for axis, colour, letter in zip(np.eye(3), AXIS_COLOURS, "xyz", strict=True):
+        draw_line(bgr, camera, np.zeros(3), length * axis, colour, 2, letter)
 
 
 def draw_line(
@@ -118,9 +122,6 @@ def draw_text(bgr: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int]
         cv2.putText(bgr, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, shade, 1, cv2.LINE_AA)
 
 
-# Masks of objects, drawn over an image.
-
-
 MASK_COLOURS = np.array(
     [
         [230, 85, 60],
@@ -137,7 +138,7 @@ MASK_COLOURS = np.array(
 
 
 def tint_masks(pixels: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "N h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """An image with the masks of N objects laid over it, half transparent, one colour each."""
+    """Return an image with the masks of N objects laid over it, half transparent, one colour each."""
     drawn = pixels.copy()
     for number, mask in enumerate(masks):
         colour = MASK_COLOURS[number % len(MASK_COLOURS)]
@@ -145,29 +146,22 @@ def tint_masks(pixels: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "N h 
     return drawn
 
 
-# Pictures of how an observation was understood: axes, workspace and masks, drawn into its images.
-
-
-_MOST_COLUMNS = 4
 _VIEW_SIDE = 384  # longer side of a tile: outlines and names need more pixels than most images have
 _AXIS_M = 0.1
 _HUES = (0.5, 0.83, 0.08, 0.42, 0.92, 0.58, 0.22, 0.75)  # of the objects; far from each other one after the other
 
 
 def observation_sheet(observation: Observation) -> UInt8[np.ndarray, "H W 3"]:
-    """A tile for each camera, BGR.
+    """Draw a tile for each camera, BGR.
 
     Each shows the world's axes at the table's centre, 10 cm long (x red, y green, z blue), the workspace's square of
     44 cm (white), the pusher's centre (yellow) and the outline of each mask in a colour of its object, with its name.
     """
-    tiles = [_view_tile(observation, view) for view in range(len(observation.cameras))]
-    columns = min(_MOST_COLUMNS, len(tiles))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+    return tiled([_view_tile(observation, view) for view in range(len(observation.cameras))])
 
 
 def object_colour(number: int) -> tuple[int, int, int]:
-    """The colour (BGR) of the outlines of an object, by its number in the observation."""
+    """Return the colour (BGR) of the outlines of an object, by its number in the observation."""
     red, green, blue = colorsys.hsv_to_rgb(_HUES[number % len(_HUES)], 0.9, 1.0)
     return round(255 * blue), round(255 * green), round(255 * red)
 
@@ -179,12 +173,14 @@ def _view_tile(observation: Observation, view: int) -> UInt8[np.ndarray, "h w 3"
     pixels = to_uint8(observation.images[view, ..., ::-1])
     bgr = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
     camera = observation.cameras[view].resized(*size)
-    _draw_workspace(bgr, camera)
+    angles = math.pi / 4 + math.pi / 2 * np.arange(4)
+    corners = math.sqrt(2) * WORKSPACE_HALF_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1)
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        draw_line(bgr, camera, a, b, _WHITE, 1)
     if observation.masks is not None:
         for number, name in enumerate(observation.names):
             draw_mask(bgr, observation.masks[view, number], name, object_colour(number))
-    for axis, colour, letter in zip(np.eye(3), (_RED, _GREEN, _BLUE), "xyz", strict=True):
-        draw_line(bgr, camera, np.zeros(3), _AXIS_M * axis, colour, 2, letter)
+    _draw_axes(bgr, camera, _AXIS_M)
     if observation.pusher is not None:
         up = np.array([0, 0, 0.02])
         draw_line(bgr, camera, observation.pusher - up, observation.pusher + up, _YELLOW, 2)
@@ -194,17 +190,10 @@ def _view_tile(observation: Observation, view: int) -> UInt8[np.ndarray, "h w 3"
     return bgr
 
 
-def _draw_workspace(bgr: UInt8[np.ndarray, "h w 3"], camera: Camera) -> None:
-    angles = math.pi / 4 + math.pi / 2 * np.arange(4)
-    corners = math.sqrt(2) * WORKSPACE_HALF_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1)
-    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        draw_line(bgr, camera, a, b, _WHITE, 1)
-
-
 def draw_mask(
     bgr: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "H W"], name: str, colour: tuple[int, int, int]
 ) -> None:
-    """The outline of a mask, and its name beside its top."""
+    """Draw the outline of a mask and its name beside its top, in place."""
     large = cv2.resize(mask.astype(np.uint8), bgr.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     if not large.any():
         return
@@ -218,5 +207,5 @@ def draw_mask(
 
 
 def _plain(name: str) -> str:
-    """What OpenCV's letters can write."""
+    """Return at most 40 characters, in the letters that OpenCV can write."""
     return name[:40].encode("ascii", "replace").decode()

@@ -1,23 +1,23 @@
-"""Unpacking a zip that somebody gave us, such as an image set or observation, without trusting anything in it."""
+"""Unpack a zip that somebody gave us, such as an image set or observation, without trusting anything in it."""
 
 from __future__ import annotations
 
+import contextlib
 import lzma
 import os
 import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.io.files import folder_at_once
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
+from osfcore.io.files import folder_at_once, writing
 
-# How many files a zip lists, counted before anybody parses the list: that takes memory and time for each.
-
+# The files that a zip lists are counted before the list is parsed: parsing takes memory and time for each.
 
 _END, _END64, _LOCATOR64, _ENTRY = b"PK\5\6", b"PK\6\6", b"PK\6\7", b"PK\1\2"
 _END_BYTES, _END64_BYTES, _LOCATOR64_BYTES, _ENTRY_BYTES = 22, 56, 20, 46
@@ -26,18 +26,10 @@ _BYTES_PER_FILE = 512  # that a list may have: a long path and what zip tools no
 _SMALL_DIRECTORY_BYTES = 1 << 16  # below this no list hurts
 
 
-@dataclass(frozen=True, slots=True)
-class _Directory:
-    """Where the list of files lies in an archive, in bytes."""
-
-    start: int
-    size: int
-
-
 def check_directory(archive: BinaryIO, max_files: int) -> None:
-    """Judge the list of files of a zip by its size and its length, whatever the archive says of them.
+    """Refuse a zip whose list of files is too large or too long, whatever the archive claims of it.
 
-    The list is sought where `zipfile` seeks it. What is damaged passes: `zipfile` refuses it.
+    The list is sought where `zipfile` seeks it. A damaged one passes here, for `zipfile` refuses it.
 
     Args:
         archive: a whole file, open for reading.
@@ -46,19 +38,20 @@ def check_directory(archive: BinaryIO, max_files: int) -> None:
     Raises:
         CorruptFile: if it is larger or longer, or if there are two.
     """
-    directory = _find(archive)
-    if directory is None or directory.start < 0:
+    start, size = _find_directory(archive)
+    if start < 0:
         return
     most = max(max_files * _BYTES_PER_FILE, _SMALL_DIRECTORY_BYTES)
-    if directory.size > most:
-        raise CorruptFile(archive.name, f"its list of files has {directory.size} bytes; at most {most} are read")
-    archive.seek(directory.start)
-    count = _entries(archive.read(directory.size))
+    if size > most:
+        raise CorruptFile(archive.name, f"its list of files has {size} bytes; at most {most} are read")
+    archive.seek(start)
+    count = _count_entries(archive.read(size))
     if count > max_files:
         raise CorruptFile(archive.name, f"it holds {count} files; at most {max_files} are unpacked")
 
 
-def _find(archive: BinaryIO) -> _Directory | None:
+def _find_directory(archive: BinaryIO) -> tuple[int, int]:
+    """Return where the list of files starts and how long it is [bytes]; the start is negative if there is none."""
     size = archive.seek(0, os.SEEK_END)
     archive.seek(max(size - _COMMENT_BYTES - _END_BYTES, 0))
     tail = archive.read()
@@ -66,13 +59,14 @@ def _find(archive: BinaryIO) -> _Directory | None:
     place = tail.rfind(_END) if has_comment else len(tail) - _END_BYTES
     record = tail[place : place + _END_BYTES]
     if place < 0 or len(record) < _END_BYTES:
-        return None
+        return -1, 0
     end = size - len(tail) + place
-    return _find64(archive, end) or _before(end, struct.unpack_from("<12xL", record)[0])
+    length = struct.unpack_from("<12xL", record)[0]
+    return _find_large_directory(archive, end) or (end - length, length)
 
 
-def _find64(archive: BinaryIO, end: int) -> _Directory | None:
-    """The list that the records for large archives tell of, if there are any before the end record."""
+def _find_large_directory(archive: BinaryIO, end: int) -> tuple[int, int] | None:
+    """Return start and length [bytes] by the records for large archives, if there are any before the end record."""
     place = end - _LOCATOR64_BYTES - _END64_BYTES
     if place < 0:
         return None
@@ -80,20 +74,19 @@ def _find64(archive: BinaryIO, end: int) -> _Directory | None:
     record, locator = archive.read(_END64_BYTES), archive.read(_LOCATOR64_BYTES)
     if locator[:4] != _LOCATOR64:
         return None
-    told = struct.unpack_from("<8xQ", locator)[0]
-    if told < place:  # versions of `zipfile` differ in which of two records they believe
-        archive.seek(told)
+    claimed = struct.unpack_from("<8xQ", locator)[0]
+    if claimed < place:  # versions of `zipfile` differ in which of two records they believe
+        archive.seek(claimed)
         if archive.read(4) == _END64:
             raise CorruptFile(archive.name, "it holds two lists of its files")
-    return _before(place, struct.unpack_from("<40xQ", record)[0]) if record[:4] == _END64 else None
+    if record[:4] != _END64:
+        return None
+    length = struct.unpack_from("<40xQ", record)[0]
+    return place - length, length
 
 
-def _before(end: int, size: int) -> _Directory:
-    return _Directory(end - size, size)
-
-
-def _entries(data: bytes) -> int:
-    """How many entries stand one behind the other."""
+def _count_entries(data: bytes) -> int:
+    """Return how many entries stand one behind the other."""
     count = place = 0
     while len(data) - place >= _ENTRY_BYTES and data.startswith(_ENTRY, place):
         place += _ENTRY_BYTES + sum(struct.unpack_from("<28xHHH", data, place))
@@ -115,10 +108,10 @@ class ArchiveKind:
     """What an archive may hold.
 
     Attributes:
-        what: it is called.
-        marker: a file that tells where in the archive it lies.
+        what: its name in messages.
+        marker: a file by which its place in the archive is found.
         kept: the folders that belong to it; all that lies beside the marker if empty.
-        expected: what was to be given, for people.
+        expected: what should have been given, for messages.
         max_depth: of folders in it.
     """
 
@@ -140,8 +133,8 @@ _OBSERVATION = ArchiveKind(
 def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
     """Unpack the train and test folders of an image set as `out`/train and `out`/test; in the zip they may lie deeper.
 
-    Everything is looked at before anything is written, and `out` appears only when all is there. The set itself is not
-    judged: `read_splits` does that.
+    Everything is looked at before anything is written, and `out` appears only when all is there. `read_splits` checks
+    the set itself.
 
     Args:
         archive: a .zip file.
@@ -161,22 +154,7 @@ def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_file
 
 
 def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
-    """Unpack an observation folder, under the same guards; `osfcore.io.observation_file` judges it.
-
-    Args:
-        archive: a .zip file.
-        out: folder to write; must not exist or be empty.
-        max_bytes: of the unpacked archive.
-        max_files: in the archive.
-
-    Returns:
-        `out`, the folder that holds observation.json.
-
-    Raises:
-        CorruptFile: if it is no zip, damaged, locked, a bomb, holds no observation, or leads elsewhere.
-        InvalidInput: if `out` is there and not empty.
-        CannotWrite: if the disk is full or cannot be written.
-    """
+    """Unpack an observation folder, as `unpack_set` does a set; `osfcore.io.observation_file` checks it."""
     return unpack(archive, out, _OBSERVATION, max_bytes, max_files)
 
 
@@ -186,15 +164,25 @@ def check_zip(archive: Path, max_files: int = MAX_FILES) -> None:
     Raises:
         CorruptFile: if it is no zip archive, or holds more than `max_files` files.
     """
+    with _opened(Path(archive), max_files):
+        pass
+
+
+@contextlib.contextmanager
+def _opened(archive: Path, max_files: int) -> Iterator[zipfile.ZipFile]:
+    """Open a zip whose list of files is not too long, and raise damage that is found in it as `CorruptFile`."""
     try:
-        with Path(archive).open("rb") as raw:
+        with archive.open("rb") as raw:
             check_directory(raw, max_files)
-            zipfile.ZipFile(raw).close()
+            with zipfile.ZipFile(raw) as file:
+                yield file
+    except OsfError:  # these are ValueErrors, too
+        raise
+    except FileNotFoundError as error:
+        raise CorruptFile(archive, "there is no such file") from error
     except _DAMAGE as error:
-        if isinstance(error, CorruptFile):
-            raise
         raise CorruptFile(archive, "it is no zip archive or a damaged one") from error
-    except (RuntimeError, NotImplementedError) as error:
+    except RuntimeError as error:
         raise CorruptFile(archive, "it is packed in a way that cannot be read; a plain zip is expected") from error
 
 
@@ -219,28 +207,18 @@ def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYT
     archive, out = Path(archive), Path(out).absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InvalidInput("output folder", out, "new or empty")
-    try:
-        with archive.open("rb") as raw:
-            check_directory(raw, max_files)
-            with zipfile.ZipFile(raw) as file:
-                members = _members(archive, file, kind, max_bytes)
-                wanted = _wanted(archive, members, kind)
-                _write(archive, file, wanted, out)
-    except FileNotFoundError as error:
-        raise CorruptFile(archive, "there is no such file") from error
-    except _DAMAGE as error:
-        if isinstance(error, CorruptFile | CannotWrite):  # these are ValueErrors, too
-            raise
-        raise CorruptFile(archive, "it is no zip archive or a damaged one") from error
-    except (RuntimeError, NotImplementedError) as error:
-        raise CorruptFile(archive, "it is packed in a way that cannot be read; a plain zip is expected") from error
+    with _opened(archive, max_files) as file:
+        wanted = _wanted(archive, _members(archive, file, kind, max_bytes), kind)
+        with folder_at_once(out) as partial:
+            for path, info in wanted.items():
+                _extract(archive, file, info, partial / path, out)
     return out
 
 
 def _members(
     archive: Path, file: zipfile.ZipFile, kind: ArchiveKind, max_bytes: int
 ) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """The plain files of an archive by their path, all of which lead inside."""
+    """Return the plain files of an archive by their path, all of which lead inside."""
     infos = file.infolist()
     size = sum(info.file_size for info in infos)
     if size > max_bytes:
@@ -282,7 +260,7 @@ def _safe_path(archive: Path, info: zipfile.ZipInfo, max_depth: int) -> PurePosi
 def _wanted(
     archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: ArchiveKind
 ) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """What lies beside the file that marks the place and is to be kept, by its path from there."""
+    """Return what lies beside the marker and is to be kept, by its path from there."""
     depth = len(kind.marker.parts)
     roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == kind.marker]
     if not roots:
@@ -295,27 +273,16 @@ def _wanted(
     return {path: info for path, info in inside.items() if not kind.kept or path.parts[0] in kind.kept}
 
 
-def _write(archive: Path, file: zipfile.ZipFile, wanted: Mapping[PurePosixPath, zipfile.ZipInfo], out: Path) -> None:
-    """Write the files, all or none."""
-    with folder_at_once(out) as partial:
-        for path, info in wanted.items():
-            _extract(archive, file, info, partial / path, out)
-
-
 def _extract(archive: Path, file: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, out: Path) -> None:
     size = 0
     with file.open(info) as source:
-        try:
+        with writing(out):
             target.parent.mkdir(parents=True, exist_ok=True)
             sink = target.open("xb")
-        except OSError as error:
-            raise CannotWrite(out, error.strerror or str(error)) from error
         with sink:
             while chunk := source.read(_CHUNK_BYTES):
                 size += len(chunk)
                 if size > info.file_size:  # sizes in the directory of an archive are mere claims
                     raise CorruptFile(archive, f"{info.filename[:100]!r} is larger than it claims to be")
-                try:
+                with writing(out):
                     sink.write(chunk)
-                except OSError as error:
-                    raise CannotWrite(out, error.strerror or str(error)) from error

@@ -1,4 +1,4 @@
-"""Checkpoints of trainings in PyTorch, and parameters of networks in safetensors files; both checked when read."""
+"""Checkpoints of trainings in PyTorch, and parameters of networks in safetensors files; both are checked when read."""
 
 from __future__ import annotations
 
@@ -15,12 +15,8 @@ from torch import Tensor, nn
 from osfcore.errors import CorruptFile, shown
 from osfcore.io.files import write_atomically
 
-# Checkpoints of trainings in PyTorch: written whole, and gone on from by the same run alone.
-#
-# A checkpoint that is missing, cut short or of another run lets a training start over. One of this run that cannot
-# be taken over ends it: a run restored by half would learn something else, and starting over would lose the work
-# unasked.
-
+# A training starts over where its checkpoint is missing, cut short or of another run. A checkpoint of the same run
+# that cannot be restored ends it: a run restored by half would learn something else, and starting over would lose work.
 
 _MOST_CHARACTERS = 100  # of what PyTorch says
 
@@ -42,7 +38,7 @@ def write_checkpoint(path: Path, fingerprint: object, content: Mapping[str, Any]
 
 
 def read_content(path: Path, fingerprint: object) -> dict[str, Any] | None:
-    """What a run has written to go on, in main memory; None if it is missing, cut short or of another run.
+    """Return what a run has written to go on, in main memory; None if missing, cut short or of another run.
 
     Raises:
         CorruptFile: if there is a file, but it cannot be read at all.
@@ -64,18 +60,18 @@ def read_content(path: Path, fingerprint: object) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def going_on_from(path: Path) -> Iterator[None]:
-    """Tell in one sentence that a checkpoint of this run cannot be taken over.
+    """Raise whatever goes wrong while a checkpoint of this run is restored as `CorruptFile`.
 
     Raises:
-        CorruptFile: for whatever is raised while that is tried, other than a lack of memory.
+        CorruptFile: for any error other than a lack of memory.
     """
     try:
         yield
     except (MemoryError, torch.OutOfMemoryError):
         raise
     except Exception as error:
-        told = f"{type(error).__name__}: {error}".splitlines()[0][:_MOST_CHARACTERS]
-        reason = f"the training cannot go on from it ({told}); delete it to start over, or write to another file"
+        cause = f"{type(error).__name__}: {error}".splitlines()[0][:_MOST_CHARACTERS]
+        reason = f"the training cannot go on from it ({cause}); delete it to start over, or write to another file"
         raise CorruptFile(path, reason) from error
 
 
@@ -85,10 +81,10 @@ def resume_from(path: Path, fingerprint: object, restore: Callable[[dict[str, An
     Args:
         path: of the file.
         fingerprint: must be that of the checkpoint.
-        restore: takes over the content, which lies in main memory.
+        restore: gets the content, which lies in main memory.
 
     Raises:
-        CorruptFile: if the checkpoint cannot be read, or taken over; what `restore` was to change is then of no use.
+        CorruptFile: if the checkpoint cannot be read or restored; what `restore` was to change is then of no use.
     """
     content = read_content(path, fingerprint)
     if content is not None:
@@ -96,11 +92,8 @@ def resume_from(path: Path, fingerprint: object, restore: Callable[[dict[str, An
             restore(content)
 
 
-# Parameters of networks in safetensors files, checked when read.
-
-
 def read_parameters(path: Path, expected: str, what: str) -> tuple[Mapping[str, str], dict[str, Tensor]]:
-    """Metadata and finite parameters of a file of the expected format.
+    """Return metadata and finite parameters of a safetensors file of the expected format.
 
     Args:
         path: of the file.

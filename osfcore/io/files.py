@@ -1,23 +1,26 @@
-"""Files that are whole or not there, and JSON that is told apart from what it should be.
+"""Write files that are whole or not there, and read JSON with its errors as one sentence.
 
 A rename alone is not enough: after a power failure the disk may have kept the new name and lost what was written under
-it, or the other way round. So contents are on the disk before they take their name, and the name is before anybody is
-told that they are there.
+it, or the other way round. So contents are synced before they take their name, and the name is synced before the
+caller goes on.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import json
 import os
 import secrets
 import shutil
 import struct
+import tempfile
+import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 from PIL import Image
 
@@ -26,6 +29,15 @@ from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, sho
 MAX_JSON_BYTES = 16_000_000
 _PNG_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 T = TypeVar("T")
+
+
+@contextlib.contextmanager
+def writing(place: Path) -> Iterator[None]:
+    """Raise what the disk refuses as `CannotWrite` of a place."""
+    try:
+        yield
+    except OSError as error:
+        raise CannotWrite(place, error.strerror or str(error)) from error
 
 
 def sync(path: Path) -> None:
@@ -46,7 +58,7 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(made: Path) -> None:
-    """Wait likewise for a file, or for a folder with all that is in it."""
+    """Wait until a file, or a folder with all that is in it, is on the disk."""
     for folder, _, names in os.walk(made):
         for name in names:
             sync(Path(folder, name))
@@ -67,7 +79,7 @@ def put_in_place(made: Path, place: Path) -> None:
 
 @contextlib.contextmanager
 def file_at_once(path: Path) -> Iterator[Path]:
-    """A new file beside `path` to fill, which takes that name only when it is whole; then it outlives a power failure.
+    """Give a new file beside `path` to fill, which takes that name only when it is whole and on the disk.
 
     Any number of threads and processes may write to the same path: each has a file of its own, and the last one stays.
 
@@ -77,18 +89,17 @@ def file_at_once(path: Path) -> Iterator[Path]:
     """
     partial = _beside(path)
     try:
-        partial.open("xb").close()  # with the rights that any new file has
-        yield partial
-        _rename(partial, path)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+        with writing(path):
+            partial.open("xb").close()  # with the rights that any new file has
+            yield partial
+            _rename(partial, path)
     finally:
         with contextlib.suppress(OSError):  # where nothing could be written, there may be no folder either
             partial.unlink(missing_ok=True)
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write bytes to a file in the same way, and make its folder if there is none.
+    """Write bytes by `file_at_once`, and make the folder if there is none.
 
     Raises:
         CannotWrite: if the disk refuses; what was there before is untouched.
@@ -99,7 +110,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file in the same way.
+    """Write a JSON file by `write_atomically`.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -109,9 +120,9 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def folder_at_once(out: Path) -> Iterator[Path]:
-    """A folder beside `out` to fill, which takes that name (an empty folder's too) only when everything is there.
+    """Give a folder beside `out` to fill, which takes that name only when everything is there and on the disk.
 
-    Then it outlives a power failure. Errors of whoever fills it pass as they are.
+    `out` may be an empty folder. Errors of whoever fills it pass as they are.
 
     Raises:
         CannotWrite: if the disk refuses the folder.
@@ -121,23 +132,61 @@ def folder_at_once(out: Path) -> Iterator[Path]:
     _make_folder(partial, out)
     try:
         yield partial
-        try:
+        with writing(out):
             _rename(partial, out)
-        except OSError as error:
-            raise CannotWrite(out, error.strerror or str(error)) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def scratch_folder(parent: Path, prefix: str, life_s: float) -> Iterator[Path]:
+    """Give a folder inside `parent` that is gone afterwards.
+
+    Args:
+        parent: made if it is not there.
+        prefix: of the folder's name.
+        life_s: folders of this prefix that have not changed for so long were left by a killed process, and go too [s].
+    """
+    parent.mkdir(parents=True, exist_ok=True)
+    for path in parent.glob(f"{prefix}*"):
+        with contextlib.suppress(OSError):  # another process may be removing it, too
+            if time.time() - path.stat().st_mtime > life_s:
+                shutil.rmtree(path, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def replace_folder(made: Path, place: Path) -> None:
+    """Put a folder in place of an older one, if there is one; on return it outlives a power failure.
+
+    Several processes may put a folder there at the same time; the last one stays. What was there is moved beside
+    `made`, for the caller to delete.
+
+    Raises:
+        OSError: if the disk refuses.
+    """
+    sync_tree(made)
+    for attempt in itertools.count():
+        try:
+            made.rename(place)
+            break
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise
+        with contextlib.suppress(FileNotFoundError):
+            place.rename(made.with_name(f"old{attempt}"))
+    sync(place.parent)
+
+
 def _make_folder(folder: Path, wanted: Path) -> None:
     """Make a folder, and those around it, for what is wanted."""
-    if folder.is_dir():
-        return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        sync(folder.parent)
-    except OSError as error:
-        raise CannotWrite(wanted, error.strerror or str(error)) from error
+    if not folder.is_dir():
+        with writing(wanted):
+            folder.mkdir(parents=True, exist_ok=True)
+            sync(folder.parent)
 
 
 def _rename(made: Path, place: Path) -> None:
@@ -148,12 +197,12 @@ def _rename(made: Path, place: Path) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """A name that nobody else takes, in the same folder."""
+    """Return a name that nobody else takes, in the same folder."""
     return path.parent / f".{path.name}.{secrets.token_hex(6)}"
 
 
 def read_json(path: Path, parse: Callable[[object], T]) -> T:
-    """What `parse` makes of a JSON file.
+    """Return what `parse` makes of a JSON file.
 
     Raises:
         CorruptFile: if it cannot be read, is not JSON, or `parse` raises an OsfError; the message says why.
@@ -181,7 +230,7 @@ def read_json(path: Path, parse: Callable[[object], T]) -> T:
 
 
 def as_mapping(data: object) -> dict[str, Any]:
-    """Parsed JSON that is an object.
+    """Return parsed JSON that is an object.
 
     Raises:
         InvalidInput: if it is something else.
@@ -200,9 +249,22 @@ def is_text(name: str) -> bool:
     return True
 
 
+def is_file_name(name: object) -> TypeGuard[str]:
+    """Whether a value of a file can be the name of a file at all."""
+    return isinstance(name, str) and bool(name) and "\0" not in name and is_text(name)
+
+
+def leads_out(folder: Path, path: Path) -> bool:
+    """Whether a path is a link that leads out of a folder."""
+    try:
+        return not path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # loops of links and names that are too long lead nowhere
+        return False
+
+
 @contextlib.contextmanager
 def reading_png(path: Path, reason: str) -> Iterator[None]:
-    """Whatever an image library makes of a damaged PNG becomes one sentence.
+    """Raise whatever an image library makes of a damaged PNG as `CorruptFile`.
 
     Raises:
         CorruptFile: with the reason, for all that reading raises, other than a `CorruptFile` itself.
@@ -211,13 +273,5 @@ def reading_png(path: Path, reason: str) -> Iterator[None]:
         yield
     except OsfError:
         raise
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        struct.error,
-        zlib.error,
-        Image.DecompressionBombError,
-    ) as error:
+    except _PNG_ERRORS as error:
         raise CorruptFile(path, reason) from error

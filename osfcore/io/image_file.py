@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -12,18 +13,26 @@ from osfcore.io.files import write_atomically
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Values in [0, 1] as 8 bit."""
+    """Return values in [0, 1] as 8 bit."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def encode_png(image: UInt8[np.ndarray, "h w *channels"]) -> bytes:
-    """An RGB or grey image as PNG."""
+    """Return an RGB or grey image as PNG."""
     return _encoded(image, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 3])
 
 
 def encode_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """An RGB image as JPEG of quality 85."""
+    """Return an RGB image as JPEG of quality 85."""
     return _encoded(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def png_header(path: Path) -> tuple[int, int, int, int] | None:
+    """Return width and height [px], bits of a channel and colour type of a PNG, or None for another file."""
+    with path.open("rb") as file:
+        head = file.read(26)
+    is_png = len(head) == 26 and head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR"
+    return struct.unpack(">IIBB", head[16:]) if is_png else None
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:

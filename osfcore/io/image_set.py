@@ -1,4 +1,4 @@
-"""Image sets in the OSF format: reading them, and finding what is wrong with them before anything learns from it.
+"""Read image sets in the OSF format, and find what is wrong with them before anything learns from them.
 
 Layout: DIR/{train,test}/anno.json, a list of dicts (`filename`, `RT` 3 x 4 world-to-camera in OpenCV axes, `K` 3 x 3
 [px], `light_pos` 3-vector in the world, optionally `resolution`), with 8-bit RGBA PNGs beside it. Further keys and
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,14 +22,14 @@ from PIL import Image
 from osfcore.errors import CorruptFile, InvalidInput, shown
 from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, Camera
 from osfcore.geometry.poses import Pose
-from osfcore.io.files import is_text, reading_png
+from osfcore.io.files import is_file_name, leads_out, reading_png
+from osfcore.io.image_file import png_header
 
 MIN_SPLIT = {"train": 8, "test": 1}  # fewer views leave an object unknown; without a test image no metric is honest
 MAX_IMAGES = 20_000
 MAX_ANNOTATION_BYTES = 64_000_000
 MAX_SPLIT_BYTES = 1 << 30  # of decoded images: both splits and the training itself stay below 4 GB
 OPAQUE = 128  # alpha from which a pixel counts as the object's
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RIGID_TOLERANCE = 1e-3
 _MAX_NUMBER = 1e9  # in any unit of length a set may have
 Split = Literal["train", "test"]
@@ -65,7 +65,7 @@ class ImageSet:
     rgba: UInt8[np.ndarray, "n h w 4"]
 
     def digest(self) -> str:
-        """Tells this split from any other: of its pixels, cameras and lights."""
+        """Return a hash of pixels, cameras and lights, which differs for any other split."""
         digest = hashlib.blake2b(np.ascontiguousarray(self.rgba).tobytes(), digest_size=16)
         digest.update(repr(self.rgba.shape).encode())
         for camera in self.cameras:
@@ -75,12 +75,12 @@ class ImageSet:
 
     @property
     def is_opaque(self) -> bool:
-        """Whether no image has a silhouette: so it is with the bare table."""
+        """Whether no image has a silhouette, as in images of the bare table."""
         return bool(np.all(self.rgba[..., 3] == 255))
 
 
 def read_annotations(folder: Path, split: str) -> tuple[AnnotatedImage, ...]:
-    """The images of one split, each of which was decoded and found sound.
+    """Return the images of one split, after each was decoded and found sound.
 
     Raises:
         CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
@@ -89,7 +89,7 @@ def read_annotations(folder: Path, split: str) -> tuple[AnnotatedImage, ...]:
 
 
 def read_image_set(folder: Path, split: Split) -> ImageSet:
-    """One split with its pixels. `read_splits` also compares the two.
+    """Return one split with its pixels. `read_splits` also compares the two.
 
     Raises:
         CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
@@ -97,12 +97,16 @@ def read_image_set(folder: Path, split: Split) -> ImageSet:
     images, pixels = zip(*_images(Path(folder), split), strict=True)
     lights = np.array([image.light_direction for image in images], np.float32)
     rgba = np.stack(pixels)
-    _refuse_lost_alpha(Path(folder) / split, images, rgba)
+    opaque = np.all(rgba[..., 3] == 255, axis=(1, 2))
+    if opaque.any() and not opaque.all():
+        place = images[int(np.argmax(opaque))].path if opaque.sum() * 2 < len(opaque) else Path(folder) / split
+        expected = "either all images have a silhouette (an object) or all are opaque (the table)"
+        raise CorruptFile(place, f"{opaque.sum()} of {len(opaque)} images are opaque all over; {expected}")
     return ImageSet(tuple(image.camera for image in images), lights, rgba)
 
 
 def read_splits(folder: Path) -> tuple[ImageSet, ImageSet]:
-    """The train and the test images of a set, of which no image is in both.
+    """Return the train and the test images of a set; no image is in both.
 
     Raises:
         CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
@@ -140,9 +144,8 @@ def _images(folder: Path, split: str) -> Iterator[tuple[AnnotatedImage, UInt8[np
             limit = f"at most {MAX_SPLIT_BYTES >> 20} MiB are read; take smaller or fewer images"
             raise CorruptFile(path, f"its {len(entries)} images of {width} x {height} px are too many: {limit}")
         if rgba[..., 3].max() < OPAQUE:
-            raise CorruptFile(
-                image_path, "its mask is empty: it has no opaque pixel, so the object cannot be seen in it"
-            )
+            reason = "its mask is empty: it has no opaque pixel, so the object cannot be seen in it"
+            raise CorruptFile(image_path, reason)
         yield _annotated(path, number, entry, image_path, (width, height)), rgba
 
 
@@ -170,34 +173,27 @@ def _entries(folder: Path, split: str, path: Path) -> list[Any]:
 
 
 def _image_path(folder: Path, path: Path, number: int, entry: Mapping[str, Any]) -> Path:
-    """Where the image of an entry lies, which is inside the set, whatever the name says."""
+    """Return the path of the image of an entry; refuse names that lead out of the set."""
     name = entry.get("filename")
-    if not isinstance(name, str) or not name or "\0" in name or not is_text(name):
+    if not is_file_name(name):
         raise CorruptFile(path, f"entry {number} lacks or garbles filename, the name of its PNG")
     place = f"entry {number} names {shown(repr(name))}"
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise CorruptFile(path, f"{place}; a file name without '..', relative to anno.json, is expected")
     image = path.parent / name
-    try:
-        is_inside = image.resolve().is_relative_to(folder.resolve())
-        is_there = image.is_file()
-    except (OSError, RuntimeError):  # loops of links, names that are too long
-        is_inside, is_there = True, False
-    if not is_inside:
+    if leads_out(folder, image):
         raise CorruptFile(path, f"{place}, a link that leads out of the set; images inside it are expected")
-    if not is_there:
+    if not os.path.isfile(image):
         reason = f"there is no readable PNG of that name, but entry {number} of {path.name} asks for it"
         raise CorruptFile(path.parent / shown(name), reason)
     return image
 
 
 def _read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
-    """The pixels of a PNG; its header is judged before anything is decoded."""
+    """Return the pixels of a PNG; its header is checked before anything is decoded."""
     with reading_png(path, "it is no readable PNG: truncated, damaged or of another kind"):
-        with path.open("rb") as file:
-            head = file.read(24)
-        if head.startswith(_PNG_SIGNATURE) and head[12:16] == b"IHDR":  # Pillow names no size when it refuses one
-            _check_sides(path, struct.unpack(">II", head[16:]))
+        if header := png_header(path):  # Pillow names no size when it refuses one
+            _check_sides(path, header[:2])
         with Image.open(path, formats=["PNG"]) as image:
             _check_sides(path, image.size)
             if image.mode != "RGBA":
@@ -220,8 +216,8 @@ def _refuse_other_size(path: Path, number: int, entry: Mapping[str, Any], size: 
     if len(sides) != 2 or not all(isinstance(s, int | float) and not isinstance(s, bool) for s in sides):
         raise CorruptFile(path, f"resolution of entry {number} is not one side or [width, height] in pixels")
     if tuple(sides) != size:
-        told = shown(f"{sides[0]} x {sides[1]}")
-        reason = f"it is {size[0]} x {size[1]} px, but resolution of entry {number} says {told}"
+        claimed = shown(f"{sides[0]} x {sides[1]}")
+        reason = f"it is {size[0]} x {size[1]} px, but resolution of entry {number} says {claimed}"
         raise CorruptFile(path.parent / shown(entry["filename"]), reason)
 
 
@@ -257,16 +253,8 @@ def _numbers(path: Path, where: str, entry: Mapping[str, Any], key: str, shape: 
     return array
 
 
-def _refuse_lost_alpha(folder: Path, images: tuple[AnnotatedImage, ...], rgba: UInt8[np.ndarray, "n h w 4"]) -> None:
-    opaque = np.all(rgba[..., 3] == 255, axis=(1, 2))
-    if opaque.any() and not opaque.all():
-        image = images[int(np.argmax(opaque))].path if opaque.sum() * 2 < len(opaque) else folder
-        expected = "either all images have a silhouette (an object) or all are opaque (the table)"
-        raise CorruptFile(image, f"{opaque.sum()} of {len(opaque)} images are opaque all over; {expected}")
-
-
 def _refuse_leaks(folder: Path, train: ImageSet, test: ImageSet) -> None:
-    """Refuse a test image that is also a training one: what is measured on it would be a lie.
+    """Refuse a test image that is also a training one: a figure measured on it would mean nothing.
 
     Pixels are compared, so a copy that was encoded anew is found, too. Two pictures of the bare table from one place
     can be equal under different lights; there the view and the light must agree as well.

@@ -1,4 +1,4 @@
-"""Observation folders: what cameras and robot report at one instant, as files that anybody can write.
+"""Read and write observation folders: what cameras and robot report at one instant.
 
 Layout: DIR/observation.json beside 8-bit PNGs.
 
@@ -11,7 +11,7 @@ Images are RGB, linear radiance as value / 255. Masks have a single channel, in 
 
 from __future__ import annotations
 
-import struct
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,16 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 from pydantic import Field, FiniteFloat
 
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, UnknownName, finite_vector, shown
+from osfcore.errors import CorruptFile, InvalidInput, UnknownName, finite_vector, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import MAX_OBJECTS, Observation
-from osfcore.io.files import is_text, read_json, reading_png, write_json
-from osfcore.io.image_file import encode_png, to_uint8
+from osfcore.io.files import is_file_name, leads_out, read_json, reading_png, write_json, writing
+from osfcore.io.image_file import encode_png, png_header, to_uint8
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.scene_file import CameraJson, PointJson, camera_to_json
 
 OBSERVATION_FILE = "observation.json"
 MAX_CAMERAS = 32  # keeps a whole observation below a gigabyte
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB, _RGBA = 0, 2, 6  # colour types of PNG
 _MASK_LEVEL = 127
 
@@ -40,7 +39,7 @@ class ObservationJson(Entry):
     """What observation.json holds."""
 
     cameras: list[CameraJson]
-    images: dict[str, Any]  # `_inside` looks at the names of files
+    images: dict[str, Any]  # `_inside` checks the names of files
     objects: list[Text]
     masks: dict[str, dict[str, Any]] | None = None
     pusher: PointJson | None = None
@@ -53,7 +52,7 @@ def is_observation(path: Path) -> bool:
 
 
 def read_observation(folder: Path) -> Observation:
-    """The observation in a folder.
+    """Return the observation in a folder.
 
     Raises:
         CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
@@ -68,8 +67,8 @@ def read_observation(folder: Path) -> Observation:
 def write_observation(folder: Path, observation: Observation) -> None:
     """Write an observation; the folder counts as one only when everything is there.
 
-    Images are written through to the disk by whoever puts the folder in place (see `osfcore.io.files`): one by one that
-    would take longer than rendering them, and many a folder only brings them from one process to another.
+    Images are not synced here, but by whoever puts the folder in place (see `osfcore.io.files`): one by one that would
+    take longer than rendering them, and many a folder only brings them from one process to another.
 
     Raises:
         InvalidInput: if arrays, cameras and names do not fit each other.
@@ -77,44 +76,34 @@ def write_observation(folder: Path, observation: Observation) -> None:
     """
     _check(observation)
     folder = Path(folder)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / OBSERVATION_FILE).unlink(missing_ok=True)  # an older one would describe a mixture
         content = _write_images(folder, observation)
-    except OSError as error:
-        raise CannotWrite(folder, error.strerror or str(error)) from error
     write_json(folder / OBSERVATION_FILE, content)
 
 
 def _write_images(folder: Path, observation: Observation) -> dict[str, Any]:
-    """Write images and masks; return what tells of them and of the rest."""
-    content: dict[str, Any] = {
+    """Write images and masks that are not empty; return the content of observation.json."""
+    images, masks = {}, {}
+    for view, camera in enumerate(observation.cameras):
+        images[camera.name] = f"image_{view}.png"
+        (folder / images[camera.name]).write_bytes(encode_png(to_uint8(observation.images[view])))
+        if observation.masks is None:
+            continue
+        files = masks[camera.name] = {}
+        for number, (name, mask) in enumerate(zip(observation.names, observation.masks[view], strict=True)):
+            if mask.any():
+                files[name] = f"mask_{view}_{number}.png"
+                (folder / files[name]).write_bytes(encode_png(mask.astype(np.uint8) * 255))
+    return {
         "cameras": [camera_to_json(camera) for camera in observation.cameras],
-        "images": {},
+        "images": images,
         "objects": list(observation.names),
         "pusher": None if observation.pusher is None else {"position": observation.pusher.tolist()},
         "time_s": float(observation.time_s),
+        **({} if observation.masks is None else {"masks": masks}),
     }
-    for view, camera in enumerate(observation.cameras):
-        content["images"][camera.name] = f"image_{view}.png"
-        (folder / f"image_{view}.png").write_bytes(encode_png(to_uint8(observation.images[view])))
-    if observation.masks is not None:
-        content["masks"] = _write_masks(folder, observation, observation.masks)
-    return content
-
-
-def _write_masks(
-    folder: Path, observation: Observation, masks: Bool[np.ndarray, "V N h w"]
-) -> dict[str, dict[str, str]]:
-    """Write what is not empty; return the names of the files."""
-    files: dict[str, dict[str, str]] = {}
-    for view, camera in enumerate(observation.cameras):
-        seen = [number for number in range(len(observation.names)) if masks[view, number].any()]
-        files[camera.name] = {observation.names[number]: f"mask_{view}_{number}.png" for number in seen}
-        for number in seen:
-            mask = masks[view, number].astype(np.uint8) * 255
-            (folder / f"mask_{view}_{number}.png").write_bytes(encode_png(mask))
-    return files
 
 
 def _check(observation: Observation) -> None:
@@ -201,21 +190,14 @@ def _read_masks(
 
 
 def _inside(folder: Path, file: object, what: str) -> Path:
-    """Where a file that observation.json names lies: inside the folder, whatever the name says."""
+    """Return the path of a file that observation.json names; refuse names that lead out of the folder."""
     allowed = "a file name without '..', relative to the folder"
-    if not isinstance(file, str) or not file or "\0" in file or not is_text(file):
-        raise InvalidInput(what, shown(repr(file)), allowed)
-    if Path(file).is_absolute() or ".." in Path(file).parts or "\\" in file:
+    if not is_file_name(file) or Path(file).is_absolute() or ".." in Path(file).parts or "\\" in file:
         raise InvalidInput(what, shown(repr(file)), allowed)
     path = folder / file
-    try:
-        is_inside = path.resolve().is_relative_to(folder.resolve())
-        is_there = path.is_file()
-    except (OSError, RuntimeError):  # loops of links, names that are too long
-        is_inside, is_there = True, False
-    if not is_inside:
+    if leads_out(folder, path):
         raise InvalidInput(what, shown(repr(file)), "inside the folder, not a link that leads out of it")
-    if not is_there:
+    if not os.path.isfile(path):
         raise CorruptFile(folder / shown(file), f"there is no such file, but {OBSERVATION_FILE} names it as {what}")
     return path
 
@@ -223,16 +205,15 @@ def _inside(folder: Path, file: object, what: str) -> Path:
 def _read_png(
     path: Path, camera: Camera, kinds: Mapping[int, tuple[int, ...]], expected: str
 ) -> UInt8[np.ndarray, "h w *c"]:
-    """The pixels of a PNG; its header is judged before anything is decoded.
+    """Return the pixels of a PNG; its header is checked before anything is decoded.
 
-    Pillow would turn 16 bits into 8 and hand out a palette's indices without a word, so the header itself is asked.
+    Pillow alone would turn 16 bits into 8, and return a palette's indices, without an error.
     """
     with reading_png(path, "it is no readable PNG: truncated or damaged"):
-        with path.open("rb") as file:
-            head = file.read(26)
-        if len(head) < 26 or not head.startswith(_PNG_SIGNATURE) or head[12:16] != b"IHDR":
+        header = png_header(path)
+        if header is None:
             raise CorruptFile(path, "it is no PNG")
-        width, height, depth, colour = struct.unpack(">IIBB", head[16:])
+        width, height, depth, colour = header
         if (width, height) != (camera.width, camera.height):
             wanted = f"{camera.width} x {camera.height} px as camera {shown(camera.name)}"
             raise CorruptFile(path, f"it is {width} x {height} px; {wanted} is expected")

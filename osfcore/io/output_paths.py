@@ -1,18 +1,17 @@
-"""Trying an output place before long work begins: what cannot be written, or must not be, is told at once."""
+"""Refuse output places that cannot or must not be written, before long work begins."""
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from collections.abc import Collection
 from pathlib import Path
 
-from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.errors import CannotWrite, InvalidInput, OsfError
+from osfcore.io.files import as_mapping, read_json, writing
 
 SUFFIX = ".safetensors"
-_MARGIN_BYTES = 16  # what files are called while they are written is longer
-_MAX_METRICS_BYTES = 1_000_000
+_MARGIN_BYTES = 16  # temporary names are longer
 
 
 def check_weights_place(out: Path, metrics: Collection[str]) -> None:
@@ -31,9 +30,8 @@ def check_weights_place(out: Path, metrics: Collection[str]) -> None:
     check_place(out)
     beside = out.with_suffix(".json")
     if os.path.lexists(beside) and not _has_keys(beside, metrics):
-        raise InvalidInput(
-            "output file", out, f"another one: {beside.name} beside it is no metrics file and would be lost"
-        )
+        allowed = f"another one: {beside.name} beside it is no metrics file and would be lost"
+        raise InvalidInput("output file", out, allowed)
 
 
 def check_place(path: Path) -> None:
@@ -43,28 +41,22 @@ def check_place(path: Path) -> None:
         CannotWrite: if it is a folder, lies inside a file, has too long a name or may not be written.
     """
     try:
-        if path.is_dir():
-            raise CannotWrite(path, "it is a folder; the name of a file is expected")
-        ground = path.parent
-        while not ground.exists() and ground != ground.parent:
-            ground = ground.parent
-        longest = max(len(os.fsencode(part)) for part in path.parts) if path.parts else 0
-        if longest + _MARGIN_BYTES > os.pathconf(ground, "PC_NAME_MAX"):
-            raise CannotWrite(path, "its name is too long")
-        descriptor, trial = tempfile.mkstemp(prefix=".trial-", dir=ground)
-        os.close(descriptor)
-        os.unlink(trial)
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+        with writing(path):
+            if path.is_dir():
+                raise CannotWrite(path, "it is a folder; the name of a file is expected")
+            ground = path.parent
+            while not ground.exists() and ground != ground.parent:
+                ground = ground.parent
+            longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
+            if longest + _MARGIN_BYTES > os.pathconf(ground, "PC_NAME_MAX"):
+                raise CannotWrite(path, "its name is too long")
+            tempfile.TemporaryFile(prefix=".trial-", dir=ground).close()
     except UnicodeEncodeError as error:
         raise CannotWrite(path, "its name cannot be written") from error
 
 
 def _has_keys(path: Path, keys: Collection[str]) -> bool:
     try:
-        if path.stat().st_size > _MAX_METRICS_BYTES:
-            return False
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return set(keys) <= set(read_json(path, as_mapping))
+    except OsfError:
         return False
-    return isinstance(content, dict) and set(keys) <= set(content)

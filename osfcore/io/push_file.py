@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import glob
 import json
@@ -81,7 +82,7 @@ _PREFIX = "disturbed_"  # of their names on disk
 
 
 class EpisodeFolder:
-    """Finished episodes beside the final file, so that a killed collection goes on where it was.
+    """The folder of finished episodes beside the final file, so that a killed collection goes on where it was.
 
     Args:
         out: the final HDF5 file.
@@ -129,12 +130,17 @@ class EpisodeFolder:
         self._settings = text
 
     def path(self, index: int) -> Path:
-        """Where the episode of this index belongs."""
+        """Return the path of the episode of this index."""
         return self._folder / f"{index:07d}.npz"
 
     def finished(self) -> frozenset[int]:
-        """Indices of the episodes that are there and whole; a damaged one is collected again."""
-        return frozenset(int(path.stem) for path in self._folder.glob("*.npz") if _is_whole(path))
+        """Return the indices of the episodes that are there and whole; a damaged one is collected again."""
+        whole = set()
+        for path in self._folder.glob("*.npz"):
+            with contextlib.suppress(OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):  # cut short
+                load_episode(path)
+                whole.add(int(path.stem))
+        return frozenset(whole)
 
     def combine(self, count: int) -> None:
         """Write episodes 0 to count - 1 into the HDF5 file, then remove the folder.
@@ -145,17 +151,8 @@ class EpisodeFolder:
         with file_at_once(self._out) as partial, h5py.File(partial, "w") as file:
             file.attrs["settings"] = self._settings
             for index in range(count):
-                _to_group(file.create_group(f"{index:07d}"), load_episode(self.path(index)))
+                _write_group(file.create_group(f"{index:07d}"), load_episode(self.path(index)))
         shutil.rmtree(self._folder)
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether an episode can be read: a power cut may have cut it short."""
-    try:
-        load_episode(path)
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
-        return False
-    return True
 
 
 def save_episode(path: Path, episode: PushEpisode) -> None:
@@ -176,7 +173,7 @@ def load_episode(path: Path) -> PushEpisode:
 
 
 def _arrays(episode: PushEpisode) -> dict[str, np.ndarray]:
-    """All arrays that an episode has, by name."""
+    """Return all arrays that an episode has, by name."""
     found = {name: getattr(episode, name) for name in (*_ARRAYS, *_OPTIONAL)}
     if episode.disturbed is not None:
         found |= {_PREFIX + name: getattr(episode.disturbed, name) for name in _DISTURBED}
@@ -184,14 +181,14 @@ def _arrays(episode: PushEpisode) -> dict[str, np.ndarray]:
 
 
 def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
-    """All episodes of a push file, in order.
+    """Return all episodes of a push file, in order.
 
     Raises:
         CorruptFile: if it is not a push file.
     """
     try:
         with h5py.File(path) as file:
-            return tuple(_from_group(group) for _, group in sorted(file.items()))
+            return tuple(_read_group(group) for _, group in sorted(file.items()))
     except FileNotFoundError:
         raise CorruptFile(path, "there is no such file") from None
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
@@ -199,7 +196,7 @@ def read_pushes(path: Path) -> tuple[PushEpisode, ...]:
 
 
 def read_sound_pushes(path: Path) -> tuple[PushEpisode, ...]:
-    """The same, with every array looked at.
+    """Return all episodes of a push file after checking every array.
 
     Raises:
         CorruptFile: if there are no episodes, or an array has another shape or holds what is not a finite number.
@@ -223,7 +220,7 @@ def read_sound_pushes(path: Path) -> tuple[PushEpisode, ...]:
 
 
 def _shapes(episode: PushEpisode) -> dict[str, tuple[int, ...]]:
-    """What the shapes of an episode's arrays must be."""
+    """Return the shapes that an episode's arrays must have."""
     steps, count = len(episode.actions), len(episode.names)
     shapes: dict[str, tuple[int, ...]] = {
         "positions": (steps + 1, count, 3),
@@ -242,7 +239,7 @@ def _shapes(episode: PushEpisode) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
+def _write_group(group: h5py.Group, episode: PushEpisode) -> None:
     group.attrs["seed"] = episode.seed
     group.create_dataset("names", data=list(episode.names), dtype=h5py.string_dtype())
     for name, array in _arrays(episode).items():
@@ -250,13 +247,13 @@ def _to_group(group: h5py.Group, episode: PushEpisode) -> None:
         group.create_dataset(name, data=array, compression="gzip", shuffle=True, chunks=chunks)
 
 
-def _from_group(group: h5py.Group) -> PushEpisode:
+def _read_group(group: h5py.Group) -> PushEpisode:
     names = tuple(name.decode() for name in np.asarray(group["names"]).tolist())
     return _episode(names, int(np.asarray(group.attrs["seed"])), group)
 
 
 def _episode(names: tuple[str, ...], seed: int, stored: Mapping[str, Any]) -> PushEpisode:
-    """An episode from arrays by their names on disk."""
+    """Return an episode of arrays by their names on disk."""
     arrays = {name: np.asarray(stored[name]) for name in (*_ARRAYS, *(n for n in _OPTIONAL if n in stored))}
     disturbed = None
     if _PREFIX + _DISTURBED[0] in stored:

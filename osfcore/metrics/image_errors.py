@@ -37,9 +37,8 @@ def psnr(
     x, y = truth.astype(np.float64), image.astype(np.float64)
     if mask is not None:
         if mask.shape != truth.shape[:2] or not mask.any():
-            raise InvalidInput(
-                "mask", f"of shape {mask.shape} with {int(mask.sum())} pixels", "as the image, not empty"
-            )
+            size = f"of shape {mask.shape} with {int(mask.sum())} pixels"
+            raise InvalidInput("mask", size, "as the image, not empty")
         x, y = x[mask], y[mask]
     with np.errstate(divide="ignore"):
         return float(min(peak_signal_noise_ratio(x, y, data_range=1), MOST_DB))
@@ -63,7 +62,7 @@ def ssim(truth: Float[np.ndarray, "h w 3"], image: Float[np.ndarray, "h w 3"]) -
 
 
 def dilated(mask: Bool[np.ndarray, "h w"], margin_px: int = MASK_MARGIN_PX) -> Bool[np.ndarray, "h w"]:
-    """The mask, grown by some pixels in every direction, diagonals included."""
+    """Return the mask, grown by some pixels in every direction, diagonals included."""
     kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
     return cv2.dilate(mask.astype(np.uint8), kernel) > 0
 

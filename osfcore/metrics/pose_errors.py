@@ -1,4 +1,4 @@
-"""How far an estimated pose is from the true one, in the measures of the field (BOP; ADD-S after Hinterstoisser)."""
+"""Errors of estimated poses, in the measures of the field (BOP; ADD-S after Hinterstoisser)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PARALLEL = 1e-9
 
 
 def rotation_error(symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: Float[np.ndarray, "4"]) -> float:
-    """The least angle [rad] by which an orientation is off, over all orientations that look like the true one.
+    """Return the least angle [rad] to any orientation that looks like the true one.
 
     Args:
         symmetry: of the object; for a body of revolution only the tilt of its axis counts.
@@ -34,7 +34,7 @@ def rotation_error(symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: 
 def rotation_components(
     symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "C"]:
-    """The rotation from the nearest orientation that looks like the true one to the estimated one [rad].
+    """Return the rotation from the nearest orientation that looks like the true one to the estimated one [rad].
 
     Args:
         symmetry: of the object.
@@ -43,7 +43,7 @@ def rotation_components(
 
     Returns:
         A rotation vector along the world's axes (C = 3); for a body of revolution its two components across the axis,
-        since a turn about it is no error and would only water down a statistic.
+        since a turn about it is no error.
     """
     if symmetry.kind == "continuous":
         axis = np.asarray(symmetry.axis)
@@ -54,7 +54,7 @@ def rotation_components(
 
 
 def direction_components(estimated: Float[np.ndarray, "3"], true: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
-    """The shortest rotation between two unit vectors [rad], along two directions across the true one."""
+    """Return the shortest rotation between two unit vectors [rad], along two directions across the true one."""
     basis = np.stack(orthogonal_basis(np.asarray(true, float)))
     turn = basis @ np.cross(true, estimated)
     sine, cosine = float(np.linalg.norm(turn)), float(np.dot(true, estimated))
@@ -64,7 +64,7 @@ def direction_components(estimated: Float[np.ndarray, "3"], true: Float[np.ndarr
 
 
 def adds(points: Float[np.ndarray, "P 3"], estimated: Pose, true: Pose) -> float:
-    """ADD-S [m]: mean distance from the object's points, where they are, to the nearest ones where they are thought.
+    """Return ADD-S [m]: the mean distance from the object's points in the true pose to the nearest in the estimated.
 
     Args:
         points: on the object's surface, in its frame [m].

@@ -1,4 +1,4 @@
-"""Success of rearrangements: errors of the final state, and what counts as success."""
+"""Errors of the final state of a rearrangement, and whether it is a success."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ TIGHT_DEG = float(np.rad2deg(0.1))  # with 2 cm: the thresholds of Push Anything
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RearrangementTask:
-    """A scene, and how it shall become.
+    """A scene and its goal.
 
     Attributes:
         number: of the task.
         start: the truth at the beginning, at rest, with the pusher in a free place.
-        goal: the truth as it shall be, without pusher, under the light of the goal image.
-        moved: the objects that shall lie elsewhere.
+        goal: the true goal, without pusher, under the light of the goal image.
+        moved: the objects whose goals lie elsewhere.
     """
 
     number: int
@@ -36,7 +36,7 @@ class RearrangementTask:
 
 @dataclass(frozen=True, slots=True)
 class ObjectScore:
-    """How one object ended, against how it should have.
+    """The final errors of one object.
 
     Attributes:
         name: of the object.
@@ -55,7 +55,7 @@ class ObjectScore:
     pose6d_symmetric: float
 
     def is_within(self, threshold_m: float, threshold_deg: float) -> bool:
-        """Whether it lies as it should."""
+        """Whether its errors are at most the thresholds [m, deg]."""
         return self.mm <= 1000 * threshold_m and self.deg <= threshold_deg
 
     def is_tight(self) -> bool:
@@ -65,11 +65,7 @@ class ObjectScore:
 
 @dataclass(frozen=True, slots=True)
 class RearrangementScore:
-    """How a table ended.
-
-    Attributes:
-        objects: each of them.
-    """
+    """The final errors of all objects of a table."""
 
     objects: tuple[ObjectScore, ...]
 
@@ -80,27 +76,27 @@ class RearrangementScore:
 
     @property
     def moved_mm(self) -> float:
-        """Mean distance of these from their goals [mm]."""
+        """Mean distance of the objects that had to move from their goals [mm]."""
         return float(np.mean([one.mm for one in self.moved]))
 
     @property
     def moved_deg(self) -> float:
-        """Mean angle likewise [deg]."""
+        """Mean angle of the objects that had to move from their goals [deg]."""
         return float(np.mean([one.deg for one in self.moved]))
 
     @property
     def others_mm(self) -> float:
-        """Largest distance of those that should have stayed; 0 if there are none [mm]."""
+        """Largest distance of the objects that should have stayed from their places; 0 if there are none [mm]."""
         return max((one.mm for one in self.objects if not one.had_to_move), default=0.0)
 
     @property
     def pose6d(self) -> float:
-        """Mean over all objects of the paper's measure."""
+        """Mean of the paper's measure over all objects."""
         return float(np.mean([one.pose6d for one in self.objects]))
 
     @property
     def pose6d_symmetric(self) -> float:
-        """The same with symmetries considered."""
+        """Mean of the paper's measure over all objects, symmetries considered."""
         return float(np.mean([one.pose6d_symmetric for one in self.objects]))
 
     def is_success(self, threshold_m: float = SUCCESS_M, threshold_deg: float = np.inf) -> bool:
@@ -116,13 +112,13 @@ class RearrangementScore:
         return self.is_success(SUCCESS_M, TIGHT_DEG)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON: the objects, and what is told of them together."""
-        together = {key: getattr(self, key) for key in ("moved_mm", "moved_deg", "others_mm", "pose6d")}
-        return {**asdict(self), "moved": len(self.moved), **together, "pose6d_symmetric": self.pose6d_symmetric}
+        """Return the objects and the figures over all of them as plain JSON."""
+        keys = ("moved_mm", "moved_deg", "others_mm", "pose6d", "pose6d_symmetric")
+        return {**asdict(self), "moved": len(self.moved), **{key: getattr(self, key) for key in keys}}
 
 
 def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, Symmetry]) -> RearrangementScore:
-    """The score of a rearrangement.
+    """Return the score of a rearrangement.
 
     Args:
         task: start, goal, and which objects had to move, at least one.
@@ -141,5 +137,5 @@ def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, 
 
 
 def _quaternion_distance(angle_rad: float) -> float:
-    """Between two unit quaternions, the nearer of both signs, of rotations that differ by an angle in [0, pi]."""
+    """Return the distance of two unit quaternions, the nearer of both signs, whose rotations differ by an angle."""
     return float(2 * np.sin(angle_rad / 4))

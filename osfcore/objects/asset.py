@@ -1,4 +1,4 @@
-"""What is known of one object: catalogue facts, textured mesh, convex collision parts, resting orientations.
+"""The types of one object: catalogue facts, textured mesh, convex collision parts, resting orientations.
 
 Object frame: the frame of the source mesh moved to the centre of its bounding box, z up, [m].
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Symmetry:
-    """Which rotations an eye cannot tell apart, after BOP's YCB-V.
+    """The rotations after which an object looks the same, after BOP's YCB-V.
 
     Attributes:
         kind: "none", "discrete" or "continuous".
@@ -129,15 +129,12 @@ class ObjectAsset:
         return float(np.linalg.norm(self.mesh.vertices, axis=1).max())
 
 
-# A light copy of a textured mesh for 3D views in browsers.
-
-
 MAX_TEXTURE_SIDE = 1024
 _JPEG_QUALITY = 85
 
 
 def viewer_glb(mesh: TexturedMesh) -> bytes:
-    """Binary glTF with a JPEG texture of at most 1024 texels a side, in the mesh's own frame [m]."""
+    """Return binary glTF with a JPEG texture of at most 1024 texels a side, in the mesh's own frame [m]."""
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
@@ -145,7 +142,7 @@ def viewer_glb(mesh: TexturedMesh) -> bytes:
 
 
 def light_mesh(mesh: TexturedMesh, max_side: int) -> trimesh.Trimesh:
-    """The mesh as exporters take it: matte, with a JPEG texture of at most `max_side` texels a side."""
+    """Return the mesh as exporters take it: matte, with a JPEG texture of at most `max_side` texels a side."""
     import trimesh
     from PIL import Image
     from trimesh.visual.material import PBRMaterial
@@ -155,7 +152,7 @@ def light_mesh(mesh: TexturedMesh, max_side: int) -> trimesh.Trimesh:
     scale = max_side / max(texture.shape[:2])
     if scale < 1:
         texture = cv2.resize(texture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    # trimesh embeds an image in the format that it was read in.
+    # trimesh embeds an image in the format that it was read in
     encoded = io.BytesIO()
     Image.fromarray(texture).save(encoded, format="JPEG", quality=_JPEG_QUALITY)
     image = Image.open(encoded)

@@ -1,21 +1,17 @@
 """Objects on disk: one folder each, written whole or not at all.
 
 A folder holds `object.json` (facts, format version, checksums), `arrays.npz` (mesh, collision parts, resting
-orientations), `texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. It is written under another name
-beside its place, synced, and renamed, so that a kill or a full disk leaves either the old object or none.
+orientations), `texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. A kill or a full disk while one
+is written leaves either the old object or none.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import io
 import json
-import os
 import re
-import shutil
-import tempfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -25,18 +21,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, MissingAssets, OsfError, UnknownName
-from osfcore.io.files import sync, sync_tree
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, OsfError, UnknownName
+from osfcore.io.files import replace_folder, scratch_folder, sync, writing
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
-from osfcore.objects.asset import ObjectAsset, ObjectGeometry, ObjectInfo, RestingPoses, TexturedMesh
+from osfcore.objects.asset import ObjectAsset, ObjectGeometry, ObjectInfo, RestingPoses, TexturedMesh, viewer_glb
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.objects.download import raising_fetch_failed, remove_old
+from osfcore.objects.download import raising_fetch_failed
 
 FORMAT_VERSION = 1
 _FACTS, _ARRAYS, _TEXTURE, _VIEWER = "object.json", "arrays.npz", "texture.png", "viewer.glb"
 _TEMPORARY_PREFIX = ".writing-"
-_NAME = re.compile(r"(?=[\w.-]*[\d_])[\w.-]*\w")  # a whole word that no other word looks like
+_NAME = re.compile(r"(?=[\w.-]*[\d_])[\w.-]*\w")  # a whole word with a digit or an underscore
 _TEMPORARY_LIFE_S = 600  # far longer than one write takes; older ones were left by a killed process
 
 
@@ -53,15 +49,15 @@ class AssetLibrary:
         self.root = Path(root)
 
     def __eq__(self, other: object) -> bool:
-        """Whether both look into the same folder."""
+        """Whether both are of the same folder."""
         return isinstance(other, AssetLibrary) and self.root == other.root
 
     def __hash__(self) -> int:
-        """By the folder."""
+        """Return a hash of the folder."""
         return hash(self.root)
 
     def names(self) -> tuple[str, ...]:
-        """Names of all objects that can be loaded, sorted."""
+        """Return the names of all objects that can be loaded, sorted."""
         if not self.root.is_dir():
             return ()
         return tuple(sorted(entry.name for entry in self.root.iterdir() if self.has(entry.name)))
@@ -74,7 +70,7 @@ class AssetLibrary:
             return False
 
     def info(self, name: str) -> ObjectInfo:
-        """Facts of an object of the catalogue, fetched or not, or of one that a user added.
+        """Return the facts of an object of the catalogue, fetched or not, or of one that a user added.
 
         Raises:
             UnknownName: if it is neither.
@@ -82,39 +78,37 @@ class AssetLibrary:
         """
         if name in CATALOGUE:
             return CATALOGUE[name]
-        facts = self._known_facts(name)
-        with self._as_corrupt(name):
+        with self._reading(name) as facts:
             return decode(ObjectInfo, facts["info"], "info")
 
     def label(self, name: str) -> str:
-        """What people call an object; its name where nothing else is known."""
+        """Return the label of an object; its name where nothing else is known."""
         try:
             return self.info(name).label
         except OsfError:  # removed meanwhile, or damaged
             return name
 
     def in_words(self, sentence: str) -> str:
-        """A sentence with what people call the objects in place of their names."""
+        """Return a sentence with the objects' labels in place of their names."""
         return _NAME.sub(lambda word: self.label(word[0]), sentence)
 
     def source(self, name: str) -> str:
-        """Where an object on this machine came from, as told to `write`."""
+        """Return where an object on this machine came from, as given to `write`."""
         return str(self._known_facts(name).get("source", ""))
 
     def size_m(self, name: str) -> Float[np.ndarray, "3"]:
-        """Extents of the bounding box in the object frame [m], without loading the mesh.
+        """Return the extents of the bounding box in the object frame [m], without loading the mesh.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
             UnknownName: if there is no such object.
             CorruptFile: if its files are damaged.
         """
-        facts = self._known_facts(name)
-        with self._as_corrupt(name):
+        with self._reading(name) as facts:
             return np.array(facts["size_m"], float).reshape(3)
 
     def load(self, name: str) -> ObjectAsset:
-        """An object with its mesh, texture, collision parts and resting orientations.
+        """Return an object with its mesh, texture, collision parts and resting orientations.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
@@ -123,8 +117,7 @@ class AssetLibrary:
         """
         import cv2
 
-        facts = self._known_facts(name)
-        with self._as_corrupt(name):
+        with self._reading(name) as facts:
             arrays = self._arrays(name, facts)
             png = np.frombuffer(self._checked(name, _TEXTURE, facts), np.uint8)
             texture = cv2.imdecode(png, cv2.IMREAD_COLOR_RGB)
@@ -135,45 +128,42 @@ class AssetLibrary:
             return ObjectAsset(self.info(name), mesh, _parts(arrays), resting)
 
     def load_geometry(self, name: str) -> ObjectGeometry:
-        """An object's shape alone, without decoding its texture, which takes most of the time of `load`.
+        """Return an object's shape alone, without decoding its texture, which takes most of the time of `load`.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
             UnknownName: if there is no such object.
             CorruptFile: if its files are damaged.
         """
-        facts = self._known_facts(name)
-        with self._as_corrupt(name):
+        with self._reading(name) as facts:
             arrays = self._arrays(name, facts)
             return ObjectGeometry(arrays["vertices"], arrays["faces"], _parts(arrays))
 
     def digest(self, name: str) -> str:
-        """Tells an object from any other and from any earlier one of its name, without loading it.
+        """Return a hash that differs from any other object and any earlier one of its name, without loading it.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
             UnknownName: if there is no such object.
             CorruptFile: if its files are damaged.
         """
-        facts = self._known_facts(name)
-        with self._as_corrupt(name):
+        with self._reading(name) as facts:
             checks = [facts["crc32"][file] for file in (_ARRAYS, _TEXTURE)]
         return hashlib.sha256(json.dumps([checks, asdict(self.info(name))]).encode()).hexdigest()
 
     def viewer_glb(self, name: str) -> bytes:
-        """The object as binary glTF with a small JPEG texture, in the object frame (z up) [m].
+        """Return the object as binary glTF with a small JPEG texture, in the object frame (z up) [m].
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
             UnknownName: if there is no such object.
             CorruptFile: if its files are damaged.
         """
-        facts = self._known_facts(name)
-        with self._as_corrupt(name):
+        with self._reading(name) as facts:
             return self._checked(name, _VIEWER, facts)
 
     def write(self, asset: ObjectAsset, source: str) -> None:
-        """Put an object in place, in one piece, over an older one of the same name if there is one.
+        """Put an object in place of an older one of the same name, if there is one.
 
         Args:
             asset: what to write.
@@ -182,27 +172,26 @@ class AssetLibrary:
         Raises:
             FetchFailed: if the disk is full or the folder cannot be written; nothing is changed.
         """
-        from osfcore.objects.asset import viewer_glb
-
-        glb = viewer_glb(asset.mesh)
-        with raising_fetch_failed(asset.info.name, self.root):
-            self.root.mkdir(parents=True, exist_ok=True)
-            remove_old(self.root, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
-            with self._temporary(asset.info.name) as folder:
-                _write_arrays(folder / _ARRAYS, asset)
-                (folder / _TEXTURE).write_bytes(encode_png(asset.mesh.texture))
-                (folder / _VIEWER).write_bytes(glb)
-                checks = {f: zlib.crc32((folder / f).read_bytes()) for f in (_ARRAYS, _TEXTURE, _VIEWER)}
-                facts = {
-                    "format_version": FORMAT_VERSION,
-                    "info": asdict(asset.info),
-                    "size_m": [round(float(s), 6) for s in asset.size_m],
-                    "source": source,
-                    "crc32": checks,
-                }
-                (folder / _FACTS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-                sync_tree(folder)
-                self._put(folder, self.root / asset.info.name)
+        files = {
+            _ARRAYS: _array_bytes(asset),
+            _TEXTURE: encode_png(asset.mesh.texture),
+            _VIEWER: viewer_glb(asset.mesh),
+        }
+        facts = {
+            "format_version": FORMAT_VERSION,
+            "info": asdict(asset.info),
+            "size_m": [round(float(s), 6) for s in asset.size_m],
+            "source": source,
+            "crc32": {name: zlib.crc32(data) for name, data in files.items()},
+        }
+        files[_FACTS] = (json.dumps(facts, indent=1) + "\n").encode()
+        with raising_fetch_failed(asset.info.name, self.root), self._scratch() as scratch:
+            folder = scratch / "new"
+            folder.mkdir()
+            folder.chmod(0o755)  # another user may serve what this one fetched
+            for name, data in files.items():
+                (folder / name).write_bytes(data)
+            replace_folder(folder, self.root / asset.info.name)
 
     def remove(self, name: str) -> None:
         """Delete an object that a user added.
@@ -215,12 +204,10 @@ class AssetLibrary:
         self._known_facts(name)
         if name in CATALOGUE:
             raise InvalidInput("object to delete", name, "one that was added here; the catalogue's stay")
-        try:
-            with self._temporary(name) as trash:
-                os.rename(self.root / name, trash / "old")
+        with writing(self.root):
+            with self._scratch() as trash:
+                (self.root / name).rename(trash / "old")
             sync(self.root)
-        except OSError as error:
-            raise CannotWrite(self.root, error.strerror or str(error)) from error
 
     def _facts(self, name: str) -> dict[str, Any]:
         path = self.root / name / _FACTS
@@ -255,41 +242,19 @@ class AssetLibrary:
         return data
 
     @contextlib.contextmanager
-    def _as_corrupt(self, name: str) -> Iterator[None]:
-        """Tell damaged contents as what they are."""
+    def _reading(self, name: str) -> Iterator[dict[str, Any]]:
+        """Give the facts of an object, and raise what damaged contents lead to as `CorruptFile`."""
+        facts = self._known_facts(name)
         try:
-            yield
+            yield facts
         except CorruptFile:
             raise
         except (OSError, KeyError, TypeError, ValueError) as error:
             reason = "its files are damaged; fetch or add it again with --force"
             raise CorruptFile(self.root / name, reason) from error
 
-    @contextlib.contextmanager
-    def _temporary(self, name: str) -> Iterator[Path]:
-        folder = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY_PREFIX}{name}-", dir=self.root))
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-    def _put(self, folder: Path, place: Path) -> None:
-        folder.chmod(0o755)  # mkdtemp makes it private, but another user may serve what this one fetched
-        while not _renamed(folder, place):  # another process may put the same object there at any moment
-            with self._temporary(place.name) as trash, contextlib.suppress(FileNotFoundError):
-                os.rename(place, trash / "old")
-        sync(self.root)
-
-
-def _renamed(folder: Path, place: Path) -> bool:
-    """Give a folder its name, unless something with contents has that name."""
-    try:
-        os.rename(folder, place)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-            raise
-        return False
-    return True
+    def _scratch(self) -> contextlib.AbstractContextManager[Path]:
+        return scratch_folder(self.root, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
 
 
 def _parts(arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "_ 3"], ...]:
@@ -313,17 +278,17 @@ def check_name(name: str) -> str:
     return name
 
 
-def _write_arrays(path: Path, asset: ObjectAsset) -> None:
-    mesh = asset.mesh
-    with path.open("wb") as file:
-        np.savez(
-            file,
-            vertices=mesh.vertices.astype(np.float32),
-            normals=mesh.normals.astype(np.float32),
-            faces=mesh.faces.astype(np.int32),
-            uv=mesh.uv.astype(np.float32),
-            parts=np.concatenate(asset.parts).astype(np.float32),
-            part_sizes=np.array([len(part) for part in asset.parts], np.int32),
-            resting_quaternions=asset.resting.quaternions.astype(float),
-            resting_probabilities=asset.resting.probabilities.astype(float),
-        )
+def _array_bytes(asset: ObjectAsset) -> bytes:
+    mesh, buffer = asset.mesh, io.BytesIO()
+    np.savez(
+        buffer,
+        vertices=mesh.vertices.astype(np.float32),
+        normals=mesh.normals.astype(np.float32),
+        faces=mesh.faces.astype(np.int32),
+        uv=mesh.uv.astype(np.float32),
+        parts=np.concatenate(asset.parts).astype(np.float32),
+        part_sizes=np.array([len(part) for part in asset.parts], np.int32),
+        resting_quaternions=asset.resting.quaternions.astype(float),
+        resting_probabilities=asset.resting.probabilities.astype(float),
+    )
+    return buffer.getvalue()

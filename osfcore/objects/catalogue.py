@@ -1,4 +1,4 @@
-"""The YCB objects that are known by name: label, mass, symmetry, licence. Meshes come from `sources`.
+"""The catalogue of YCB objects: label, mass, symmetry, licence. Meshes come from `sources`.
 
 Masses are those of the YCB data sheet. Symmetries follow BOP's YCB-V in the object frame (the google_16k axes, origin
 at the bounding box's centre): an object is symmetric only where its label and colours are, too. The axes of the
@@ -25,6 +25,7 @@ _SQUARE_PRISM = (
 )
 _HALF_TURN_Z = ((0.0, 0.0, 0.0, 1.0),)
 _LABEL = "printed label breaks the symmetry"
+_BRICK = "plain brick, holes in its top only"
 
 _ROWS = (
     ("002_master_chef_can", "Master Chef can", 0.414, Symmetry("none", reason=_LABEL)),
@@ -46,12 +47,7 @@ _ROWS = (
     ("025_mug", "Mug", 0.118, Symmetry("none", reason="handle")),
     ("035_power_drill", "Power drill", 0.895, Symmetry("none", reason="no symmetric shape")),
     ("036_wood_block", "Wood block", 0.729, Symmetry("discrete", _SQUARE_PRISM, reason="plain square block")),
-    (
-        "061_foam_brick",
-        "Foam brick",
-        0.028,
-        Symmetry("discrete", _HALF_TURN_Z, reason="plain brick, holes in its top only"),
-    ),
+    ("061_foam_brick", "Foam brick", 0.028, Symmetry("discrete", _HALF_TURN_Z, reason=_BRICK)),
 )
 
 CATALOGUE: Mapping[str, ObjectInfo] = MappingProxyType(

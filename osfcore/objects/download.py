@@ -1,15 +1,13 @@
-"""Files from the network and from archives: bounded in size and time, never half there."""
+"""Download and unpack files: bounded in size and time, never half there."""
 
 from __future__ import annotations
 
 import contextlib
 import http.client
 import os
-import shutil
 import subprocess
 import sys
 import tarfile
-import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -18,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from osfcore.errors import CorruptFile, FetchFailed
-from osfcore.io.files import put_in_place
+from osfcore.io.files import put_in_place, scratch_folder
 
 MAX_BYTES = 300_000_000
 TIMEOUT_S = 30.0
@@ -31,11 +29,7 @@ _TEMPORARY_LIFE_S = 3600  # older folders were left by a killed process
 
 @contextlib.contextmanager
 def raising_fetch_failed(what: str, place: Path) -> Iterator[None]:
-    """Tell a full disk, or a place that cannot be written, in one sentence.
-
-    Raises:
-        FetchFailed: instead of an OSError.
-    """
+    """Raise an `OSError`, such as of a full disk, as `FetchFailed`."""
     try:
         yield
     except OSError as error:
@@ -44,33 +38,15 @@ def raising_fetch_failed(what: str, place: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path, what: str) -> Iterator[Path]:
-    """A folder inside `parent` that is gone afterwards; folders that a killed process left long ago go with it.
+    """Give a folder inside `parent` that is gone afterwards; folders that a killed process left long ago go with it.
 
     Raises:
         FetchFailed: if it cannot be made.
     """
-    with raising_fetch_failed(what, parent):
-        parent.mkdir(parents=True, exist_ok=True)
-        remove_old(parent, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
-        folder = Path(tempfile.mkdtemp(prefix=_TEMPORARY_PREFIX, dir=parent))
-    try:
+    with contextlib.ExitStack() as stack:
+        with raising_fetch_failed(what, parent):
+            folder = stack.enter_context(scratch_folder(parent, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S))
         yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def remove_old(parent: Path, prefix: str, age_s: float) -> None:
-    """Remove folders that a killed process left behind.
-
-    Args:
-        parent: folder in which they lie.
-        prefix: of their names.
-        age_s: since their last change, from which on they are removed [s].
-    """
-    for path in parent.glob(f"{prefix}*"):
-        with contextlib.suppress(OSError):  # another process may be removing it, too
-            if time.time() - path.stat().st_mtime > age_s:
-                shutil.rmtree(path, ignore_errors=True)
 
 
 def download(address: str, path: Path, max_bytes: int = MAX_BYTES) -> bool:
@@ -150,7 +126,9 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
                 if not (member.isfile() or member.isdir()):
                     raise CorruptFile(archive, f"it holds {member.name!r}, which is neither a file nor a folder")
                 tar.extract(member, folder, filter="data")
-            _read_on(tar, max_bytes)
+            for _ in range(0, max_bytes, _CHUNK_BYTES):  # gzip compares checksums only at its end
+                if tar.fileobj is None or not tar.fileobj.read(_CHUNK_BYTES):
+                    break
     except CorruptFile:
         raise
     except (tarfile.TarError, EOFError) as error:
@@ -161,13 +139,6 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
         raise FetchFailed(archive.name, f"{folder} cannot be written ({error.strerror})") from error
     except (ValueError, zlib.error) as error:
         raise CorruptFile(archive, "it is a damaged archive") from error
-
-
-def _read_on(tar: tarfile.TarFile, max_bytes: int) -> None:
-    """Read what follows the last member: only at its end does gzip compare checksums."""
-    for _ in range(0, max_bytes, _CHUNK_BYTES):
-        if tar.fileobj is None or not tar.fileobj.read(_CHUNK_BYTES):
-            return
 
 
 def pip_download(requirement: str, folder: Path) -> Iterator[int]:

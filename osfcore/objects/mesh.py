@@ -1,4 +1,4 @@
-"""Textured meshes: read from files of strangers, brought into the object frame, checked, and where they rest."""
+"""Textured meshes: read from files of strangers, brought into the object frame and checked; orientations at rest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from osfcore.objects.asset import RestingPoses, TexturedMesh
 
 if TYPE_CHECKING:
     import trimesh
-    from PIL.Image import Image
 
 
 # Colours of loaded meshes as one texture: images, colour factors, vertex or face colours, several materials.
@@ -52,12 +51,12 @@ class TexturedPiece:
 
 
 def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
-    """One loaded mesh with its image, its vertex or face colours, or a grey.
+    """Return one loaded mesh with its image, its vertex or face colours, or a grey.
 
     Raises:
         InvalidInput: if the image has over 67 million pixels or repeats too often.
     """
-    visual: Any = mesh.visual  # trimesh's kinds of visuals share no base that tells their attributes
+    visual: Any = mesh.visual  # trimesh's kinds of visuals share no base with these attributes
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     uv = getattr(visual, "uv", None)
     if visual.kind == "texture":
@@ -65,7 +64,9 @@ def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
         image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
         factor = getattr(material, "baseColorFactor", None)
         if image is not None and uv is not None and len(uv) == len(vertices):
-            texture = _pixels(image)
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                raise InvalidInput("texture size [px]", f"{image.width} x {image.height}", "at most 8192 x 8192")
+            texture = np.asarray(image.convert("RGB"))
             if factor is not None:
                 texture = np.round(texture * _rgb(factor)).astype(np.uint8)
             return _unrepeated(TexturedPiece(vertices, faces, np.asarray(uv, float), texture))
@@ -84,19 +85,13 @@ def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
 
 
 def _rgb(colour: object) -> Float[np.ndarray, "3"]:
-    """The first three channels in [0, 1], from bytes or fractions."""
+    """Return the first three channels in [0, 1], from bytes or fractions."""
     array = np.asarray(colour)
     return np.clip(array[:3] / 255.0 if array.dtype.kind in "ui" else array[:3].astype(float), 0, 1)
 
 
-def _pixels(image: Image) -> UInt8[np.ndarray, "h w 3"]:
-    if image.width * image.height > MAX_IMAGE_PIXELS:
-        raise InvalidInput("texture size [px]", f"{image.width} x {image.height}", "at most 8192 x 8192")
-    return np.asarray(image.convert("RGB"))
-
-
 def _unrepeated(piece: TexturedPiece) -> TexturedPiece:
-    """Texture coordinates brought into [0, 1], with the texture tiled where a face spans several copies of it."""
+    """Bring texture coordinates into [0, 1], and tile the texture where a face spans several copies of it."""
     if not np.all(np.isfinite(piece.uv)) or (piece.uv.min() >= 0 and piece.uv.max() <= 1):
         return piece
     corners = piece.uv[piece.faces]
@@ -112,7 +107,7 @@ def _unrepeated(piece: TexturedPiece) -> TexturedPiece:
 def _baked(
     vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "F 3 3"]
 ) -> TexturedPiece:
-    """A texture with a small square for each face, in which bilinear sampling gives back the corners' colours."""
+    """Make a texture with a small square for each face, in which bilinear sampling gives the corners' colours."""
     across = int(np.ceil(np.sqrt(len(faces))))
     down = -(-len(faces) // across)
     index = np.arange(len(faces))
@@ -133,7 +128,7 @@ def _baked(
 
 
 def joined(pieces: list[TexturedPiece]) -> TexturedPiece:
-    """All pieces as one, their textures (equal ones once) stacked into one image."""
+    """Join pieces into one, their textures (equal ones once) stacked into one image."""
     if len(pieces) == 1:
         return pieces[0]
     images = {_key(p.texture): p.texture for p in pieces}
@@ -171,23 +166,24 @@ _SUFFIXES = (".obj", ".glb", ".gltf", ".ply")
 _EXPECTED = "a GLB, or a zip of an OBJ with its MTL and texture"
 
 
-def check_upload(file: Path) -> None:
-    """Refuse at once what is neither a GLB nor a zip; this takes milliseconds.
+def check_upload(file: Path) -> bool:
+    """Return whether an upload is a GLB, not a zip, and refuse what is neither; this takes milliseconds.
 
     Raises:
         CorruptFile: if it is neither.
     """
     with file.open("rb") as source:
         magic = source.read(4)
-    if magic == _GLB_MAGIC:
-        return
-    if not magic.startswith(_ZIP_MAGIC):
+    is_glb = magic == _GLB_MAGIC
+    if not is_glb and not magic.startswith(_ZIP_MAGIC):
         raise CorruptFile(file, f"it is neither a GLB nor a zip; send {_EXPECTED}")
-    check_zip(file, MAX_FILES)
+    if not is_glb:
+        check_zip(file, MAX_FILES)
+    return is_glb
 
 
 def unpack_mesh(file: Path, out: Path) -> Path:
-    """The mesh of an upload, with what it names beside it.
+    """Unpack the mesh of an upload, with the files that it names beside it.
 
     Args:
         file: a GLB or a zip, whatever it is called.
@@ -200,14 +196,9 @@ def unpack_mesh(file: Path, out: Path) -> Path:
         CorruptFile: if it is neither, or the zip holds no mesh or several, is damaged, a bomb, or leads elsewhere.
         CannotWrite: if the disk is full.
     """
-    check_upload(file)
-    with file.open("rb") as source:
-        is_glb = source.read(4) == _GLB_MAGIC
-    if is_glb:
+    if check_upload(file):
         out.mkdir()
-        mesh = out / "mesh.glb"
-        file.rename(mesh)
-        return mesh
+        return file.rename(out / "mesh.glb")
     inside = _mesh_in(file)
     kind = ArchiveKind("mesh", inside, (), _EXPECTED)
     return unpack(file, out, kind, MAX_UNPACKED_BYTES, MAX_FILES) / inside
@@ -216,8 +207,7 @@ def unpack_mesh(file: Path, out: Path) -> Path:
 def _mesh_in(archive: Path) -> PurePosixPath:
     with zipfile.ZipFile(archive) as file:
         paths = [PurePosixPath(name.replace("\\", "/")) for name in file.namelist()]
-    meshes = [p for p in paths if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")]
-    meshes = [p for p in meshes if p.parts[0] != "__MACOSX"]
+    meshes = [p for p in paths if p.suffix.lower() in _SUFFIXES and p.name[0] != "." and p.parts[0] != "__MACOSX"]
     if not meshes:
         raise CorruptFile(archive, f"it holds no mesh; send {_EXPECTED}")
     if len(meshes) > 1:
@@ -226,7 +216,7 @@ def _mesh_in(archive: Path) -> PurePosixPath:
 
 
 class UnpackedFiles(Resolver):
-    """What a mesh may name: files under one folder, by their path from the mesh or, failing that, by their name alone.
+    """The files that a mesh may name: those of one folder, by their path from the mesh or else by their name alone.
 
     Args:
         root: the folder.
@@ -238,7 +228,7 @@ class UnpackedFiles(Resolver):
         self.missing: list[str] = []
 
     def get(self, key: str) -> bytes:
-        """The contents of a file.
+        """Return the contents of a file.
 
         Raises:
             FileNotFoundError: if it is not among the unpacked; it is then in `missing`, too.
@@ -255,7 +245,7 @@ class UnpackedFiles(Resolver):
         raise FileNotFoundError(wanted)
 
     def write(self, name: str, data: object) -> None:
-        """Nothing is written beside a stranger's mesh.
+        """Refuse to write beside a stranger's mesh.
 
         Raises:
             PermissionError: always.
@@ -268,14 +258,14 @@ class UnpackedFiles(Resolver):
         return sorted(str(path.relative_to(self._root)) for path in self._root.rglob("*") if path.is_file())
 
     def namespaced(self, namespace: str) -> UnpackedFiles:
-        """The same files, seen from a folder among them."""
+        """Return the same files, seen from a folder among them."""
         return UnpackedFiles(self._root, self._folder / namespace / "mesh")
 
     def check(self, mesh: Path) -> None:
-        """Tell of what was asked for in vain.
+        """Refuse a mesh that names files which did not come with it.
 
         Raises:
-            CorruptFile: if there is something.
+            CorruptFile: if there is one.
         """
         if self.missing:
             missing = ", ".join(dict.fromkeys(self.missing))
@@ -296,7 +286,7 @@ _RIM_TEXELS = 2  # JPEG mixes the background into this many texels of a chart's 
 def coverage(
     uv: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
 ) -> UInt8[np.ndarray, "height width"]:
-    """1 for each texel that a face touches, else 0; first row at v = 1.
+    """Return 1 for each texel that a face touches, else 0; first row at v = 1.
 
     Args:
         uv: texture coordinates of the vertices, v upwards; what lies outside [0, 1] is cut off.
@@ -313,7 +303,7 @@ def coverage(
 
 
 def _fill(image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """Push-pull: texels of no weight take the smoothly interpolated colour of those that have some."""
+    """Give texels of no weight the smoothly interpolated colour of those that have some, by push-pull."""
     height, width = weight.shape
     if weight.all() or (height == 1 and width == 1):
         return image
@@ -327,7 +317,7 @@ def _fill(image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -
 
 
 def _without_rim(covered: UInt8[np.ndarray, "h w"], texels: int) -> UInt8[np.ndarray, "h w"]:
-    """The charts less their rims, into which the background is mixed; charts that are nothing but rim stay."""
+    """Return the charts without their rims, into which the background is mixed; charts of rim alone stay."""
     inner = cv2.erode(covered, np.ones((2 * texels + 1, 2 * texels + 1), np.uint8), borderValue=1)
     near = cv2.dilate(inner, np.ones((4 * texels + 3, 4 * texels + 3), np.uint8))
     return np.maximum(inner, covered & (1 - near))
@@ -339,7 +329,7 @@ def clean_texture(
     faces: Int[np.ndarray, "F 3"],
     max_side: int = MAX_TEXTURE_SIDE,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """The texture, reduced if need be, with everything outside the charts filled from their rims.
+    """Return the texture, reduced if need be, with everything outside the charts filled from their rims.
 
     A covered texel of the result is the mean of the covered texels beneath it. A texture of which no face covers
     anything comes back as it is.
@@ -362,14 +352,12 @@ def clean_texture(
         reduced = cv2.resize(image * weight[..., None], target, interpolation=cv2.INTER_AREA)
         weight = cv2.resize(weight, target, interpolation=cv2.INTER_AREA)
         image = reduced / np.maximum(weight, 1e-12)[..., None]
-    filled = _fill(image, weight)
-    return np.clip(np.round(filled), 0, 255).astype(np.uint8)
+    return np.clip(np.round(_fill(image, weight)), 0, 255).astype(np.uint8)
 
 
-# Reader of MuJoCo's binary mesh format.
-#
-# Four int32 counts (vertices, normals, texture coordinates, faces), then float32 vertices, normals and texture
-# coordinates, then int32 faces. Here v runs downwards; it is turned to run upwards as in OBJ.
+# MuJoCo's binary mesh format: four int32 counts (vertices, normals, texture coordinates, faces), then
+# float32 vertices, normals and texture coordinates, then int32 faces. Its v runs downwards; it is turned to run upwards
+# as in OBJ.
 
 
 _HEADER_BYTES = 16
@@ -378,7 +366,7 @@ _MAX_COUNT = 10_000_000
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MshMesh:
-    """What a .msh file holds.
+    """The contents of a .msh file.
 
     Attributes:
         vertices: as in the file, [m] for the objects used here.
@@ -424,7 +412,7 @@ _SAME_DOWN_RAD = 0.35  # the facets of a rolling can lie closer together than th
 
 
 def resting_poses(parts: tuple[Float[np.ndarray, "_ 3"], ...]) -> RestingPoses:
-    """Orientations at rest on a plane, for a body of uniform density made of convex parts.
+    """Return the orientations at rest on a plane of a body of uniform density made of convex parts.
 
     Poses that differ by a turn about the vertical, or by less than 20 degrees in what points down, count as one; those
     that a random drop hardly ever ends in are left out.
@@ -452,20 +440,15 @@ def resting_poses(parts: tuple[Float[np.ndarray, "_ 3"], ...]) -> RestingPoses:
         else:
             kept.append(int(i))
             sums.append(float(probabilities[i]))
-    return _likeliest(transforms[kept, :3, :3], np.array(sums))
+    total = np.array(sums)
+    likeliest = np.argsort(-total, kind="stable")[:MAX_POSES]
+    likeliest = likeliest[total[likeliest] >= min(MIN_PROBABILITY, total.max())]
+    chosen = total[likeliest]
+    return RestingPoses(quaternion_from_matrix(transforms[kept, :3, :3][likeliest]), chosen / chosen.sum())
 
 
-def _likeliest(rotations: Float[np.ndarray, "K 3 3"], probabilities: Float[np.ndarray, "K"]) -> RestingPoses:
-    order = np.argsort(-probabilities, kind="stable")[:MAX_POSES]
-    order = order[probabilities[order] >= min(MIN_PROBABILITY, probabilities.max())]
-    chosen = probabilities[order]
-    return RestingPoses(quaternion_from_matrix(rotations[order]), chosen / chosen.sum())
-
-
-# Textured meshes from files, brought into the object frame and checked.
-#
-# Whatever comes in (a scan, a modelled GLB with several materials, vertex colours only) leaves as one
-# `TexturedMesh`: centred, wound outward, with smooth normals across texture seams and one clean texture.
+# Whatever a file holds (a scan, a modelled GLB with several materials, vertex colours only) becomes one `TexturedMesh`:
+# centred, wound outward, with smooth normals across texture seams and one clean texture.
 
 
 MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0
@@ -481,7 +464,7 @@ class WrongMeshSize(InvalidInput):
 
     Args:
         extents_m: of its bounding box [m].
-        source: what the message calls it.
+        source: its name in the message.
     """
 
     def __init__(self, extents_m: Float[np.ndarray, "3"], source: Path | str) -> None:
@@ -510,9 +493,7 @@ def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> T
         raise InvalidInput("mesh file", path.name, f"one of {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
         raise InvalidInput("mesh file", path, "a file that exists")
-    files = None
-    if unpacked is not None:
-        files = UnpackedFiles(unpacked, path)
+    files = None if unpacked is None else UnpackedFiles(unpacked, path)
     try:
         scene = trimesh.load_scene(path, process=False, resolver=files)
         pieces = [piece_of(g) for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
@@ -544,14 +525,14 @@ def textured_mesh(
     *,
     is_clean: bool = False,
 ) -> TexturedMesh:
-    """The mesh in the object frame: centred, wound outward, smooth normals, clean texture.
+    """Return the mesh in the object frame: centred, wound outward, with smooth normals and a clean texture.
 
     Args:
         vertices: in any frame with z up [m].
         faces: vertex indices.
         uv: in [0, 1], v upwards.
         texture: RGB.
-        source: what the message calls it when something is wrong.
+        source: its name in messages.
         is_clean: whether the texture can stay as it is.
 
     Raises:
@@ -559,12 +540,26 @@ def textured_mesh(
         InvalidInput: if it is under 5 mm or over 1 m long, or has too many triangles.
     """
     vertices, faces, uv = np.asarray(vertices, float), np.asarray(faces, np.int64), np.asarray(uv, float)
-    vertices, faces, uv = _check_triangles(vertices, faces, uv, source)
+    if len(faces) == 0 or len(vertices) == 0:
+        raise CorruptFile(source, "it holds no triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CorruptFile(source, "its faces name vertices that do not exist")
+    used, inverse = np.unique(faces, return_inverse=True)  # others would move the bounding box
+    vertices, faces, uv = vertices[used], inverse.reshape(faces.shape), uv[used]
+    if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
+        raise CorruptFile(source, "it has coordinates that are not finite")
+    if len(faces) > MAX_FACES:
+        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    _check_size(high - low, source)
+    longest = float((high - low).max())
+    if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
+        raise WrongMeshSize(high - low, source)
+    if (high - low).min() < _MIN_THICKNESS * longest:
+        raise CorruptFile(source, "it is flat and encloses no volume")
     vertices = vertices - (low + high) / 2
     welded, weld = _weld(vertices)
-    faces = faces[_has_area(welded, weld[faces])]
+    a, b, c = weld[faces].T
+    faces = faces[(a != b) & (b != c) & (c != a) & (np.linalg.norm(_normals(welded, weld[faces]), axis=1) > 0)]
     if len(faces) == 0:
         raise CorruptFile(source, "all of its triangles are degenerate")
     faces = _outward(welded, weld, faces)
@@ -580,74 +575,38 @@ def textured_mesh(
     )
 
 
-def _check_triangles(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, source: Path | str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The vertices that faces name, if all of them are there and finite."""
-    if len(faces) == 0 or len(vertices) == 0:
-        raise CorruptFile(source, "it holds no triangles")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise CorruptFile(source, "its faces name vertices that do not exist")
-    vertices, faces, uv = _referenced(vertices, faces, uv)
-    if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
-        raise CorruptFile(source, "it has coordinates that are not finite")
-    if len(faces) > MAX_FACES:
-        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
-    return vertices, faces, uv
-
-
-def _check_size(extents: Float[np.ndarray, "3"], source: Path | str) -> None:
-    longest = float(extents.max())
-    if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
-        raise WrongMeshSize(extents, source)
-    if extents.min() < _MIN_THICKNESS * longest:
-        raise CorruptFile(source, "it is flat and encloses no volume")
-
-
-def _referenced(
-    vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], uv: Float[np.ndarray, "P 2"]
-) -> tuple[Float[np.ndarray, "Q 3"], Int[np.ndarray, "F 3"], Float[np.ndarray, "Q 2"]]:
-    """Without the vertices that no face names: they would move the bounding box."""
-    used, inverse = np.unique(faces, return_inverse=True)
-    return vertices[used], inverse.reshape(faces.shape), uv[used]
-
-
 def _weld(vertices: Float[np.ndarray, "P 3"]) -> tuple[Float[np.ndarray, "Q 3"], Int[np.ndarray, "P"]]:
-    """Distinct positions, and for each vertex the index of its position."""
+    """Return the distinct positions, and for each vertex the index of its position."""
     grid = np.round(vertices / (1e-6 * np.ptp(vertices, axis=0).max())).astype(np.int64)
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     return vertices[first], inverse.reshape(-1)
 
 
-def _corners(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3"]:
+def _normals(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3"]:
+    """Return the normals of faces, as long as twice their areas."""
     a, b, c = (points[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
-
-
-def _has_area(points: Float[np.ndarray, "Q 3"], faces: Int[np.ndarray, "F 3"]) -> np.ndarray:
-    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return distinct & (np.linalg.norm(_corners(points, faces), axis=1) > 0)
 
 
 def _outward(
     points: Float[np.ndarray, "Q 3"], weld: Int[np.ndarray, "P"], faces: Int[np.ndarray, "F 3"]
 ) -> Int[np.ndarray, "F 3"]:
-    """The same faces, each counter-clockwise seen from outside."""
+    """Return the same faces, each counter-clockwise seen from outside."""
     import trimesh
 
     mesh = trimesh.Trimesh(points, weld[faces], process=False)
-    before = _corners(points, weld[faces])
+    before = _normals(points, weld[faces])
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
     trimesh.repair.fix_inversion(mesh, multibody=mesh.is_watertight and mesh.body_count > 1)
-    flipped = np.einsum("ij,ij->i", before, _corners(points, np.asarray(mesh.faces))) < 0
+    flipped = np.einsum("ij,ij->i", before, _normals(points, np.asarray(mesh.faces))) < 0
     return np.where(flipped[:, None], faces[:, ::-1], faces)
 
 
 def _split_at_creases(
     points: Float[np.ndarray, "Q 3"], weld: Int[np.ndarray, "P"], faces: Int[np.ndarray, "F 3"]
 ) -> tuple[Int[np.ndarray, "R"], Int[np.ndarray, "R"], Int[np.ndarray, "F 3"]]:
-    """One vertex per smooth patch that meets there.
+    """Split vertices at sharp edges: one for each smooth patch that meets there.
 
     Returns:
         For each new vertex the old one it copies and the group that shares its normal (one position, one patch), and
@@ -668,8 +627,8 @@ def _split_at_creases(
 def _smooth_normals(
     vertices: Float[np.ndarray, "R 3"], group: Int[np.ndarray, "R"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "R 3"]:
-    """Unit normals: those of the faces around each group of vertices, weighted by their angle there."""
-    face_normals = _corners(vertices, faces)
+    """Return unit normals: means over the faces around each group of vertices, weighted by their angle there."""
+    face_normals = _normals(vertices, faces)
     face_normals /= np.linalg.norm(face_normals, axis=1, keepdims=True)
     normals = np.zeros((group.max() + 1, 3))
     for corner in range(3):

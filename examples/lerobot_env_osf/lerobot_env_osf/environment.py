@@ -5,8 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import osfcore.environments  # noqa: F401  registers what is made below
-from osfcore.environments.registration import TABLETOP_ID
+from osfcore.environments import TABLETOP_ID  # registers what is made below
 from osfcore.environments.tabletop_env import TabletopEnv
 from osfcore.export.lerobot import GOAL_IMAGE, environment_state, image_name, instruction
 from osfcore.geometry.cameras import default_cameras

@@ -1,4 +1,4 @@
-"""The client against a running service; what both say to each other is as the OpenAPI schema has it."""
+"""The client against a running service; requests and answers are checked by the OpenAPI schema."""
 
 import json
 import re
@@ -14,20 +14,18 @@ from app.jobs.job import FINISHED, State
 from osfcore.client import Client, Episode, Estimate, Health, ServiceError
 from osfcore.client.client import Connection, Mode
 from osfcore.errors import InvalidInput
-from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import encode_png, to_uint8
 from osfcore.world.collect_images import CollectObservation, collect_observation
-from tests.app.conftest import LONG
+from tests.support.errors import about
 
-SLOW = pytest.mark.slow
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 TINY = {"steps": 1, "samples": 8, "horizon": 4}
 SCHEMA = create_app().openapi()
 
 
 def operation(request):
-    """What the schema says of a request."""
+    """The schema of a request."""
     for path, methods in SCHEMA["paths"].items():
         pattern = re.sub(r"\\\{\w+\\\}", "[^/]+", re.escape(path))
         if re.fullmatch(pattern, request.url.path) and request.method.lower() in methods:
@@ -53,15 +51,15 @@ def judge_request(request):
 
 def judge_answer(answer):
     kind = answer.headers.get("content-type", "")
-    told = operation(answer.request)["responses"][str(answer.status_code)]["content"]
-    assert kind.partition(";")[0] in told
+    known = operation(answer.request)["responses"][str(answer.status_code)]["content"]
+    assert kind.partition(";")[0] in known
     if "json" in kind:
         answer.read()
-        check(told[kind]["schema"], answer.json())
+        check(known[kind]["schema"], answer.json())
 
 
 def resolved(schema, root):
-    """What a schema refers to, or itself."""
+    """The schema that a reference points to, or itself."""
     if "$ref" in schema:
         _, *path = schema["$ref"].split("/")
         schema = root
@@ -80,20 +78,20 @@ def takes_all(ours, theirs, where):
     """That one schema allows every value that another one allows; both with what their references point into."""
     (our_schema, our_root), (their_schema, their_root) = ours, theirs
     our_choices = choices(our_schema, our_root)
-    for told in choices(their_schema, their_root):
-        kind = told.get("type")
+    for given in choices(their_schema, their_root):
+        kind = given.get("type")
         fitting = [one for one in our_choices if one.get("type") in (kind, "number" if kind == "integer" else kind)]
-        assert fitting, f"{where} may be {told}, which is not known here"
+        assert fitting, f"{where} may be {given}, which is not known here"
         (known,) = fitting
         if "enum" in known or "const" in known:
-            values = set(told.get("enum", [told.get("const")]))
+            values = set(given.get("enum", [given.get("const")]))
             assert values <= set(known.get("enum", [known.get("const")])), where
         for part in ("items", "additionalProperties"):
             if isinstance(known.get(part), dict):
-                takes_all((known[part], our_root), (told[part], their_root), f"{where}, each")
-        assert set(known.get("required", ())) <= set(told.get("required", ())), where
+                takes_all((known[part], our_root), (given[part], their_root), f"{where}, each")
+        assert set(known.get("required", ())) <= set(given.get("required", ())), where
         for name, member in known.get("properties", {}).items():
-            takes_all((member, our_root), (told["properties"][name], their_root), f"{where}, {name}")
+            takes_all((member, our_root), (given["properties"][name], their_root), f"{where}, {name}")
 
 
 @pytest.mark.parametrize(
@@ -106,15 +104,12 @@ def test_every_answer_that_the_schema_allows_is_understood(kind, path):
     takes_all((ours, ours), (theirs, SCHEMA), kind.__name__)
 
 
-def test_work_is_over_in_the_states_in_which_the_service_has_finished_it():
-    fields = {"id": "e1", "stage": None, "done": 0, "total": 0, "note": "", "eta_s": None, "error": None}
-    over = {state: Estimate(**fields, status=state, estimate=None).is_over for state in get_args(State)}
-    assert over == {state: state in FINISHED for state in get_args(State)}
-
-
-def test_the_modes_of_an_estimate_are_those_of_the_service():
+def test_modes_and_finished_states_are_those_of_the_service():
     known = resolved(SCHEMA["components"]["schemas"]["EstimateIn"]["properties"]["mode"], SCHEMA)
     assert set(known["enum"]) == set(get_args(Mode))
+    fields = {"id": "e1", "stage": None, "done": 0, "total": 0, "note": "", "eta_s": None, "error": None}
+    over = {state for state in get_args(State) if Estimate(**fields, status=state, estimate=None).is_over}
+    assert over == set(FINISHED)
 
 
 @pytest.fixture
@@ -131,12 +126,9 @@ def table(osf, live):
     live.request("DELETE", f"/api/scenes/{scene.id}")
 
 
-def test_how_the_service_is_and_what_it_has(osf):
+def test_a_table_is_made_pushed_and_seen(osf, table):
     assert osf.health().status in ("ok", "degraded")
     assert {BOX, BOTTLE} <= set(osf.objects())
-
-
-def test_a_table_is_made_pushed_and_seen(osf, table):
     assert table.state.names == (BOX, BOTTLE)
     assert [camera.name for camera in table.cameras] == ["0", "1", "2", "3", "goal"]
     velocity = -table.state.pusher / np.abs(table.state.pusher).max() * [0.2, 0.2, 0]
@@ -148,15 +140,6 @@ def test_a_table_is_made_pushed_and_seen(osf, table):
     assert image.shape == (64, 64, 3)
     assert 0.05 < image.mean() < 0.95
     assert np.abs(osf.image("2", size=64) - image).max() > 0.1
-
-
-def test_light_and_poses_are_as_given(osf, live):
-    poses = {BOX: Pose(np.array([0.1, 0.0, 0.2]), np.array([1.0, 0, 0, 0]))}
-    light = Light(np.array([0.6, 0.0, 0.8]))
-    scene = osf.new_scene([BOX], poses=poses, light=light)
-    np.testing.assert_allclose(scene.state.light.direction, light.direction, atol=1e-9)
-    np.testing.assert_allclose(scene.state.pose(BOX).position, poses[BOX].position, atol=1e-9)
-    live.request("DELETE", f"/api/scenes/{scene.id}")
 
 
 def test_goals_are_sent_and_made(osf, table, tmp_path):
@@ -173,12 +156,9 @@ def test_goals_are_sent_and_made(osf, table, tmp_path):
     pose = table.state.pose(BOX)
     made = osf.goal_of({BOX: Pose(pose.position + [0.0, 0.05, 0.0], pose.quaternion)}, light=table.state.light)
     assert np.abs(osf.goal_image(made) - image).max() > 0.1
-
-
-def test_what_is_no_photo_is_told_without_asking_the_service(osf, tmp_path):
     (tmp_path / "goal.txt").write_text("a table")
     for path in (tmp_path / "goal.txt", tmp_path / "none.png"):
-        with pytest.raises(InvalidInput, match="photo is .*, but it must be a file that is there and ends in"):
+        with pytest.raises(InvalidInput, check=about("photo")):
             osf.upload_goal(path)
 
 
@@ -191,25 +171,19 @@ def test_predictions_are_futures(osf, table):
     np.testing.assert_allclose(rollouts.pusher[:, 0], np.tile(table.state.pusher, (2, 1)), atol=1e-6)
     again = osf.predict(np.zeros((1, 3, 3)), table.state)
     np.testing.assert_allclose(again.positions[0], rollouts.positions[1], atol=1e-6)
-    with pytest.raises(InvalidInput, match=r"action 0 of sequence 0 \[m/s\]"):
+    with pytest.raises(InvalidInput, check=about("action 0 of sequence 0")):
         osf.predict(np.full((1, 1, 3), 9.0))
 
 
 def test_what_the_service_refuses_is_one_sentence(osf, live):
-    with pytest.raises(ServiceError, match=r"There is no object named 'teapot'; .*known:") as refused:
+    with pytest.raises(ServiceError, match="'teapot'") as refused:
         osf.new_scene(["teapot"])
     assert refused.value.status == 422
-    with pytest.raises(ServiceError, match="There is no such scene") as unknown:
+    with pytest.raises(ServiceError) as unknown:
         osf.image(scene="none")
     assert unknown.value.status == 404
-    with Client(live.url) as plain, pytest.raises(ServiceError, match="Steps is 0"):
+    with Client(live.url) as plain, pytest.raises(ServiceError):
         plain.episode({BOX: Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))}, steps=0)
-
-
-def test_a_service_that_is_not_there():
-    with Client("http://127.0.0.1:9") as osf, pytest.raises(ServiceError, match="start it with 'osf serve'") as silent:
-        osf.health()
-    assert silent.value.status == 0
 
 
 def talking_to(answer):
@@ -217,10 +191,12 @@ def talking_to(answer):
     return Client(connection=Connection(httpx2.Client(base_url="http://desk", transport=httpx2.MockTransport(answer))))
 
 
-def test_another_programs_answer_is_told_as_such():
+def test_no_service_or_another_one_is_told_by_its_status():
     page = talking_to(lambda request: httpx2.Response(404, text="<html>nothing here"))
-    with page as osf, pytest.raises(ServiceError, match=r"http://desk/api/health answered 404 as .*; give the address"):
-        osf.health()
+    for client, status in ((Client("http://127.0.0.1:9"), 0), (page, 404)):
+        with client as osf, pytest.raises(ServiceError) as caught:
+            osf.health()
+        assert caught.value.status == status
 
 
 def test_a_download_that_breaks_off_leaves_the_older_file(tmp_path):
@@ -239,7 +215,7 @@ def test_a_download_that_breaks_off_leaves_the_older_file(tmp_path):
 
 def test_an_episode_is_followed_over_a_broken_network(table, osf):
     waiting = osf.episode({name: table.state.pose(name) for name in table.state.names})
-    known = {**_fields(next(waiting)), "id": "e1"}
+    known = {**json.loads(next(waiting).model_dump_json()), "id": "e1"}
     osf.cancel(osf.episodes()[0])
     streams = []
 
@@ -256,25 +232,11 @@ def test_an_episode_is_followed_over_a_broken_network(table, osf):
     assert len(streams) == 3
 
 
-def _fields(entry):
-    return json.loads(entry.model_dump_json())
-
-
-def test_an_estimate_that_waits_is_ended(osf, table, live):
-    _, job = live.request("POST", "/api/jobs", LONG)  # has the turn
-    follow = osf.estimate("first", seed=3)
-    waiting = next(follow)
-    assert (waiting.status, waiting.estimated, waiting.is_over) == ("queued", None, False)
-    osf.cancel(waiting)
-    assert [one.status for one in follow][-1] == "cancelled"
-    live.request("DELETE", f"/api/jobs/{job['id']}")
-
-
-@SLOW
+@pytest.mark.slow
 def test_an_observation_is_estimated(osf, library, tmp_path):
     folder = tmp_path / "seen"
     collect_observation(CollectObservation(folder, (BOTTLE,), size=64), library)
-    with pytest.raises(InvalidInput, match=r"a folder with observation.json in it"):
+    with pytest.raises(InvalidInput):
         osf.estimate(observation=tmp_path)
     *before, last = osf.estimate(observation=folder)
     assert {one.status for one in before} <= {"queued", "running", "done"}
@@ -284,7 +246,7 @@ def test_an_observation_is_estimated(osf, library, tmp_path):
     assert last.estimated.trusted
 
 
-@SLOW
+@pytest.mark.slow
 def test_an_episode_from_photo_to_files(osf, table, tmp_path):
     poses = {name: table.state.pose(name) for name in table.state.names}
     *before, last = osf.episode(poses, **TINY)

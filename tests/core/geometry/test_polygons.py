@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from osfcore.geometry.polygons import circle, direction_index, gap_between, gap_to_point
@@ -34,13 +34,9 @@ def to_rectangle(point, a, b) -> float:
     return float(np.linalg.norm(np.maximum(away, 0)) + min(away.max(), 0))
 
 
-def test_circle_begins_along_x_and_goes_counterclockwise():
-    four = circle(4)
-    torch.testing.assert_close(four, torch.tensor([[1.0, 0], [0, 1], [-1, 0], [0, -1]]), atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("count", [8, 16, 64])
+@pytest.mark.parametrize("count", [8, 64])
 def test_directions_find_themselves_and_their_neighbourhood(count):
+    torch.testing.assert_close(circle(count)[count // 4], torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0)
     own = torch.arange(count)
     for off in (0.0, 0.45, -0.45):
         angle = (own + off) * (2 * math.pi / count)
@@ -51,6 +47,7 @@ def test_directions_find_themselves_and_their_neighbourhood(count):
 @given(
     a=st.floats(0.01, 0.1), b=st.floats(0.01, 0.1), angle=angles, x=places, y=places, shift=st.tuples(places, places)
 )
+@settings(max_examples=40)
 def test_gap_of_a_rectangle_to_a_point(a, b, angle, x, y, shift):
     point = torch.tensor([[x, y]]) @ turn(angle).T + torch.tensor([shift])
     gap = gap_to_point(rectangle(a, b, angle, shift), point)
@@ -63,23 +60,6 @@ def test_gap_of_a_rectangle_to_a_point(a, b, angle, x, y, shift):
         assert float(gap.normal.norm()) == pytest.approx(1, abs=1e-3)
 
 
-@given(radius=st.floats(0.01, 0.1), x=places, y=places)
-def test_gap_of_a_disc_to_a_point(radius, x, y):
-    """A polygon of 64 corners lies within its circle by 0.12 % of the radius."""
-    gap = gap_to_point(disc(radius, (0.05, -0.02)), torch.tensor([[x + 0.05, y - 0.02]]))
-    exact = math.hypot(x, y) - radius
-    flat = radius * (1 - math.cos(math.pi / COUNT))
-    if not -flat <= exact <= flat:
-        assert exact - 1e-6 <= float(gap.distance) <= exact + flat + 1e-6
-
-
-def test_what_is_just_outside_a_long_side_is_outside():
-    angle = math.pi / COUNT
-    point = torch.tensor([[0.051, 0.0]]) @ turn(angle).T
-    gap = gap_to_point(rectangle(0.05, 0.08, angle), point)
-    assert float(gap.distance) == pytest.approx(0.001, abs=1e-6)
-
-
 @given(
     first=st.tuples(st.floats(0.01, 0.1), st.floats(0.01, 0.1)),
     second=st.tuples(st.floats(0.01, 0.1), st.floats(0.01, 0.1)),
@@ -87,6 +67,7 @@ def test_what_is_just_outside_a_long_side_is_outside():
     beside=st.floats(-0.5, 0.5),
     angle=angles,
 )
+@settings(max_examples=40)
 def test_gap_of_rectangles_that_face_each_other(first, second, apart, beside, angle):
     """Side to side: the distance is that of the sides, overlapping or not, at any angle of the pair."""
     offset = turn(angle) @ torch.tensor([first[0] + second[0] + apart, beside * (first[1] + second[1])])
@@ -100,40 +81,15 @@ def test_gap_of_rectangles_that_face_each_other(first, second, apart, beside, an
     assert float(back.distance) == pytest.approx(float(gap.distance), abs=1e-6)
 
 
-@given(
-    one=st.floats(0.02, 0.1),
-    two=st.floats(0.02, 0.1),
-    share=st.floats(0.5, 3),
-    angle=angles,
-    at=st.tuples(places, places),
-)
-def test_gap_of_discs(one, two, share, angle, at):
-    distance = share * (one + two)
-    there = torch.tensor(at) + distance * turn(angle)[:, 0]
-    gap = gap_between(disc(one, at), disc(two, there.tolist()))
-    exact = distance - one - two
-    slack = (one + two) * (1 - math.cos(math.pi / COUNT)) + distance * (1 - math.cos(math.pi / COUNT)) + 1e-6
-    assert abs(float(gap.distance) - exact) <= slack
-    assert float(gap.normal[0] @ turn(angle)[:, 0]) > math.cos(2 * math.pi / COUNT)
-
-
 @given(angle=angles, x=st.floats(-0.04, 0.04), y=st.floats(-0.02, 0.02))
+@settings(max_examples=40)
 def test_overlapping_outlines_moved_apart_by_the_gap_just_touch(angle, x, y):
     one, other = rectangle(0.05, 0.03, 0.3), rectangle(0.02, 0.04, angle, (x, y))
     gap = gap_between(one, other)
     assert float(gap.distance) < 0
+    assert float(gap.normal.norm()) == pytest.approx(1, abs=1e-3)
     apart = gap_between(one, other - gap.distance[:, None, None] * gap.normal[:, None])
     assert float(apart.distance) == pytest.approx(0, abs=2e-6)
-
-
-@given(angle=angles, shift=st.tuples(places, places))
-def test_between_corners_the_gap_is_never_too_large(angle, shift):
-    one, other = rectangle(0.05, 0.03), rectangle(0.02, 0.04, angle, shift)
-    corners = [np.unique(np.round(o[0].numpy(), 6), axis=0) for o in (one, other)]
-    between = np.linalg.norm(corners[0][:, None] - corners[1][None], axis=2).min()
-    found = gap_between(one, other)
-    assert float(found.distance) <= between + 1e-6
-    assert float(found.normal.norm()) == pytest.approx(1, abs=1e-3)
 
 
 def test_a_dent_does_not_tear_outlines_apart():
@@ -147,6 +103,7 @@ def test_many_outlines_are_looked_at_independently():
     outlines = torch.cat([rectangle(0.05, 0.03, 0.2 * k, (0.02 * k, 0.0)) for k in range(5)])
     others = torch.cat([disc(0.02, (0.1, 0.03 * k)) for k in range(5)])
     together = gap_between(outlines, others)
+    assert gap_between(outlines[:0], others[:0]).distance.shape == (0,)
     points = gap_to_point(outlines, others[:, 0])
     for k in range(5):
         alone = gap_between(outlines[k : k + 1], others[k : k + 1])
@@ -154,9 +111,3 @@ def test_many_outlines_are_looked_at_independently():
         torch.testing.assert_close(
             points.distance[k], gap_to_point(outlines[k : k + 1], others[k : k + 1, 0]).distance[0]
         )
-
-
-def test_no_pairs_are_no_trouble():
-    none = rectangle(0.05, 0.03)[:0]
-    assert gap_between(none, none).distance.shape == (0,)
-    assert gap_to_point(none, none[:, 0]).normal.shape == (0, 2)

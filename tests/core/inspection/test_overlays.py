@@ -1,21 +1,17 @@
-"""Overlays: image set overlay, observation overlay."""
-
 from dataclasses import replace
 
 import numpy as np
 
 from osfcore.fields.visual_hull import carve
 from osfcore.geometry.cameras import Camera, default_cameras
-from osfcore.geometry.states import MAX_OBJECTS, Observation
+from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
 from osfcore.inspection.overlays import object_colour, observation_sheet, overlay_sheet
 from osfcore.io.image_set import read_image_set
-from tests.core.fields.sets import turn_cameras
 
-# Image set overlay
-
-
-MAGENTA, YELLOW = (255, 0, 255), (0, 255, 255)
+MAGENTA, YELLOW, WHITE = (255, 0, 255), (0, 255, 255), (255, 255, 255)
+AXES = ((0, 0, 255), (0, 255, 0), (255, 0, 0))
+TILE = 384
 
 
 def sheet_of(image_set, box=None):
@@ -23,14 +19,15 @@ def sheet_of(image_set, box=None):
     return overlay_sheet(sets, carve(*sets).box if box is None else box)
 
 
-def count(sheet, colour):
-    return np.all(sheet == colour, axis=-1).sum()
+def count(image, colour) -> int:
+    """Pixels of about a colour: lines are anti-aliased."""
+    return int((np.abs(image.astype(int) - colour).max(axis=-1) < 60).sum())
 
 
 def test_box_axes_and_light_are_drawn_around_the_object(image_set):
     sheet = sheet_of(image_set)
     assert sheet.shape == (512, 1024, 3)
-    for colour in (MAGENTA, YELLOW, (0, 0, 255), (0, 255, 0), (255, 0, 0)):
+    for colour in (MAGENTA, YELLOW, *AXES):
         assert count(sheet, colour) > 100
     for row in range(2):
         for column in range(4):
@@ -44,18 +41,9 @@ def test_box_axes_and_light_are_drawn_around_the_object(image_set):
             assert np.percentile(ys, 98) <= box_ys.max()
 
 
-def test_a_wrong_convention_is_seen(image_set):
-    turn_cameras(image_set, lambda RT: np.diag([1, -1, -1]) @ RT)
-    sheet = sheet_of(image_set, np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]]))
-    assert count(sheet, MAGENTA) == 0
-    assert count(sheet, (0, 0, 255)) > 100  # the words
-
-
 def test_lines_that_pass_the_camera_are_cut(image_set):
     around_cameras = np.array([[-0.1, -9, -9], [0.1, 9, 9]])  # all edges from +y to -y pass the cameras
-    sheet = sheet_of(image_set, around_cameras).astype(int)
-    is_magenta = (sheet[..., 0] > 200) & (sheet[..., 2] > 200) & (sheet[..., 1] < 100)
-    assert is_magenta.sum() > 500
+    assert count(sheet_of(image_set, around_cameras), MAGENTA) > 500
 
 
 def test_fewer_images_than_tiles_and_no_box_are_fine(image_set):
@@ -67,24 +55,12 @@ def test_fewer_images_than_tiles_and_no_box_are_fine(image_set):
     assert count(sheet, MAGENTA) == 0
 
 
-# Observation overlay
-
-
-WHITE, MASK_YELLOW, AXES = (255, 255, 255), (0, 255, 255), ((0, 0, 255), (0, 255, 0), (255, 0, 0))
-TILE = 384
-
-
 def observation(cameras=None, names=("a", "b")) -> Observation:
     cameras = default_cameras(64) if cameras is None else cameras
     shape = (len(cameras), cameras[0].height, cameras[0].width)
     masks = np.zeros((shape[0], len(names), *shape[1:]), bool)
     masks[0, 0, 30:50, 10:20] = True
     return Observation(cameras, np.full((*shape, 3), 0.3, np.float32), names, masks, np.array([0.1, 0, 0.062]), 0.0)
-
-
-def count_pixels(image, colour) -> int:
-    """Pixels of about a colour: lines are anti-aliased."""
-    return int((np.abs(image.astype(int) - colour).max(axis=-1) < 60).sum())
 
 
 def tile(sheet, number):
@@ -96,34 +72,24 @@ def test_axes_workspace_pusher_and_masks_are_drawn_where_they_are():
     sheet = observation_sheet(made)
     assert sheet.shape == (TILE, 4 * TILE, 3)
     for number in range(4):
-        for colour in (*AXES, MASK_YELLOW, WHITE):
-            assert count_pixels(tile(sheet, number), colour) > 20
+        for colour in (*AXES, YELLOW, WHITE):
+            assert count(tile(sheet, number), colour) > 20
         corner = made.cameras[number].resized(TILE, TILE).project(np.array([WORKSPACE_HALF_M, WORKSPACE_HALF_M, 0]))
         x, y = np.round(corner).astype(int)
-        assert count_pixels(tile(sheet, number)[y - 3 : y + 4, x - 3 : x + 4], WHITE) > 0
+        assert count(tile(sheet, number)[y - 3 : y + 4, x - 3 : x + 4], WHITE) > 0
     rows, columns = np.nonzero(np.all(tile(sheet, 0)[180:] == object_colour(0), axis=-1))
     assert (rows.min() + 180, columns.min(), columns.max()) == (180, 60, 119)  # six times as large as the mask
     assert rows.max() + 180 == 299
-    assert count_pixels(sheet, object_colour(1)) == 0
-
-
-def test_what_is_not_known_is_not_drawn():
-    made = observation()
+    assert count(sheet, object_colour(1)) == 0
     bare = observation_sheet(replace(made, masks=None, pusher=None))
-    assert count_pixels(bare, object_colour(0)) == count_pixels(bare, MASK_YELLOW) == 0
-    assert count_pixels(bare, WHITE) > 0
-
-
-def test_objects_have_colours_of_their_own():
-    colours = [object_colour(number) for number in range(MAX_OBJECTS)]
-    assert len({*colours, *AXES, WHITE, MASK_YELLOW}) == MAX_OBJECTS + 5
+    assert count(bare, object_colour(0)) == count(bare, YELLOW) == 0
 
 
 def test_strange_views_are_drawn_too():
     away = Camera.look_at("\u00e9" * 100, (0.6, 0, 0.5), (2, 0, 0.5), size=16)
     sheet = observation_sheet(observation((away,), ("\u4e2d" * 50,)))
     assert sheet.shape == (TILE, TILE, 3)
-    assert count_pixels(sheet, (0, 0, 255)) > 20  # says that the table is behind the camera
+    assert count(sheet, (0, 0, 255)) > 20  # says that the table is behind the camera
     flat = replace(default_cameras(64)[0], width=1024, height=16)
     assert observation_sheet(observation((flat,))).shape == (16, TILE, 3)
     cameras = tuple(replace(default_cameras(64)[0], name=str(i)) for i in range(6))

@@ -24,8 +24,3 @@ def test_glb_holds_the_same_surface_with_a_small_texture(side):
     assert max(image.size) == min(side, 1024)
     assert image.height == 2 * image.width
     assert np.abs(np.asarray(image).astype(int) - (200, 100, 50)).max() < 6
-
-
-def test_real_objects_are_light(library):
-    for name in library.names():
-        assert len(library.viewer_glb(name)) < 900_000, name

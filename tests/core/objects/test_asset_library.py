@@ -1,16 +1,15 @@
 import json
-import os
-import subprocess
-import sys
+import resource
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, MissingAssets, UnknownName
+from osfcore.errors import CorruptFile, FetchFailed, MissingAssets, UnknownName
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
-from osfcore.objects.asset_library import AssetLibrary, check_name
+from osfcore.objects.asset_library import AssetLibrary
+from tests.support.errors import about
 
 SYMMETRY = Symmetry("discrete", ((0.0, 0.0, 0.0, 1.0),), (0.0, 0.0, 1.0), "made up")
 INFO = ObjectInfo("toy", "Toy", 0.25, SYMMETRY, "CC0-1.0", "nobody")
@@ -50,36 +49,24 @@ def test_what_is_written_comes_back(shelf, asset):
     np.testing.assert_allclose(shelf.size_m("toy"), asset.size_m, atol=1e-6)
     assert shelf.source("toy") == "a test"
     assert shelf.names() == ("toy",)
-
-
-def test_sentences_are_told_with_what_people_call_the_objects(shelf):
-    said = "006_mustard_bottle and 003_cracker_box overlap by 4 mm, 0.5 cm from no_such_thing."
-    assert shelf.in_words(said) == "Mustard bottle and Cracker box overlap by 4 mm, 0.5 cm from no_such_thing."
-    assert (shelf.label("toy"), shelf.label("gone")) == (shelf.info("toy").label, "gone")
-
-
-def test_its_shape_comes_back_alone_even_without_its_texture(shelf, asset):
     (shelf.root / "toy" / "texture.png").unlink()
-    shape = shelf.load_geometry("toy")
-    np.testing.assert_array_equal(shape.vertices, asset.mesh.vertices.astype(np.float32))
-    np.testing.assert_array_equal(shape.faces, asset.mesh.faces)
+    shape = shelf.load_geometry("toy")  # does without
+    np.testing.assert_array_equal(shape.vertices, back.mesh.vertices)
     assert all(np.array_equal(a, b) for a, b in zip(shape.parts, asset.parts, strict=True))
-
-
-def test_info_of_the_catalogue_needs_no_files(tmp_path):
-    library = AssetLibrary(tmp_path / "none")
-    assert library.names() == ()
-    assert library.info("024_bowl").label == "Bowl"
 
 
 def test_missing_and_unknown_are_told_apart(shelf):
     for method in (shelf.load, shelf.load_geometry, shelf.size_m, shelf.viewer_glb, shelf.source, shelf.digest):
-        with pytest.raises(MissingAssets, match=r"024_bowl.*osf assets fetch"):
+        with pytest.raises(MissingAssets, check=about("024_bowl")):
             method("024_bowl")
-        with pytest.raises(UnknownName, match="toy"):
+        with pytest.raises(UnknownName, check=about("nothing")):
             method("nothing")
     with pytest.raises(UnknownName):
         shelf.info("nothing")
+    assert shelf.info("024_bowl").label == "Bowl"
+    sentence = "006_mustard_bottle and toy overlap by 4 mm, 0.5 cm from no_such_thing."
+    assert shelf.in_words(sentence) == "Mustard bottle and toy overlap by 4 mm, 0.5 cm from no_such_thing."
+    assert (shelf.label("toy"), shelf.label("gone")) == ("Toy", "gone")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../objects/toy", "toy/", ".writing-x", "a\0b", "x" * 300])
@@ -103,24 +90,19 @@ def test_damage_is_told(shelf, file, damage):
     else:
         path.write_bytes(data[:20] + bytes([data[20] ^ 255]) + data[21:])
     is_absent = file == "object.json" and damage == "gone"
-    with pytest.raises(UnknownName if is_absent else CorruptFile, match="toy"):
+    with pytest.raises(UnknownName if is_absent else CorruptFile, check=about("toy")):
         shelf.viewer_glb("toy") if file == "viewer.glb" else shelf.load("toy")
 
 
-@pytest.mark.parametrize("facts", [[], {}, {"format_version": 1}, {"format_version": 1, "info": {}, "crc32": 3}])
+@pytest.mark.parametrize(
+    "facts", [[], {}, {"format_version": 0}, {"format_version": 1}, {"format_version": 1, "info": {}, "crc32": 3}]
+)
 def test_facts_of_another_shape_are_told(shelf, facts):
     (shelf.root / "toy" / "object.json").write_text(json.dumps(facts))
     for method in (shelf.load, shelf.load_geometry, shelf.info, shelf.size_m, shelf.digest):
         with pytest.raises(CorruptFile):
             method("toy")
-
-
-def test_an_older_format_counts_as_not_there(shelf):
-    path = shelf.root / "toy" / "object.json"
-    path.write_text(path.read_text().replace('"format_version": 1', '"format_version": 0'))
-    assert not shelf.has("toy")
-    with pytest.raises(CorruptFile, match="another version"):
-        shelf.load("toy")
+    assert shelf.has("toy") == (facts not in ([], {}, {"format_version": 0}))
 
 
 def test_writing_again_replaces_and_leaves_nothing_behind(shelf, asset):
@@ -128,6 +110,8 @@ def test_writing_again_replaces_and_leaves_nothing_behind(shelf, asset):
     assert shelf.load("toy").info.mass_kg == 0.5
     assert [path.name for path in shelf.root.iterdir()] == ["toy"]
     assert sorted(path.name for path in (shelf.root / "toy").iterdir()) == sorted(FILES)
+    shelf.remove("toy")
+    assert list(shelf.root.iterdir()) == []
 
 
 def test_digests_tell_what_was_written_from_what_was_there_before(shelf, asset):
@@ -146,66 +130,23 @@ def test_digests_tell_what_was_written_from_what_was_there_before(shelf, asset):
     assert len(digests) == 4
 
 
-def test_old_temporary_folders_are_removed_and_fresh_ones_kept(shelf, asset):
-    old, fresh = shelf.root / ".writing-old", shelf.root / ".writing-fresh"
-    for folder in (old, fresh):
-        folder.mkdir()
-        (folder / "arrays.npz").write_bytes(b"half")
-    os.utime(old, (0, 0))
-    shelf.write(asset, "again")
-    assert not old.exists()
-    assert fresh.exists()
-    assert shelf.names() == ("toy",)
-
-
-def test_a_root_that_cannot_be_made_is_told(tmp_path, asset):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(FetchFailed, match="cannot be written"):
-        AssetLibrary(tmp_path / "file" / "objects").write(asset, "a test")
-
-
 def test_many_may_write_the_same_object_at_once(tmp_path, asset):
     shelf = AssetLibrary(tmp_path / "objects")
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda n: shelf.write(asset, f"writer {n}"), range(40)))
+        list(pool.map(lambda n: shelf.write(asset, f"writer {n}"), range(24)))
     assert shelf.load("toy").info == asset.info
     assert [path.name for path in shelf.root.iterdir()] == ["toy"]
 
 
-# Files of this process can grow to a few kilobytes only, as on a full disk.
-FULL_DISK = """
-import resource, sys
-from pathlib import Path
-from osfcore.errors import FetchFailed
-from osfcore.objects.asset_library import AssetLibrary
-shelf = AssetLibrary(Path(sys.argv[1]))
-asset = shelf.load("toy")
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
-try:
-    shelf.write(asset, "on a full disk")
-except FetchFailed as error:
-    print(error)
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
 @pytest.mark.parametrize("limit", [100, 2000, 5000])
-def test_a_full_disk_keeps_the_old_object_whole(shelf, limit):
-    run = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(shelf.root), str(limit)], capture_output=True, text=True, check=True
-    )
-    assert "cannot be written" in run.stdout
+def test_a_full_disk_keeps_the_old_object_whole(shelf, asset, limit):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))  # files can grow to a few kilobytes only
+    try:
+        with pytest.raises(FetchFailed):
+            shelf.write(asset, "on a full disk")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert shelf.source("toy") == "a test"
     shelf.load("toy")
     assert [path.name for path in shelf.root.iterdir()] == ["toy"]
-
-
-@pytest.mark.parametrize("name", ["a", "my-mug_2", "0x", "a" * 64])
-def test_good_names(name):
-    assert check_name(name) == name
-
-
-@pytest.mark.parametrize("name", ["", "A", "-a", "_a", "a b", "a/b", "..", "a" * 65, "mug\n", "é"])
-def test_bad_names(name):
-    with pytest.raises(InvalidInput, match="object name"):
-        check_name(name)

@@ -1,12 +1,13 @@
 import io
 import os
 import tarfile
+import zipfile
 
 import pytest
 
 from osfcore.errors import CorruptFile, FetchFailed
-from osfcore.objects import download as module
-from osfcore.objects.download import download, pip_download, temporary_folder, unpack
+from osfcore.objects.download import TRIES, download, pip_download, temporary_folder, unpack
+from tests.support.errors import about
 
 
 def archive(path, members, mode="w:gz"):
@@ -17,49 +18,29 @@ def archive(path, members, mode="w:gz"):
     return path
 
 
-def test_download_brings_the_bytes(served, tmp_path):
-    root, address, _ = served
+def test_downloads_are_whole_or_not_there(served, tmp_path):
+    root, address, server = served
     (root / "a.bin").write_bytes(os.urandom(3_000_000))
     assert download(f"{address}/a.bin", tmp_path / "b.bin")
     assert (tmp_path / "b.bin").read_bytes() == (root / "a.bin").read_bytes()
+    assert not download(f"{address}/none", tmp_path / "c")
+    with pytest.raises(FetchFailed):
+        download(f"{address}/a.bin", tmp_path / "c", max_bytes=1000)
+    server.modes["a.bin"] = "short"
+    with pytest.raises(FetchFailed):
+        download(f"{address}/a.bin", tmp_path / "c")
+    assert not list(tmp_path.glob("c*"))
 
 
-def test_a_file_that_is_not_there_is_no_error(served, tmp_path):
-    assert not download(f"{served[1]}/none", tmp_path / "b")
-    assert not (tmp_path / "b").exists()
-
-
-@pytest.mark.parametrize(("mode", "reason"), [("error", "503"), ("short", "connection")])
-def test_a_failing_server_is_told_after_a_few_tries(served, tmp_path, monkeypatch, mode, reason):
-    monkeypatch.setattr(module, "_PAUSE_S", 0.0)
-    root, address, server = served
-    (root / "a").write_text("x")
-    server.modes["a"] = mode
-    with pytest.raises(FetchFailed, match=reason):
+@pytest.mark.slow  # it waits between the tries
+def test_a_failing_server_is_asked_a_few_times(served, tmp_path):
+    _, address, server = served
+    server.modes["a"] = "error"
+    with pytest.raises(FetchFailed, check=about("503")):
         download(f"{address}/a", tmp_path / "b")
-    assert list(tmp_path.glob("b*")) == []
-    if mode == "error":
-        assert len(server.seen) >= module.TRIES
-
-
-def test_no_server_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_PAUSE_S", 0.0)
-    with pytest.raises(FetchFailed, match="no connection"):
+    assert len(server.seen) >= TRIES
+    with pytest.raises(FetchFailed):
         download("http://127.0.0.1:9/a", tmp_path / "b")
-
-
-def test_too_large_is_refused(served, tmp_path):
-    root, address, _ = served
-    (root / "a").write_bytes(bytes(2000))
-    with pytest.raises(FetchFailed, match="larger"):
-        download(f"{address}/a", tmp_path / "b", max_bytes=1000)
-    assert list(tmp_path.glob("b*")) == []
-
-
-def test_unpack(tmp_path):
-    path = archive(tmp_path / "a.tgz", [(tarfile.TarInfo("x/y.txt"), b"hello")])
-    unpack(path, tmp_path / "out")
-    assert (tmp_path / "out/x/y.txt").read_bytes() == b"hello"
 
 
 def hostile(name="x", kind=tarfile.REGTYPE, target=""):
@@ -93,10 +74,12 @@ def test_hostile_archives_write_nothing_outside(tmp_path, member):
     assert outside == [path]
 
 
-def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path):
-    path = archive(tmp_path / "bomb.tgz", [(tarfile.TarInfo(f"{i}"), bytes(400_000)) for i in range(3)])
-    with pytest.raises(CorruptFile, match="more than 1 MB"):
-        unpack(path, tmp_path / "out", max_bytes=1_000_000)
+def test_archives_unpack_unless_to_too_much(tmp_path):
+    path = archive(tmp_path / "a.tgz", [(tarfile.TarInfo(f"x/{i}"), bytes(400_000)) for i in range(3)])
+    unpack(path, tmp_path / "out")
+    assert (tmp_path / "out/x/2").read_bytes() == bytes(400_000)
+    with pytest.raises(CorruptFile):
+        unpack(path, tmp_path / "again", max_bytes=1_000_000)
 
 
 @pytest.mark.parametrize("damage", ["empty", "garbage", "truncated", "flipped"])
@@ -112,7 +95,7 @@ def test_damaged_archives_are_told(tmp_path, damage):
             "flipped": data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :],
         }[damage]
     )
-    with pytest.raises(CorruptFile, match=r"a\.tgz"):
+    with pytest.raises(CorruptFile, check=about("a.tgz")):
         unpack(path, tmp_path / "out")
 
 
@@ -125,18 +108,7 @@ def test_temporary_folders_vanish_and_take_old_ones_along(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pip_without_an_index_is_told_in_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")
-    monkeypatch.setenv("PIP_EXTRA_INDEX_URL", "")
-    monkeypatch.setenv("PIP_RETRIES", "0")
-    with pytest.raises(FetchFailed, match=r"index cannot be reached|No matching distribution") as caught:
-        list(pip_download("MyoSuite==2.8.0", tmp_path))
-    assert "\n" not in str(caught.value)
-
-
 def test_pip_takes_a_wheel_from_a_folder(tmp_path, monkeypatch):
-    import zipfile
-
     wheels, out = tmp_path / "wheels", tmp_path / "out"
     wheels.mkdir()
     out.mkdir()
@@ -152,5 +124,5 @@ def test_pip_takes_a_wheel_from_a_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("PIP_FIND_LINKS", str(wheels))
     assert all(count >= 0 for count in pip_download("tiny-osf-toy==1.0", out))
     assert (out / "tiny_osf_toy-1.0-py3-none-any.whl").is_file()
-    with pytest.raises(FetchFailed, match="No matching distribution"):
+    with pytest.raises(FetchFailed, check=about("No matching distribution")):
         list(pip_download("tiny-osf-toy==2.0", tmp_path))
